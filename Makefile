@@ -44,6 +44,7 @@ coverage:
 lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/python .ci/plain_code.py
 	$(VENV)/bin/mypy
 
 docs: install

@@ -35,7 +35,9 @@ class Phases(NamedTuple):
     approach: float = 0.0
     """Seconds in which the hand first comes from next to the table; 0 begins near the object."""
     lift: float = 0.0
-    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the table."""
+    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the
+    table.
+    """
     hold: float = 2.0
     """Seconds of the hold, at least those that count for success."""
 
@@ -60,13 +62,22 @@ class Outcome(NamedTuple):
 
 
 class Attempts:
-    """Grasps objects one after another with a policy's mean action, each in several ways in parallel.
+    """Grasps objects one after another with a policy's mean action, each in several ways in
+    parallel.
 
     Attributes:
       phases: durations and heights of the next run.
     """
 
-    def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, threads: int, phases: Phases = PLAIN):
+    def __init__(
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        bundle: PolicyBundle,
+        *,
+        threads: int,
+        phases: Phases = PLAIN,
+    ):
         """Sets up the attempts; nothing is compiled yet.
 
         Args:
@@ -104,10 +115,16 @@ class Attempts:
         begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self.phases.lift)}
         if self.phases.lift:
             begins["lift"] = removal
-        return {name: step * self._task.control_dt for name, step in sorted(begins.items(), key=lambda item: item[1])}
+        return {
+            name: step * self._task.control_dt
+            for name, step in sorted(begins.items(), key=lambda item: item[1])
+        }
 
     def run(
-        self, obj: GraspObject, request: RequestedEpisodes, progress: Callable[[int], None] = lambda step: None
+        self,
+        obj: GraspObject,
+        request: RequestedEpisodes,
+        progress: Callable[[int], None] = lambda step: None,
     ) -> Outcome:
         """Grasps an object in B ways; a different B than before causes a recompilation.
 
@@ -144,14 +161,25 @@ class Attempts:
         return Outcome(resolution.goal, *flags, metrics, trace)
 
     def episode(
-        self, outcome: Outcome, index: int, surface: Surface, obj: GraspObject, about: dict[str, Any]
+        self,
+        outcome: Outcome,
+        index: int,
+        surface: Surface,
+        obj: GraspObject,
+        about: dict[str, Any],
     ) -> Message:
         """Returns one attempt as an episode for logs and pictures; `about` has further metadata."""
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         trace = Trace(*(field[:, index] for field in outcome.trace))
-        meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics}
+        meta = {
+            "version": self._bundle.version,
+            "success": metrics["success"] > 0,
+            "metrics": metrics,
+        }
         meta |= {"phases": self.begins, **about}
-        return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
+        return episode_message(
+            self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta
+        )
 
     def renew(self, bundle: PolicyBundle) -> None:
         """Replaces the weights of the policy without recompilation."""
@@ -164,7 +192,9 @@ class Attempts:
             self._worker.physics.close()
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
-        """Returns a worker of `batch` environments on this object that acts with the mean and traces all of them."""
+        """Returns a worker of `batch` environments on this object that acts with the mean and
+        traces all of them.
+        """
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(
             self._hand,

@@ -1,7 +1,8 @@
 """The environment: `reset` and `step` over a batch of hands and objects.
 
-A step consists of `targets`, the physics step, and `advance`. An engine that JAX cannot trace is called between the two
-compiled halves (`actors.worker`); for traceable engines `step` combines all three.
+A step consists of `targets`, the physics step, and `advance`. An engine that JAX cannot trace is
+called between the two compiled halves (`actors.worker`); for traceable engines `step` combines all
+three.
 """
 
 import dataclasses
@@ -53,7 +54,9 @@ def begin_success(height: Array) -> Success:
     return Success(height, zero, zero, no, no)
 
 
-def track_success(task: TaskConfig, success: Success, scene: Scene, diverged: Array) -> tuple[Success, Array]:
+def track_success(
+    task: TaskConfig, success: Success, scene: Scene, diverged: Array
+) -> tuple[Success, Array]:
     """Advances the protocol by one control step.
 
     Args:
@@ -76,9 +79,15 @@ def track_success(task: TaskConfig, success: Success, scene: Scene, diverged: Ar
         moved_at_removal=jnp.where(removed_now, moved, success.moved_at_removal),
         diverged=success.diverged | diverged,
     )
-    up = (height > success.removal_height - task.drop_height) & ~fallen(task, state) & ~success.diverged
+    up = (
+        (height > success.removal_height - task.drop_height)
+        & ~fallen(task, state)
+        & ~success.diverged
+    )
     up &= success.links_at_removal > 0
-    return success._replace(kept=jnp.where(state.time == task.approach_steps + task.hold_steps, up, success.kept)), up
+    return success._replace(
+        kept=jnp.where(state.time == task.approach_steps + task.hold_steps, up, success.kept)
+    ), up
 
 
 class Settings(NamedTuple):
@@ -166,7 +175,9 @@ class Transition(NamedTuple):
     terminal: Array
     """(B,) bool: the episode ended with this step."""
     truncated: Array
-    """(B,) bool: it ended by the time limit while the object was held, in a state that has a value."""
+    """(B,) bool: it ended by the time limit while the object was held, in a state that has a
+    value.
+    """
     terms: Array
     """(B, terms) weighted reward terms."""
     errors: dict[str, tuple[Array, Array]]
@@ -184,7 +195,8 @@ class GraspEnv:
         Args:
           hand: the hand.
           task: the task.
-          engine: an engine that JAX can trace, with the objects that initial conditions refer to by index; None for
+          engine: an engine that JAX can trace, with the objects that initial conditions refer to by
+          index; None for
             one that is stepped outside, between `targets` and `advance`.
         """
         self.hand, self.task, self._engine = hand, task, engine
@@ -229,7 +241,14 @@ class GraspEnv:
             success=begin_success(reset_state.object_position[:, 2]),
             sums=sums,
             terms=jnp.zeros((batch, len(terms(self.task)))),
-            grasps=Grasps(no, index, index, reset_state.q, reset_state.base_position, reset_state.base_quaternion),
+            grasps=Grasps(
+                no,
+                index,
+                index,
+                reset_state.q,
+                reset_state.base_position,
+                reset_state.base_quaternion,
+            ),
             finished=jnp.zeros((batch, len(episode_fields(self.task)))),
             has_finished=no,
         )
@@ -237,31 +256,41 @@ class GraspEnv:
     def restart(self, state: EnvState, rows: Array, initial: InitialConditions) -> EnvState:
         """Starts K new episodes; the other environments continue, with their contacts.
 
-        Only the episodes that start are computed: sampling them and their scene cost several times a step of the task.
+        Only the episodes that start are computed: sampling them and their scene cost several times
+        a step of the task.
 
         Args:
-          state: the environments; an engine that is stepped outside is reset separately, to the new `reset_state`.
-          rows: (K,) int, environments in which the episodes start; numbers from B on are ignored.
-          initial: the episodes (K,).
+          state: the environments; an engine that is stepped outside is reset separately, to the new
+          `reset_state`. rows: (K,) int, environments in which the episodes start; numbers from B on
+          are ignored. initial: the episodes (K,).
         """
 
         def placed(new: Any, old: Any) -> Any:
             return jax.tree.map(lambda some, every: every.at[rows].set(some, mode="drop"), new, old)
 
-        fresh, names = self._begun(initial), ("physics", "views", "grasps", "finished", "has_finished")
+        fresh, names = (
+            self._begun(initial),
+            ("physics", "views", "grasps", "finished", "has_finished"),
+        )
         kept: dict[str, Any] = {name: getattr(state, name) for name in names}
         without: dict[str, Any] = dict.fromkeys(names)
-        merged: EnvState = placed(fresh._replace(**without), state._replace(**without))._replace(**kept)
+        merged: EnvState = placed(fresh._replace(**without), state._replace(**without))._replace(
+            **kept
+        )
         if self._engine is None:
             return merged
         started = jnp.zeros(len(state.time), bool).at[rows].set(True, mode="drop")
         physics = self._engine.reset(state.physics, started, merged.reset_state)
         seen = self._engine.read(physics)
-        some: dict[str, Any] = {name: array[rows] for name, array in seen._asdict().items() if name != "occupancy"}
+        some: dict[str, Any] = {
+            name: array[rows] for name, array in seen._asdict().items() if name != "occupancy"
+        }
         scene = self.with_scene(fresh, seen._replace(**some))
         return merged._replace(physics=physics, views=placed(scene.views, state.views))
 
-    def step(self, state: EnvState, action: Array, settings: Settings | None = None) -> tuple[EnvState, Transition]:
+    def step(
+        self, state: EnvState, action: Array, settings: Settings | None = None
+    ) -> tuple[EnvState, Transition]:
         """Simulates one control step of a traceable engine; finished episodes are not restarted.
 
         Args:
@@ -274,9 +303,16 @@ class GraspEnv:
         physics, physics_state = self._traced.step(state.physics, *command)
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
-    def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
-        """Returns the joint targets of an action, and the inputs of the engine's step (`Physics.step`)."""
-        target, table = decode(self.seen(state), settings.control, action), self.table_present(state)
+    def targets(
+        self, state: EnvState, action: Array, settings: Settings
+    ) -> tuple[Action, tuple[Array, ...]]:
+        """Returns the joint targets of an action, and the inputs of the engine's step
+        (`Physics.step`).
+        """
+        target, table = (
+            decode(self.seen(state), settings.control, action),
+            self.table_present(state),
+        )
         followed = self._followed(state, target)
         motors = motor_positions(self.hand, followed.q_target)
         if settings.protocol is None:
@@ -284,8 +320,12 @@ class GraspEnv:
         start, time = state.reset_state, state.time
         frame = protocols.frame(settings.protocol, self.task, time + 0.5)
         table = table | settings.protocol.table
-        u_target = protocols.carried_targets(followed.u_target, self.hand, start.base_quaternion, frame)
-        force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
+        u_target = protocols.carried_targets(
+            followed.u_target, self.hand, start.base_quaternion, frame
+        )
+        force = protocols.push(
+            settings.protocol, self.task, time, start.object_index, start.mass_scale
+        )
         return target, (jnp.concatenate([u_target, motors], -1), table, force)
 
     def advance(
@@ -302,14 +342,18 @@ class GraspEnv:
         task, had_table = self.task, self.table_present(state)
         state = state._replace(
             time=state.time + 1,
-            q_target=jnp.where(physics_state.diverged[:, None], state.reset_state.q, target.q_target),
+            q_target=jnp.where(
+                physics_state.diverged[:, None], state.reset_state.q, target.q_target
+            ),
             u_target=jnp.where(physics_state.diverged[:, None], 0.0, target.u_target),
         )
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
         moved = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
         followed = self._followed(state, Action(state.q_target, state.u_target))
-        momentum = track_load(self.hand, task, state.momentum, moved.u, moved.u_velocity, followed.u_target)
+        momentum = track_load(
+            self.hand, task, state.momentum, moved.u, moved.u_velocity, followed.u_target
+        )
         state = state._replace(momentum=jnp.where(physics_state.diverged[:, None], 0.0, momentum))
         state = self._viewed(self._sense(state, physics_state, moved), moved, followed)
         scene = self.scene_of(state)
@@ -319,12 +363,15 @@ class GraspEnv:
         stacked = jnp.stack([found[name] for name in terms(task)], -1)
         reward = jnp.sum(stacked, -1)
         error = metrics.errors(scene)
-        # The paper's window ends `hold_steps` after the removal, however long the episode continues.
+        # The paper's window ends `hold_steps` after the removal, however long the episode
+        # continues.
         window = ~had_table & (state.time <= task.approach_steps + task.hold_steps)
         force = jnp.linalg.norm(scene.features.force, axis=-1)
         state = state._replace(
             success=tracked,
-            grasps=harvest.collect(scene, state.grasps, error, up, state.reset_state.object_index, state.region),
+            grasps=harvest.collect(
+                scene, state.grasps, error, up, state.reset_state.object_index, state.region
+            ),
             sums={
                 **metrics.accumulate(task, state.sums, error, had_table, window),
                 "return": state.sums["return"] + reward,
@@ -348,7 +395,9 @@ class GraspEnv:
         return state, transition
 
     def _ends(self, state: EnvState, up: Array) -> tuple[Array, Array]:
-        """(B,) bool each: the episode's metrics are complete with this step, and the episode ends with it."""
+        """(B,) bool each: the episode's metrics are complete with this step, and the episode ends
+        with it.
+        """
         task = self.task
         over = state.time - state.hold - task.approach_steps
         counts, terminal = over == 0, over >= state.after
@@ -358,14 +407,20 @@ class GraspEnv:
         return counts, terminal
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """Returns the environments with the scene of an engine that has simulated no step since the last `advance`."""
+        """Returns the environments with the scene of an engine that has simulated no step since the
+        last `advance`.
+        """
         moved = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
         return self._viewed(state, moved, self._followed(state))
 
     def _viewed(self, state: EnvState, moved: PhysicsState, followed: Action) -> EnvState:
-        """Returns the environments with their views of a scene in the carried frame, and these followed targets."""
+        """Returns the environments with their views of a scene in the carried frame, and these
+        followed targets.
+        """
         reset_state = state.reset_state
-        physical = {name: value for name, value in moved._asdict().items() if name in SceneState._fields}
+        physical = {
+            name: value for name, value in moved._asdict().items() if name in SceneState._fields
+        }
         scene = SceneState(
             **physical,
             q_target=followed.q_target,
@@ -382,8 +437,14 @@ class GraspEnv:
         sensed = None
         if state.readings is not None:
             first = state.tracker.first if state.tracker else cameras.world(len(scene.q))
-            begun = scene._replace(object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:])
-            shown = (state.camera.cloud, state.camera.goal) if state.camera else (state.surface, state.goal)
+            begun = scene._replace(
+                object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:]
+            )
+            shown = (
+                (state.camera.cloud, state.camera.goal)
+                if state.camera
+                else (state.surface, state.goal)
+            )
             sensed = self._view(sensing.seen_by(self.task, begun, state.readings), *shown)
         return state._replace(views=Views(self._view(scene, state.surface, state.goal), sensed))
 
@@ -400,12 +461,16 @@ class GraspEnv:
         """Scene of the current control step as observed by the policy."""
         assert state.views is not None, "call `with_scene` first"
         view = state.views.sensed or state.views.true
-        cloud, goal = (state.camera.cloud, state.camera.goal) if state.camera else (None, state.goal)
+        cloud, goal = (
+            (state.camera.cloud, state.camera.goal) if state.camera else (None, state.goal)
+        )
         return Scene(self.hand, self.task, *view, goal, state.readings, cloud)
 
     def privileged(self, state: EnvState) -> Scene:
         """Scene of the current control step as observed by a policy of the full state."""
-        return self.scene_of(state)._replace(task=dataclasses.replace(self.task, observation="full"))
+        return self.scene_of(state)._replace(
+            task=dataclasses.replace(self.task, observation="full")
+        )
 
     def critic_inputs(self, state: EnvState, masses: Array) -> Array:
         """Privileged inputs (B, P) of the critic; `masses` are those of `Settings`."""
@@ -430,17 +495,22 @@ class GraspEnv:
         steps = sensing.longest(task.sensing, task.control_dt)
         if task.observation == "camera":
             pose = jnp.concatenate([start.object_position, start.object_quaternion], -1)
-            found["camera"] = cameras.begin(task, initial.sensors, steps, pose, initial.surface, initial.goal)
+            found["camera"] = cameras.begin(
+                task, initial.sensors, steps, pose, initial.surface, initial.goal
+            )
             shown = cameras.world(len(pose))
         else:
-            found["tracker"] = sensing.begin(initial.sensors, steps, start.object_position, start.object_quaternion)
+            found["tracker"] = sensing.begin(
+                initial.sensors, steps, start.object_position, start.object_quaternion
+            )
             shown = found["tracker"].shown
         wrist = jnp.zeros((len(start.q), 6))
         first = Readings(start.q, wrist, start.q, wrist, shown[:, :3], shown[:, 3:])
         return {**found, "readings": sensing.still(first, task.history)}
 
     def _sense(self, state: EnvState, physics_state: PhysicsState, moved: PhysicsState) -> EnvState:
-        """Returns the environments with the sensors' readings after a control step, in the carried frame.
+        """Returns the environments with the sensors' readings after a control step, in the carried
+        frame.
 
         Args:
           state: the environments.
@@ -452,22 +522,37 @@ class GraspEnv:
         tracker, camera, pose = state.tracker, state.camera, cameras.world(len(moved.q))
         if tracker is not None:
             true = physics_state.object_position, physics_state.object_quaternion
-            tracker = sensing.track(tracker, state.time, *true, self.table_present(state), self.task.sensing.settle)
+            tracker = sensing.track(
+                tracker, state.time, *true, self.table_present(state), self.task.sensing.settle
+            )
             pose = tracker.shown - jnp.pad(protocols.up(state.frame.height), ((0, 0), (0, 4)))
         if camera is not None:
-            camera = cameras.look(self.hand, camera, state.time, moved, state.reset_state, state.surface)
-        newest = Readings(moved.q, moved.u, state.q_target, state.u_target, pose[:, :3], pose[:, 3:])
-        return state._replace(tracker=tracker, camera=camera, readings=sensing.push(state.readings, newest))
+            camera = cameras.look(
+                self.hand, camera, state.time, moved, state.reset_state, state.surface
+            )
+        newest = Readings(
+            moved.q, moved.u, state.q_target, state.u_target, pose[:, :3], pose[:, 3:]
+        )
+        return state._replace(
+            tracker=tracker, camera=camera, readings=sensing.push(state.readings, newest)
+        )
 
     def _followed(self, state: EnvState, newest: Action | None = None) -> Action:
-        """Returns the targets that the servos follow in a step with its `newest` targets, or followed in the last."""
+        """Returns the targets that the servos follow in a step with its `newest` targets, or
+        followed in the last.
+        """
         if state.readings is None or not self.task.sensing.latency[1]:
             return newest or Action(state.q_target, state.u_target)
         sensor = state.camera or state.tracker
         assert sensor is not None, "readings are of a sensor"
         past = Action(state.readings.q_target, state.readings.u_target)
         if newest is not None:
-            past = Action(*(jnp.concatenate([new[:, None], old], 1) for new, old in zip(newest, past, strict=True)))
+            past = Action(
+                *(
+                    jnp.concatenate([new[:, None], old], 1)
+                    for new, old in zip(newest, past, strict=True)
+                )
+            )
         steps = sensor.sensors.latency[:, None, None]
         return Action(*(jnp.take_along_axis(targets, steps, 1)[:, 0] for targets in past))
 

@@ -18,11 +18,27 @@ from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message
 
-_TRACED = "object_position", "object_quaternion", "contact_force", "q", "u", "q_target", "u_target", "action", "table"
+_TRACED = (
+    "object_position",
+    "object_quaternion",
+    "contact_force",
+    "q",
+    "u",
+    "q_target",
+    "u_target",
+    "action",
+    "table",
+)
 
 
 def episode_message(
-    hand: Hand, task: TaskConfig, trace: Trace, goal: Goal, surface: Surface, obj: GraspObject, meta: dict[str, Any]
+    hand: Hand,
+    task: TaskConfig,
+    trace: Trace,
+    goal: Goal,
+    surface: Surface,
+    obj: GraspObject,
+    meta: dict[str, Any],
 ) -> Message:
     """Returns the episode up to its end within the trace, or the whole trace if it does not end.
 
@@ -59,7 +75,9 @@ def episode_message(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array) -> tuple[Array, Array]:
+def _frames(
+    hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array
+) -> tuple[Array, Array]:
     """Frames (T, L, 3), (T, L, 4) of the links in the world frame."""
     local_position, local_quaternion = link_poses(hand, q)
     turn = jnp.broadcast_to(wrist_quaternion[:, None], local_quaternion.shape)
@@ -69,7 +87,11 @@ def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
     """Convex pieces and mesh of the object, as arrays of the message."""
     pieces = obj.pieces
-    colours = {"colour_points": obj.colours.points, "colour_values": obj.colours.values} if obj.colours else {}
+    colours = (
+        {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
+        if obj.colours
+        else {}
+    )
     return {
         "piece_kind": np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
         "piece_size": np.array([piece.size for piece in pieces], np.float64),

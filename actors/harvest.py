@@ -1,7 +1,8 @@
 """Reference poses and trajectories from the policy's grasps (paper, section Hand Morphology).
 
-Final states of successful episodes periodically replace poses of the constraint bank, unless a constraint excludes them
-(`Constraint.harvested`). Many of the goals of later episodes are thus feasible for this hand.
+Final states of successful episodes periodically replace poses of the constraint bank, unless a
+constraint excludes them (`Constraint.harvested`). Many of the goals of later episodes are thus
+feasible for this hand.
 """
 
 import contextlib
@@ -55,7 +56,8 @@ def collect(
     object_index: Array,
     region: Array,
 ) -> Grasps:
-    """Adds the grasps that succeeded in this step close to their heading, under constraints that allow references.
+    """Adds the grasps that succeeded in this step close to their heading, under constraints that
+    allow references.
 
     Args:
       scene: the control step.
@@ -83,18 +85,24 @@ def collect(
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "task"))
-def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array) -> ConstraintBank:
-    """Replaces random reference poses in the constraint bank by grasps of the same objects and regions.
+def renew(
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array
+) -> ConstraintBank:
+    """Replaces random reference poses in the constraint bank by grasps of the same objects and
+    regions.
 
-    Entries that are not allowed in any resting pose are replaced first; of the others only the first half. These form a
-    reservoir (Vitter 1985, algorithm R): after n grasps of an object and region, a further one is stored with
-    probability places / n, so that the references come from the policy at all ages, not only from the current one. A
-    policy trained with references from its latest grasps only held 97 % of these, but 66 % of another policy's.
+    Entries that are not allowed in any resting pose are replaced first; of the others only the
+    first half. These form a reservoir (Vitter 1985, algorithm R): after n grasps of an object and
+    region, a further one is stored with probability places / n, so that the references come from
+    the policy at all ages, not only from the current one. A policy trained with references from its
+    latest grasps only held 97 % of these, but 66 % of another policy's.
     """
     slot_key, path_key, chance_key = jax.random.split(key, 3)
     objects = bank.pose_q.shape[0]
     fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
-    path, turns, valid = make_references(hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points)
+    path, turns, valid = make_references(
+        hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points
+    )
     usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
     seen = bank.grasps.at[grasps.object_index, grasps.region].add(usable.astype(bank.grasps.dtype))
     unused = ~bank.pose_valid[grasps.object_index, grasps.region].any(1)
@@ -104,7 +112,8 @@ def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, ke
     own = jnp.arange(unused.shape[1]) < places
     slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.region, slot
-    # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a GPU.
+    # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a
+    # GPU.
     number = jnp.arange(slot.size)
     taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
     # Writes outside an array are dropped.
@@ -130,11 +139,13 @@ def references_file(run_dir: pathlib.Path, actor: str) -> pathlib.Path:
 
 
 def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
-    """Writes the bank's references for a restarted actor; a full disk is ignored, and the next start lacks them.
+    """Writes the bank's references for a restarted actor; a full disk is ignored, and the next
+    start lacks them.
 
-    They are collected over hundreds of updates. Without them, the goals of a restarted actor are less feasible: a run
-    on one H200 that was resumed at update 993 fell from 68 to 60 % of reference poses held, and took 250 updates to
-    recover. The file has the poses in half precision, 3 MB for 1,600 objects; trajectories to them are drawn again.
+    They are collected over hundreds of updates. Without them, the goals of a restarted actor are
+    less feasible: a run on one H200 that was resumed at update 993 fell from 68 to 60 % of
+    reference poses held, and took 250 updates to recover. The file has the poses in half precision,
+    3 MB for 1,600 objects; trajectories to them are drawn again.
     """
     arrays = {name: np.asarray(getattr(bank, name), np.float16) for name in _POSES}
     arrays["grasps"] = np.asarray(bank.grasps)
@@ -142,10 +153,18 @@ def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
         write_atomically(path, encode(Message(arrays, {"objects": _digest(bank)})))
 
 
-def with_kept_references(path: pathlib.Path, hand: Hand, task: TaskConfig, bank: ConstraintBank) -> ConstraintBank:
-    """Returns the bank with the references of a file; unchanged if the file is missing, damaged or of other objects."""
+def with_kept_references(
+    path: pathlib.Path, hand: Hand, task: TaskConfig, bank: ConstraintBank
+) -> ConstraintBank:
+    """Returns the bank with the references of a file; unchanged if the file is missing, damaged or
+    of other objects.
+    """
     message = read_kept(path)
-    if message is None or message.meta.get("objects") != _digest(bank) or message.arrays.keys() != {*_POSES, "grasps"}:
+    if (
+        message is None
+        or message.meta.get("objects") != _digest(bank)
+        or message.arrays.keys() != {*_POSES, "grasps"}
+    ):
         return bank
     if any(array.shape != getattr(bank, name).shape for name, array in message.arrays.items()):
         return bank

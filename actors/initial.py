@@ -1,4 +1,6 @@
-"""Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand Initialization)."""
+"""Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand
+Initialization).
+"""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -56,7 +58,9 @@ class RequestedEpisodes(NamedTuple):
     """A batch of requested episodes, before the priority rules; object frame."""
 
     goal: Goal
-    """Goal arrays; those of absent constraints may hold any finite values, and the active flags are ignored."""
+    """Goal arrays; those of absent constraints may hold any finite values, and the active flags are
+    ignored.
+    """
     asked: dict[str, Array]
     """(B,) bool for each optional constraint by name: True if requested."""
     surface: Surface
@@ -75,7 +79,8 @@ def sample(
 ) -> InitialConditions:
     """Draws objects, resting poses, constraints and initial hands at random.
 
-    Each constraint has random numbers of its own, so that adding one does not change the draws of the others.
+    Each constraint has random numbers of its own, so that adding one does not change the draws of
+    the others.
 
     Args:
       hand: the hand.
@@ -86,15 +91,24 @@ def sample(
       stationary: () bool, fixes the objects (the paper's first phase).
       rows: (K,) int, draws only these of the B episodes; all by default.
     """
-    uniform, sensors = _uniforms(hand, task, key, batch), draw_sensors(task.sensing, task.control_dt, key, batch)
+    uniform, sensors = (
+        _uniforms(hand, task, key, batch),
+        draw_sensors(task.sensing, task.control_dt, key, batch),
+    )
     if rows is not None:
         uniform, sensors = jax.tree.map(lambda numbers: numbers[rows], (uniform, sensors))
     episode = uniform[_TRAINING].T
     count = len(episode[0])
-    objects, rests = chance.weighted(episode[0], bank.weight), chance.index(episode[1], bank.rest.shape[1])
-    # A constraint that is never requested is a constant, so that its share of the program is not even compiled.
+    objects, rests = (
+        chance.weighted(episode[0], bank.weight),
+        chance.index(episode[1], bank.rest.shape[1]),
+    )
+    # A constraint that is never requested is a constant, so that its share of the program is not
+    # even compiled.
     wanted = {
-        c.name: uniform[c.name][:, 0] < share if (share := getattr(task, f"p_{c.name}")) else jnp.zeros(count, bool)
+        c.name: uniform[c.name][:, 0] < share
+        if (share := getattr(task, f"p_{c.name}"))
+        else jnp.zeros(count, bool)
         for c in optional(task)
     }
     active = active_blocks(wanted)
@@ -105,7 +119,9 @@ def sample(
     if task.disturbed_references:
         disturbance = jnp.where(episode[3] < task.disturbed_references, episode[4], 0.0)
     draw = Draw(bank, objects, rests, disturbance=disturbance)
-    return _drawn(hand, task, draw, uniform, sensors, wanted, stationary, _varied(task, *episode[5:]))
+    return _drawn(
+        hand, task, draw, uniform, sensors, wanted, stationary, _varied(task, *episode[5:])
+    )
 
 
 _TRAINING, _EPISODE = "training", "episode"
@@ -115,20 +131,23 @@ _TRAINING, _EPISODE = "training", "episode"
 def _uniforms(hand: Hand, task: TaskConfig, key: Array, batch: int) -> dict[str, Array]:
     """Random numbers (B, U) in [0, 1) of B episodes by name.
 
-    A constraint has two before those of `Constraint.sample`: whether it is requested, and its reference.
+    A constraint has two before those of `Constraint.sample`: whether it is requested, and its
+    reference.
     """
     numbers = {c.name: 2 + c.numbers(hand, task) for c in known(task)}
     return chance.uniforms(key, {_TRAINING: 8, _EPISODE: 5, **numbers}, batch)
 
 
 def _varied(task: TaskConfig, distance: Array, margin: Array, speed: Array) -> Approach:
-    """Approaches for training from random numbers (B,) in [0, 1): from near and far, at rest or in motion, with
-    different openings.
+    """Approaches for training from random numbers (B,) in [0, 1): from near and far, at rest or in
+    motion, with different openings.
     """
     near, far = task.back_off_range
     narrow, wide = task.preshape_margin
     back_off = near + (far - near) * distance
-    return Approach(back_off, narrow + (wide - narrow) * margin, speed * task.initial_speed * back_off / far)
+    return Approach(
+        back_off, narrow + (wide - narrow) * margin, speed * task.initial_speed * back_off / far
+    )
 
 
 def _nominal(task: TaskConfig, batch: int) -> Approach:
@@ -150,7 +169,12 @@ class PlannedEpisodes(NamedTuple):
 
 
 def planned(
-    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Mapping[str, Array]
+    hand: Hand,
+    task: TaskConfig,
+    bank: ConstraintBank,
+    key: Array,
+    plan: PlannedEpisodes,
+    asked: Mapping[str, Array],
 ) -> InitialConditions:
     """Draws planned episodes under the requested constraints, each from a separate key.
 
@@ -170,13 +194,24 @@ def planned(
         draw = Draw(bank, episode.objects[None], episode.rests[None])
         wanted = {name: jnp.reshape(flag, 1) for name, flag in asked.items()}
         sensors = draw_sensors(task.sensing, task.control_dt, own, 1)
-        return _drawn(hand, task, draw, _uniforms(hand, task, own, 1), sensors, wanted, False, _nominal(task, 1))
+        return _drawn(
+            hand,
+            task,
+            draw,
+            _uniforms(hand, task, own, 1),
+            sensors,
+            wanted,
+            False,
+            _nominal(task, 1),
+        )
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
 
 
 def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> np.ndarray:
-    """(N, R) bool: objects and resting poses for which the constraints of these names can be drawn together."""
+    """(N, R) bool: objects and resting poses for which the constraints of these names can be drawn
+    together.
+    """
     objects, rests = (jnp.asarray(axis.ravel()) for axis in np.indices(bank.has_affordance.shape))
     wanted = {c.name: jnp.full(objects.shape, c.name in asked) for c in optional(task)}
     draw, found = _available(task, Draw(bank, objects, rests), wanted)
@@ -188,16 +223,22 @@ def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> 
     return np.asarray(fine).reshape(bank.has_affordance.shape)
 
 
-def _available(task: TaskConfig, draw: Draw, wanted: Mapping[str, Array]) -> tuple[Draw, dict[str, Array]]:
-    """Returns the draw with its region, and the available ones of the wanted constraints (B,), in order."""
+def _available(
+    task: TaskConfig, draw: Draw, wanted: Mapping[str, Array]
+) -> tuple[Draw, dict[str, Array]]:
+    """Returns the draw with its region, and the available ones of the wanted constraints (B,), in
+    order.
+    """
     asked, draw = {}, draw._replace(region=jnp.zeros_like(draw.objects))
     for constraint in optional(task):
         asked[constraint.name] = wanted[constraint.name] & constraint.available(draw)
-        draw = draw._replace(region=jnp.maximum(draw.region, constraint.region * asked[constraint.name]))
+        draw = draw._replace(
+            region=jnp.maximum(draw.region, constraint.region * asked[constraint.name])
+        )
     return draw, asked
 
 
-def _drawn(
+def _drawn(  # noqa: PLR0913
     hand: Hand,
     task: TaskConfig,
     draw: Draw,
@@ -207,7 +248,8 @@ def _drawn(
     stationary: Array | bool,
     approach: Approach,
 ) -> InitialConditions:
-    """Draws the rest of B episodes with given objects, resting poses, sensors and (where available) constraints.
+    """Draws the rest of B episodes with given objects, resting poses, sensors and (where available)
+    constraints.
 
     `uniform` are numbers of `_uniforms`.
     """
@@ -244,13 +286,17 @@ def _drawn(
 
 
 def _references(
-    task: TaskConfig, draw: Draw, asked: Mapping[str, Array], uniform: Mapping[str, Array], common: Array
+    task: TaskConfig,
+    draw: Draw,
+    asked: Mapping[str, Array],
+    uniform: Mapping[str, Array],
+    common: Array,
 ) -> dict[str, Array]:
     """Index (B,) of the reference of each constraint that is drawn from references.
 
-    Each constraint draws independently (the paper's potentially misaligned pairs). With `aligned_references`, all use
-    one that every requested constraint allows, by the random numbers `common` (B,); where there is none, each draws
-    independently.
+    Each constraint draws independently (the paper's potentially misaligned pairs). With
+    `aligned_references`, all use one that every requested constraint allows, by the random numbers
+    `common` (B,); where there is none, each draws independently.
     """
     together = _allowed_together(task, draw, asked)
     found = {}
@@ -275,18 +321,25 @@ def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) 
 
 
 def handover_speed(hand: Hand, task: TaskConfig) -> float:
-    """Wrist speed (m/s) at the end of a planned reach: nine tenths of that at which the guidance moves it on.
+    """Wrist speed (m/s) at the end of a planned reach: nine tenths of that at which the guidance
+    moves it on.
 
-    A target that leads by d moves the wrist at d stiffness / damping. A slower reach has a second peak after it.
+    A target that leads by d moves the wrist at d stiffness / damping. A slower reach has a second
+    peak after it.
     """
     stiffness, damping = hand.wrist_servos[:, 0]
     return float(0.9 * task.control.approach_position_limit * stiffness / damping)
 
 
 def given(
-    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: Array | int, speed: Array | float
+    hand: Hand,
+    task: TaskConfig,
+    request: RequestedEpisodes,
+    hold: Array | int,
+    speed: Array | float,
 ) -> tuple[InitialConditions, Resolution]:
-    """Returns requested episodes of one object of nominal mass and friction, and the effects of the priority rules.
+    """Returns requested episodes of one object of nominal mass and friction, and the effects of the
+    priority rules.
 
     The policy observes the true pose of the object, whatever tracker it was trained with.
 
@@ -315,10 +368,12 @@ def given(
     )
     holds = jnp.full(batch, hold, jnp.int32)
     sensors = draw_sensors(SensingConfig(), task.control_dt, jax.random.key(0), batch)
-    return InitialConditions(reset_state, resolution.goal, request.surface, index, holds, sensors), resolution
+    return InitialConditions(
+        reset_state, resolution.goal, request.surface, index, holds, sensors
+    ), resolution
 
 
-def start(
+def start(  # noqa: PLR0913
     hand: Hand,
     task: TaskConfig,
     goal: Goal,
@@ -332,10 +387,14 @@ def start(
     gain_scale: Array,
     stationary: Array,
 ) -> ResetState:
-    """Returns initial conditions with the hand where its constraints place it, for objects in resting poses (B, 7)."""
+    """Returns initial conditions with the hand where its constraints place it, for objects in
+    resting poses (B, 7).
+    """
     q, base_position, base_quaternion = initial_hand(hand, task, goal, surface, rest, approach)
     along = rotations.rotate(rest[:, 3:], goal["heading"].direction)
-    velocity = rotations.rotate(rotations.conjugate(base_quaternion), approach.speed[:, None] * along)
+    velocity = rotations.rotate(
+        rotations.conjugate(base_quaternion), approach.speed[:, None] * along
+    )
     return ResetState(
         object_index=objects,
         mass_scale=mass_scale,
@@ -352,12 +411,18 @@ def start(
 
 
 def initial_hand(
-    hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: Array, approach: Approach | None = None
+    hand: Hand,
+    task: TaskConfig,
+    goal: Goal,
+    surface: Surface,
+    rest: Array,
+    approach: Approach | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the constraints.
+    """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the
+    constraints.
 
-    With `TaskConfig.preshape` the fingers are opened to the object's width at the heading, unless a constraint sets
-    them. A hand that would be in the table is raised.
+    With `TaskConfig.preshape` the fingers are opened to the object's width at the heading, unless a
+    constraint sets them. A hand that would be in the table is raised.
 
     Args:
       hand: the hand.
@@ -379,13 +444,24 @@ def initial_hand(
     for constraint in known(task):
         if (wrist := constraint.initial_wrist(hand, approach.back_off, goal, q)) is not None:
             where = wrist[0][:, None]
-            position, quaternion = jnp.where(where, wrist[1], position), jnp.where(where, wrist[2], quaternion)
+            position, quaternion = (
+                jnp.where(where, wrist[1], position),
+                jnp.where(where, wrist[2], quaternion),
+            )
     position, quaternion = rotations.compose_pose(rest[:, :3], rest[:, 3:], position, quaternion)
-    return q, position.at[:, 2].add(jnp.maximum(_CLEARANCE - _lowest(hand, q, position, quaternion), 0.0)), quaternion
+    return (
+        q,
+        position.at[:, 2].add(
+            jnp.maximum(_CLEARANCE - _lowest(hand, q, position, quaternion), 0.0)
+        ),
+        quaternion,
+    )
 
 
 def _lowest(hand: Hand, q: Array, position: Array, quaternion: Array) -> Array:
-    """Height (B,) in m over the table of the lowest point of hands at wrist poses (B, 3), (B, 4), world frame."""
+    """Height (B,) in m over the table of the lowest point of hands at wrist poses (B, 3), (B, 4),
+    world frame.
+    """
     ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(len(q), -1, 3)
     height = jnp.sum(rotations.to_matrix(quaternion)[:, None, 2] * ends, -1) + position[:, 2:]
     return jnp.min(height - np.repeat(hand.capsule_radii, 2), -1)

@@ -1,8 +1,9 @@
 """Actor side of the link: configuration, tickets, weights, and exactly-once delivery of rollouts.
 
-`upload` assigns a rollout its identity (actor, incarnation, sequence), under which it is sent until the learner
-replies, across restarts of the learner (`Uploads`). Sending happens in the background, while the next rollout is
-produced; at most `window` rollouts are in transit, further ones wait in `upload`.
+`upload` assigns a rollout its identity (actor, incarnation, sequence), under which it is sent until
+the learner replies, across restarts of the learner (`Uploads`). Sending happens in the background,
+while the next rollout is produced; at most `window` rollouts are in transit, further ones wait in
+`upload`.
 """
 
 import contextlib
@@ -28,15 +29,19 @@ Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # slowest link that is waited for, bytes/s
 _LONGEST_TICK = 1.0  # s
-_NOTICED, _NOTICE_AGAIN = 5.0, 60.0  # silence after which a line is logged, and time between two lines, s
+# Silence after which a line is logged, and time between two lines, s
+_NOTICED, _NOTICE_AGAIN = (
+    5.0,
+    60.0,
+)
 _log = logging.getLogger(__name__)
 
 
 class Patience:
     """Limit of the learner's silence, in seconds during which this process ran.
 
-    An interval in which the process was frozen or starved counts as one second. `now` must therefore be called at least
-    once a second.
+    An interval in which the process was frozen or starved counts as one second. `now` must
+    therefore be called at least once a second.
 
     Attributes:
       limit: longest silence, s.
@@ -71,11 +76,14 @@ class Patience:
         silence = now - answered
         if silence > self.limit:
             raise TransportError(
-                f"The learner has not answered for {self.limit:g} s: {error}", "Start the actor again later."
+                f"The learner has not answered for {self.limit:g} s: {error}",
+                "Start the actor again later.",
             ) from None
         if silence > _NOTICED and now - self._noticed > _NOTICE_AGAIN:
             self._noticed = now
-            _log.warning("The learner does not answer; waiting for up to %g s: %s", self.limit, error)
+            _log.warning(
+                "The learner does not answer; waiting for up to %g s: %s", self.limit, error
+            )
 
 
 class _Upload(NamedTuple):
@@ -90,11 +98,11 @@ class Uploads:
 
     Attributes:
       failure: the reason why sending has stopped, if it has; also set by the owner.
-      free: acquired by the owner for each queued rollout; released when that rollout has its outcome.
-      closed: set once sending has been stopped.
+      free: acquired by the owner for each queued rollout; released when that rollout has its
+      outcome. closed: set once sending has been stopped.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         transport: Transport,
         key: str,
@@ -143,7 +151,9 @@ class Uploads:
         self.failure, self._refusals = None, 0
 
     def wait(self, timeout: float) -> bool:
-        """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
+        """Waits until every rollout has its outcome; False if that takes longer than `timeout`
+        seconds.
+        """
         deadline = time.monotonic() + timeout
         for outcome in list(self._pending):
             try:
@@ -177,8 +187,12 @@ class Uploads:
         """Sends one rollout until it has an outcome."""
         answered = self._patience.now()
         damaged = 0
-        # Repeating a query in transit would only fill a slow link; a dead link ends the query by itself.
-        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience.limit)
+        # Repeating a query in transit would only fill a slow link; a dead link ends the query by
+        # itself.
+        timeout = min(
+            self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST,
+            self._patience.limit,
+        )
         delays = backoff()
         while not self.closed.is_set():
             delay = next(delays)
@@ -268,7 +282,7 @@ class Ticket(NamedTuple):
 class ActorLink(Closing):
     """An actor's connection to its learner, for use by one thread."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         transport: Transport,
         run: str,
@@ -294,7 +308,10 @@ class ActorLink(Closing):
         """
         self.keys = Keys(run)
         self.actor = actor
-        self._ticket_key, self._weights_key = self.keys.ticket(actor), self.keys.weights_for("actor", actor)
+        self._ticket_key, self._weights_key = (
+            self.keys.ticket(actor),
+            self.keys.weights_for("actor", actor),
+        )
         self.incarnation = secrets.token_hex(4)
         self._transport = transport
         self._timeout = request_timeout
@@ -338,7 +355,8 @@ class ActorLink(Closing):
         return self._info
 
     def acquire_ticket(self, timeout: float) -> Ticket | None:
-        """Waits for permission to produce a rollout; returns None if there is none within `timeout` seconds.
+        """Waits for permission to produce a rollout; returns None if there is none within `timeout`
+        seconds.
 
         An unreachable learner grants nothing.
 
@@ -374,7 +392,8 @@ class ActorLink(Closing):
             self._transport.query(self._ticket_key, request, timeout=self._timeout)
 
     def weights(self, newer_than: int) -> Message | None:
-        """Returns the latest policy bundle, or None if the caller has it already or the learner is unreachable.
+        """Returns the latest policy bundle, or None if the caller has it already or the learner is
+        unreachable.
 
         Sends no request unless the learner has announced another version.
 
@@ -405,11 +424,12 @@ class ActorLink(Closing):
         return reply
 
     def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
-        """Queues a rollout for sending in the background; waits while `window` others are in transit.
+        """Queues a rollout for sending in the background; waits while `window` others are in
+        transit.
 
         Args:
-          rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds the identity.
-          ticket: ticket of the rollout.
+          rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds the
+          identity. ticket: ticket of the rollout.
 
         Returns:
           Future of its outcome.
@@ -436,7 +456,9 @@ class ActorLink(Closing):
         return self._uploads.put(message)
 
     def flush(self, timeout: float) -> bool:
-        """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
+        """Waits until every rollout has its outcome; False if that takes longer than `timeout`
+        seconds.
+        """
         return self._uploads.wait(timeout)
 
     def close(self) -> None:
@@ -449,7 +471,9 @@ class ActorLink(Closing):
         return {"actor": self.actor, "incarnation": self.incarnation, "ticket": ticket}
 
     def _check(self) -> None:
-        """Raises the error that stops the link: a failure of the uploads, the end of the run, or its closing."""
+        """Raises the error that stops the link: a failure of the uploads, the end of the run, or
+        its closing.
+        """
         if self._uploads.failure:
             raise self._uploads.failure
         if self._finished:
@@ -483,7 +507,9 @@ class ActorLink(Closing):
         while True:
             rest = max(0.05, deadline - self._patience.now())
             try:
-                return self._transport.query(key, Message(meta=meta), timeout=min(self._timeout, rest))
+                return self._transport.query(
+                    key, Message(meta=meta), timeout=min(self._timeout, rest)
+                )
             except RefusedError:
                 raise
             except TransportError:
@@ -500,5 +526,6 @@ class ActorLink(Closing):
 def _restarted(before: str, now: Any) -> RunRestarted:
     """Error for a changed run id."""
     return RunRestarted(
-        f"The learner started another training (run id {now} after {before}).", "The actor starts over."
+        f"The learner started another training (run id {now} after {before}).",
+        "The actor starts over.",
     )

@@ -56,35 +56,47 @@ class Follower:
         """Drops the followed episode, because the environments restart."""
         self._begun = None
 
-    def add(self, trace: Trace, before: EnvState | None, after: EnvState, *, due: bool) -> Followed | None:
+    def add(
+        self, trace: Trace, before: EnvState | None, after: EnvState, *, due: bool
+    ) -> Followed | None:
         """Adds a rollout.
 
         Args:
           trace: (T, ...) trace of environment 0.
-          before: the environments before the rollout, if environment 0 was at the beginning of an episode.
-          after: the environments after the rollout.
+          before: the environments before the rollout, if environment 0 was at the beginning of an
+          episode. after: the environments after the rollout.
           due: follows an episode that begins in the rollout, if none is being followed.
 
         Returns:
-          The episode, once its last rollout arrives; None if a later episode ends in the same rollout, since the
-          rollout only has metrics of its last one.
+          The episode, once its last rollout arrives; None if a later episode ends in the same
+          rollout, since the rollout only has metrics of its last one.
         """
         if self._begun is not None:
             parts = zip(self._begun.trace, trace, strict=True)
-            self._begun = self._begun._replace(trace=Trace(*(np.concatenate([*fields]) for fields in parts)))
+            self._begun = self._begun._replace(
+                trace=Trace(*(np.concatenate([*fields]) for fields in parts))
+            )
         elif due and before is not None:
             self._begun = _begun(before, trace, 0)
-        elif due and len(ends := np.flatnonzero(np.asarray(trace.terminal))) and ends[-1] + 1 < len(trace.terminal):
+        elif (
+            due
+            and len(ends := np.flatnonzero(np.asarray(trace.terminal)))
+            and ends[-1] + 1 < len(trace.terminal)
+        ):
             self._begun = _begun(after, trace, int(ends[-1]) + 1)
         if self._begun is None or not len(ends := np.flatnonzero(self._begun.trace.terminal)):
             return None
-        whole = self._begun._replace(trace=Trace(*(field[: ends[0] + 1] for field in self._begun.trace)))
+        whole = self._begun._replace(
+            trace=Trace(*(field[: ends[0] + 1] for field in self._begun.trace))
+        )
         self._begun = None
         return whole if len(ends) == 1 else None
 
 
 def _begun(state: EnvState, trace: Trace, first: int) -> Followed:
-    """Returns an episode with the goal and object of a state, whose trace begins with step `first` of a rollout."""
+    """Returns an episode with the goal and object of a state, whose trace begins with step `first`
+    of a rollout.
+    """
     return Followed(
         state.goal.row(0),
         jax.tree.map(lambda array: np.asarray(array[0]), state.surface),
@@ -99,7 +111,7 @@ _SAVE_SECONDS = 60.0
 """Seconds between two writes of the reference poses from the policy's grasps."""
 
 
-def run_actor(
+def run_actor(  # noqa: PLR0913
     transport: Transport,
     *,
     run: str,
@@ -117,8 +129,8 @@ def run_actor(
     Args:
       transport: transport connected to the learner.
       run: name of the run.
-      actor: this actor's name, unique in the run; it also determines the actor's objects and random numbers.
-      stop: ends the actor between two rollouts.
+      actor: this actor's name, unique in the run; it also determines the actor's objects and random
+      numbers. stop: ends the actor between two rollouts.
       physics: engine; that of the run by default.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
@@ -135,7 +147,9 @@ def run_actor(
                 info = link.config(patience)
                 config = run_config_from_json(info.config)
                 engine = physics or config.physics
-                _Actor(config, info, link, transport, engine, threads, on_rollout, references).act(stop)
+                _Actor(config, info, link, transport, engine, threads, on_rollout, references).act(
+                    stop
+                )
                 link.flush(_FLUSH_SECONDS)
                 return
             except RunFinished:
@@ -156,7 +170,7 @@ def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.nda
 class _Actor:
     """Environments, policy and counters of one actor."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         config: RunConfig,
         info: RunInfo,
@@ -169,12 +183,21 @@ class _Actor:
     ):
         arrays, remedy = info.arrays, "Start the actor with the learner's version of congrasp."
         if unknown := set(arrays) - RECORDABLE.keys():
-            what = f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}."
+            what = (
+                f"The learner's algorithm needs arrays that actors do not record: "
+                f"{', '.join(sorted(unknown))}."
+            )
             raise CongraspError(what, remedy)
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
-        self._hand, self._spec = get_hand(config.task.hand), policy_spec(config.task, config.network)
+        self._hand, self._spec = (
+            get_hand(config.task.hand),
+            policy_spec(config.task, config.network),
+        )
         if self._spec.schema != info.schema:
-            what = f"The learner's policies have the schema {info.schema}; this actor's have {self._spec.schema}."
+            what = (
+                f"The learner's policies have the schema {info.schema}; this actor's have "
+                f"{self._spec.schema}."
+            )
             raise CongraspError(what, remedy)
         prepare_physics(physics, self._hand, config.task)
         self._number = zlib.crc32(link.actor.encode())
@@ -184,7 +207,9 @@ class _Actor:
         training = training_set(self._hand, config, self._number)
         self._objects = training.objects
         with stage("engine"):
-            self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
+            self._physics = make_physics(
+                physics, self._hand, config.task, self._objects, threads=threads
+            )
         self._worker = RolloutWorker(
             self._hand,
             config.task,
@@ -214,10 +239,14 @@ class _Actor:
         self._follower = Follower()
 
     def _compile(self, training: TrainingSet) -> None:
-        """Compiles the programs of a compiled engine's rollouts before the bank of the training set is built."""
+        """Compiles the programs of a compiled engine's rollouts before the bank of the training set
+        is built.
+        """
         if self._physics.compiled:
             with stage("programs"):
-                self._worker.compile(training.form(), self._spec.inference_form, self._config.rollout_steps)
+                self._worker.compile(
+                    training.form(), self._spec.inference_form, self._config.rollout_steps
+                )
 
     def act(self, stop: threading.Event) -> None:
         """Produces rollouts until `stop` is set or the run ends."""
@@ -258,21 +287,27 @@ class _Actor:
         self._failures = self._failure_weights(bank)
 
     def _warm_up(self, stop: threading.Event) -> None:
-        """Waits for the first policy, and compiles the programs around an engine that JAX cannot trace.
+        """Waits for the first policy, and compiles the programs around an engine that JAX cannot
+        trace.
 
-        This is before the first ticket is requested, so that its rollout is not stale when it is finished.
+        This is before the first ticket is requested, so that its rollout is not stale when it is
+        finished.
         """
         while not self._refresh():
             if stop.is_set():
                 return
-            if ticket := self._link.acquire_ticket(_TICKET_SECONDS):  # waits for the learner, but not indefinitely
+            if ticket := self._link.acquire_ticket(
+                _TICKET_SECONDS
+            ):  # waits for the learner, but not indefinitely
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
         if self._physics.compiled:
             return
         with stage("programs"):
-            for _ in range(2):  # the second time, after a restart of environments, which is traced separately
+            for _ in range(
+                2
+            ):  # the second time, after a restart of environments, which is traced separately
                 self._worker.collect(self._bundle.inference_parameters, self._config.rollout_steps)
                 self._worker.restart()
 
@@ -280,7 +315,8 @@ class _Actor:
         """Sets the curriculum's weights and phase under the policy of this version."""
         config = self._config
         self._worker.configure(
-            config.curriculum.weights(config.task.reward, version), stationary=config.curriculum.stationary(version)
+            config.curriculum.weights(config.task.reward, version),
+            stationary=config.curriculum.stationary(version),
         )
 
     def _refresh(self) -> bool:
@@ -299,7 +335,9 @@ class _Actor:
         self._configure(bundle.version)
         started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
         with stage("first rollout"):
-            rollout = jax.block_until_ready(self._worker.collect(bundle.inference_parameters, config.rollout_steps))
+            rollout = jax.block_until_ready(
+                self._worker.collect(bundle.inference_parameters, config.rollout_steps)
+            )
         steps = config.rollout_steps * config.environments
         taken = {name: getattr(rollout, name) for name in self._arrays}
         episodes, left_out = countable(finished_episodes(rollout, config.task))
@@ -325,11 +363,16 @@ class _Actor:
             **buffer_occupancy(np.asarray(rollout.occupancy)),
             **(self._failures.metrics() if self._failures is not None else {}),
         }
-        self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
+        self._publish(
+            "metrics",
+            Message({}, {"time": time.time(), "version": bundle.version, "values": values}),
+        )
         self._on_rollout({"version": float(bundle.version), **values})
         due, after = self._rollouts >= self._next_episode, self._worker.state
         assert after is not None
-        if episode := self._follower.add(rollout.trace, before if started_fresh else None, after, due=due):
+        if episode := self._follower.add(
+            rollout.trace, before if started_fresh else None, after, due=due
+        ):
             self._publish_episode(bundle, rollout, episode)
             self._next_episode = self._rollouts + config.episode_every
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
@@ -339,7 +382,9 @@ class _Actor:
             self._renew_objects()
 
     def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
-        """Returns a rollout's first environments, with the metadata that a reader needs to parse the arrays."""
+        """Returns a rollout's first environments, with the metadata that a reader needs to parse
+        the arrays.
+        """
         meta = {
             "time": time.time(),
             "version": bundle.version,
@@ -350,12 +395,23 @@ class _Actor:
             "layout": [[name, size] for name, size in self._spec.layout],
             "environments": self._config.environments,
         }
-        return Message(first_environments(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
+        return Message(
+            first_environments(
+                arrays, self._config.log_rollout_worlds or self._config.environments
+            ),
+            meta,
+        )
 
     def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, episode: Followed) -> None:
         """Publishes the episode of environment 0."""
-        episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
-        metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
+        episodes = dict(
+            zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True)
+        )
+        metrics = {
+            name.removeprefix("episode/"): float(v)
+            for name, v in episodes.items()
+            if "episode/" in name
+        }
         obj = self._objects[episode.object_index]
         meta = {
             "time": time.time(),
@@ -386,7 +442,9 @@ class _Since(NamedTuple):
 
 
 def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
-    """Metrics of `Rollout.occupancy`: steps that exceeded contacts or rows, the fullest, and unconverged solutions."""
+    """Metrics of `Rollout.occupancy`: steps that exceeded contacts or rows, the fullest, and
+    unconverged solutions.
+    """
     buffers, limited = occupancy[:, :2], occupancy[:, 2]
     contacts, rows = buffers.max(0)
     return {
@@ -398,6 +456,8 @@ def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
 
 
 def countable(episodes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
-    """Returns the episodes with finite metrics (E,), and the number of others, which the learner would reject."""
+    """Returns the episodes with finite metrics (E,), and the number of others, which the learner
+    would reject.
+    """
     fine = np.isfinite(np.stack(list(episodes.values()))).all(0)
     return {name: values[fine] for name, values in episodes.items()}, int((~fine).sum())

@@ -1,7 +1,7 @@
 """Rollouts and the compiled functions that produce them.
 
-With an engine that JAX can trace the whole rollout is one program (`jax.lax.scan`); otherwise the same functions are
-compiled separately around the engine's step. `actors.worker` drives both.
+With an engine that JAX can trace the whole rollout is one program (`jax.lax.scan`); otherwise the
+same functions are compiled separately around the engine's step. `actors.worker` drives both.
 """
 
 import functools
@@ -30,13 +30,13 @@ from congrasp.common.task.types import Action, Array
 ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
 Probe = Callable[[Scene, Array, Any], Any]
-"""(scene after a control step, indices of the objects (B,), `Settings.probe_data`) -> a pytree of arrays to record for
-every environment and step."""
+"""(scene after a control step, indices of the objects (B,), `Settings.probe_data`) -> a pytree of
+arrays to record for every environment and step."""
 Traced = Literal["first", "all", "none"]
 """Environments whose steps are recorded (`Trace`)."""
 _RENEWALS, _LEAST_TOGETHER = 64, 8
-"""A batch of new episodes is this fraction of the environments, and at least so many: about three times as many as end
-in a control step."""
+"""A batch of new episodes is this fraction of the environments, and at least so many: about three
+times as many as end in a control step."""
 _WHICH: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
 
 
@@ -45,7 +45,8 @@ def no_probe(scene: Scene, index: Array, data: Any) -> None:
 
 
 class Trace(NamedTuple):
-    """Recorded values of one environment, or of several, at every step, for logs and pictures (T leads).
+    """Recorded values of one environment, or of several, at every step, for logs and pictures (T
+    leads).
 
     Poses are in the world frame, even if the policy observes a carried frame (`actors.stress`).
     """
@@ -89,7 +90,9 @@ class Rollout(NamedTuple):
     last_observation: Array
     """(B, D)."""
     episodes: Array
-    """(B, fields) metrics of the last finished episode of each environment, in the order of `episode_fields`."""
+    """(B, fields) metrics of the last finished episode of each environment, in the order of
+    `episode_fields`.
+    """
     has_episode: Array
     """(B,) bool."""
     trace: Trace
@@ -131,7 +134,7 @@ class Programs:
     The methods with an underscore are what the attributes without it compile.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         hand: Hand,
         task: TaskConfig,
@@ -144,7 +147,8 @@ class Programs:
         traced: Traced,
         taught: bool,
     ):
-        """Declares the functions; nothing is compiled yet. `actors.worker.RolloutWorker` describes the arguments.
+        """Declares the functions; nothing is compiled yet. `actors.worker.RolloutWorker` describes
+        the arguments.
 
         Args:
           engine: an engine that JAX can trace; None for one that is stepped between the functions.
@@ -169,25 +173,37 @@ class Programs:
         return initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
 
     def _begin(self, conditions: InitialConditions, kept: EnvState | None) -> EnvState:
-        """Starts episodes in every environment; a compiled engine is started or, if it runs already, reset."""
+        """Starts episodes in every environment; a compiled engine is started or, if it runs
+        already, reset.
+        """
         if self._engine is None:
             return self.env.state_of(conditions, None)
         if kept is None:
             return self.env.reset(conditions)
-        physics = self._engine.reset(kept.physics, jnp.ones(self._batch, bool), conditions.reset_state)
+        physics = self._engine.reset(
+            kept.physics, jnp.ones(self._batch, bool), conditions.reset_state
+        )
         return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
 
     def _restart(self, state: EnvState, mask: Array, conditions: InitialConditions) -> EnvState:
         """Starts these episodes in the masked environments (B,); see `GraspEnv.restart`."""
-        return self.env.restart(state, jnp.where(mask, jnp.arange(self._batch), self._batch), conditions)
+        return self.env.restart(
+            state, jnp.where(mask, jnp.arange(self._batch), self._batch), conditions
+        )
 
-    def _renew(self, bank: ConstraintBank, state: EnvState, key: Array, stationary: Array, ended: Array) -> EnvState:
-        """Draws new episodes for environments whose episodes ended (B,), a small batch at a time."""
+    def _renew(
+        self, bank: ConstraintBank, state: EnvState, key: Array, stationary: Array, ended: Array
+    ) -> EnvState:
+        """Draws new episodes for environments whose episodes ended (B,), a small batch at a
+        time.
+        """
 
         def some(carry: tuple[EnvState, Array]) -> tuple[EnvState, Array]:
             state, left = carry
             rows = jnp.nonzero(left, size=self._together, fill_value=self._batch)[0]
-            fresh = initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary, rows)
+            fresh = initial.sample(
+                self.env.hand, self.env.task, bank, key, self._batch, stationary, rows
+            )
             return self.env.restart(state, rows, fresh), left.at[rows].set(False, mode="drop")
 
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (state, ended))[0]
@@ -200,17 +216,25 @@ class Programs:
             given = self.env.privileged(state), self.env.seen(state), settings.control
             everything = observe_for_teacher(*given).astype(self._dtype)
         masses = settings.masses
-        inputs = None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
+        inputs = (
+            None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
+        )
         return _Seen(observation, everything, inputs)
 
-    def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
+    def _decide(
+        self, parameters: Any, settings: Settings, state: EnvState, key: Array
+    ) -> _Decision:
         """Returns observation, action and joint targets of the coming step."""
         seen = self._look(state, settings)
-        action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), key)
+        action, log_probability = self._policy(
+            parameters, seen.observation.astype(jnp.float32), key
+        )
         target, command = self.env.targets(state, action, settings)
         return _Decision(seen, action, log_probability, target, command)
 
-    def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
+    def _kept(
+        self, state: EnvState, action: Array, transition: Transition, settings: Settings
+    ) -> tuple[Trace, Any]:
         """Returns the recorded values of trace and probe of a step."""
         scene = self.env.scene_of(state)
         probed = self._probe(scene, state.reset_state.object_index, settings.probe_data)
@@ -225,14 +249,18 @@ class Programs:
         decision: _Decision,
         key_data: Array,
     ) -> tuple[dict[str, Any], Transition, tuple[Trace, Any], _Decision]:
-        """Completes a control step and decides on the next one: one call between two steps of the engine.
+        """Completes a control step and decides on the next one: one call between two steps of the
+        engine.
 
-        Only the changed part of the state is returned, because every array that passes through a call has a cost.
+        Only the changed part of the state is returned, because every array that passes through a
+        call has a cost.
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
         kept = self._kept(after, decision.action, transition, settings)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(key_data))
-        changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
+        changed = {
+            name: new for name, new in after._asdict().items() if new is not getattr(state, name)
+        }
         changed.pop("views")
         return changed, transition, kept, following
 
@@ -257,7 +285,9 @@ class Programs:
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry
             seen = self._look(state, settings)
-            action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), step_key)
+            action, log_probability = self._policy(
+                parameters, seen.observation.astype(jnp.float32), step_key
+            )
             state, transition = self.env.step(state, action, settings)
             kept = self._kept(state, action, transition, settings)
             carry = state, episode_key
@@ -273,22 +303,28 @@ class Programs:
 
 @functools.lru_cache(maxsize=16)
 def _shared(hand: Hand, task: TaskConfig, policy: ActFunction, **settings: Any) -> Programs:
-    """Returns the programs around an engine that is stepped between them; the same ones for the same arguments."""
+    """Returns the programs around an engine that is stepped between them; the same ones for the
+    same arguments.
+    """
     return Programs(hand, task, None, policy, **settings)
 
 
-def programs_of(hand: Hand, task: TaskConfig, engine: Physics, policy: ActFunction, **settings: Any) -> Programs:
+def programs_of(
+    hand: Hand, task: TaskConfig, engine: Physics, policy: ActFunction, **settings: Any
+) -> Programs:
     """Returns the programs of rollouts on an engine.
 
-    Workers on equal tasks share them, so that each is compiled once in a process; the programs of an engine that JAX
-    can trace belong to that engine.
+    Workers on equal tasks share them, so that each is compiled once in a process; the programs of
+    an engine that JAX can trace belong to that engine.
     """
     if engine.compiled:
         return Programs(hand, task, engine, policy, **settings)
     return _shared(hand, task, policy, **settings)
 
 
-def row_of(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
+def row_of(
+    seen: _Seen, action: Array, log_probability: Array, transition: Transition
+) -> dict[str, Any]:
     """Fields of a `Rollout` for one control step."""
     return {
         **seen._asdict(),
@@ -301,8 +337,12 @@ def row_of(seen: _Seen, action: Array, log_probability: Array, transition: Trans
     }
 
 
-def rollout_of(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
-    """Returns the rollout of stacked rows (`row_of`) that ends in this state, with the observations `last`."""
+def rollout_of(
+    state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any
+) -> Rollout:
+    """Returns the rollout of stacked rows (`row_of`) that ends in this state, with the observations
+    `last`.
+    """
     return Rollout(
         **columns,
         last_observation=last.observation,
@@ -314,12 +354,17 @@ def rollout_of(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Tra
     )
 
 
-def _traced(scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice) -> Trace:
+def _traced(
+    scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice
+) -> Trace:
     """Recorded values of a step for one environment, or for several."""
     state, features = scene.state, scene.features
-    force = jnp.sum(jnp.where(state.contact_found[where][..., None], state.contact_force[where], 0.0), -2)
+    force = jnp.sum(
+        jnp.where(state.contact_found[where][..., None], state.contact_force[where], 0.0), -2
+    )
     errors = [
-        a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(scene.task))
+        a[where] / jnp.maximum(b[where], 1.0)
+        for a, b in (transition.errors[s.name] for s in metrics.specs(scene.task))
     ]
     way, slid = protocols.up(frame.height), protocols.slides(state.base_quaternion, frame.height)
     return Trace(

@@ -1,8 +1,9 @@
 """Stress test of a grasp after the table is removed: the hand is lifted, and the object is pushed.
 
-The lift is a moving frame: the policy observes hand and object relative to it, so that features and goals are
-independent of the lift, and the wrist's joint targets include the motion of the frame. Pushes are forces on the object.
-Both depend on the control steps since the table's removal; the episode is otherwise unchanged.
+The lift is a moving frame: the policy observes hand and object relative to it, so that features and
+goals are independent of the lift, and the wrist's joint targets include the motion of the frame.
+Pushes are forces on the object. Both depend on the control steps since the table's removal; the
+episode is otherwise unchanged.
 """
 
 import itertools
@@ -32,7 +33,9 @@ PUSH_SECONDS = 0.25
 PUSH_FORCE = 1.0
 """Force of the second six pushes, N; that of the first six is half of the object's weight."""
 FARTHEST, MOST_TURNED = 0.05, float(np.radians(15.0))
-"""Greatest change of the object's pose in the wrist frame for survival, m and rad (as in DexGraspBench)."""
+"""Greatest change of the object's pose in the wrist frame for survival, m and rad (as in
+DexGraspBench).
+"""
 SURVIVAL = ("lift_survival", "push_survival_weight", "push_survival")
 """Names of the survived parts."""
 ASSESSED = (*plausibility.MEASURES, "clean", *SURVIVAL)
@@ -42,11 +45,12 @@ _DIRECTIONS = np.concatenate([np.stack([axis, -axis]) for axis in np.eye(3, dtyp
 
 
 class Protocol(NamedTuple):
-    """A lift, then six pushes with half of the object's weight and six with 1 N; times count from the table's removal.
+    """A lift, then six pushes with half of the object's weight and six with 1 N; times count from
+    the table's removal.
 
-    The pushes are those of DexGraspBench (along each axis of the world frame, in both directions), but they follow one
-    another in the same grasp, last 0.25 s instead of 2 s, and act in addition to gravity. Its force, 10 m/s^2 times the
-    mass, is 1 N for its objects of 100 g.
+    The pushes are those of DexGraspBench (along each axis of the world frame, in both directions),
+    but they follow one another in the same grasp, last 0.25 s instead of 2 s, and act in addition
+    to gravity. Its force, 10 m/s^2 times the mass, is 1 N for its objects of 100 g.
     """
 
     lift_start: Array
@@ -72,15 +76,23 @@ class Frame(NamedTuple):
     """(B,) m/s^2."""
 
 
-def stress(task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT) -> Protocol:
-    """Returns a lift by `height` metres and all pushes, starting `start` control steps after the table's removal."""
+def stress(
+    task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT
+) -> Protocol:
+    """Returns a lift by `height` metres and all pushes, starting `start` control steps after the
+    table's removal.
+    """
     push_start = np.float32(start + lift_steps(task, height))
     masses = np.array([obj.mass for obj in objects], np.float32)
     return Protocol(np.float32(start), np.float32(height), push_start, masses)
 
 
-def lift_first(task: TaskConfig, objects: Sequence[GraspObject], hold: int, height: float) -> Protocol:
-    """Returns a lift by `height` metres off the table, which stays, instead of its removal; all pushes after `hold`."""
+def lift_first(
+    task: TaskConfig, objects: Sequence[GraspObject], hold: int, height: float
+) -> Protocol:
+    """Returns a lift by `height` metres off the table, which stays, instead of its removal; all
+    pushes after `hold`.
+    """
     protocol = stress(task, objects, hold, 0.0)
     return protocol._replace(lift_start=np.float32(0), lift_height=np.float32(height), table=True)
 
@@ -106,8 +118,8 @@ def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
 def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
     """Carried frame `time` (B,) control steps into the episode.
 
-    Its acceleration is at most `LIFT_ACCELERATION` and its speed at most `LIFT_SPEED`: a ramp minus the same ramp
-    delayed by height / speed.
+    Its acceleration is at most `LIFT_ACCELERATION` and its speed at most `LIFT_SPEED`: a ramp minus
+    the same ramp delayed by height / speed.
     """
     since = (time - task.approach_steps - protocol.lift_start) * task.control_dt
     rise = LIFT_SPEED / LIFT_ACCELERATION
@@ -117,7 +129,8 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
         speeding = jnp.clip(seconds, 0.0, rise)
         way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
         speeds_up = (seconds > 0.0) & (seconds < rise)
-        # Zeros of this type, or the frame's weak type would compile every program of an episode again.
+        # Zeros of this type, or the frame's weak type would compile every program of an episode
+        # again.
         pull = jnp.where(speeds_up, LIFT_ACCELERATION, jnp.zeros_like(seconds))
         return Frame(way, LIFT_ACCELERATION * speeding, pull)
 
@@ -125,8 +138,11 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
     return Frame(*(first - second for first, second in zip(begun, ended, strict=True)))
 
 
-def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_scale: Array) -> Array:
-    """Force (B, 3) on the objects in the control step that begins `time` (B,) steps into the episode, world frame, N.
+def push(
+    protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_scale: Array
+) -> Array:
+    """Force (B, 3) on the objects in the control step that begins `time` (B,) steps into the
+    episode, world frame, N.
 
     Args:
       protocol: times of the pushes.
@@ -135,7 +151,9 @@ def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_s
       index: (B,) int, indices of the objects.
       mass_scale: (B,) factors on their masses.
     """
-    number = jnp.floor((time - task.approach_steps - protocol.push_start) / push_steps(task)).astype(jnp.int32)
+    number = jnp.floor(
+        (time - task.approach_steps - protocol.push_start) / push_steps(task)
+    ).astype(jnp.int32)
     weight = GRAVITY * jnp.asarray(protocol.masses)[index] * mass_scale
     newtons = jnp.where(number < len(_DIRECTIONS), 0.5 * weight, PUSH_FORCE)
     newtons = jnp.where((number >= 0) & (number < 2 * len(_DIRECTIONS)), newtons, 0.0)
@@ -161,18 +179,24 @@ def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> Physic
 
 
 def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame) -> Array:
-    """Transforms wrist targets (B, 6) from the carried frame to the world frame, at the middle of a control step.
+    """Transforms wrist targets (B, 6) from the carried frame to the world frame, at the middle of a
+    control step.
 
-    They lead to compensate for the servo's damping of the frame's speed, and for the hand's inertia.
+    They lead to compensate for the servo's damping of the frame's speed, and for the hand's
+    inertia.
     """
     gains = hand.wrist
-    lead = (gains.slide_kv * frame.speed + hand.wrist_inertia[0] * frame.acceleration) / gains.slide_kp
+    lead = (
+        gains.slide_kv * frame.speed + hand.wrist_inertia[0] * frame.acceleration
+    ) / gains.slide_kp
     return u_target + slides(base_quaternion, frame.height + lead)
 
 
 def slides(base_quaternion: Array, height: Array) -> Array:
     """Wrist joints (B, 6) of a rise by `height` (B,)."""
-    return jnp.pad(rotations.rotate(rotations.conjugate(base_quaternion), up(height)), ((0, 0), (0, 3)))
+    return jnp.pad(
+        rotations.rotate(rotations.conjugate(base_quaternion), up(height)), ((0, 0), (0, 3))
+    )
 
 
 def up(length: Array) -> Array:
@@ -186,18 +210,21 @@ def assess(
     """Measures (B,) of episodes and the survival of their grasps.
 
     Args:
-      samples: samples of the approach, the hold and, if simulated, `stress`; NumPy arrays (T, B, ...).
-      held: (B,) bool, True if the object was held until the end of the hold.
+      samples: samples of the approach, the hold and, if simulated, `stress`; NumPy arrays (T, B,
+      ...). held: (B,) bool, True if the object was held until the end of the hold.
       task: the task.
       hold: control steps without the table.
       height: height of the lift, m.
 
     Returns:
-      Those of `common.task.plausibility.measures` up to the end of the hold; `clean`, 0 or 1, which is defined for a
-      hold of two seconds; and those of `survival`, NaN without `stress`.
+      Those of `common.task.plausibility.measures` up to the end of the hold; `clean`, 0 or 1, which
+      is defined for a hold of two seconds; and those of `survival`, NaN without `stress`.
     """
     end = task.approach_steps + hold
-    until, after = (jax.tree.map(operator.itemgetter(part), samples) for part in (slice(end), slice(end - 1, None)))
+    until, after = (
+        jax.tree.map(operator.itemgetter(part), samples)
+        for part in (slice(end), slice(end - 1, None))
+    )
     found = plausibility.measures(until, task.control_dt)
     survived = survival(after.object_position, after.object_quaternion, held, task, height)
     found |= {"clean": plausibility.is_clean(held, found), **survived}
@@ -213,11 +240,12 @@ def survival(
 ) -> dict[str, np.ndarray]:
     """Survival of the parts of `stress`: (B,) 1 or 0 each, NaN if it was not simulated.
 
-    Every control step counts, and each part is relative to the object's pose at its beginning; an object lost in one
-    part is lost in the following ones.
+    Every control step counts, and each part is relative to the object's pose at its beginning; an
+    object lost in one part is lost in the following ones.
 
     Args:
-      object_position: (1 + T, B, 3) in the wrist frame, m, after the last control step of the hold and after the
+      object_position: (1 + T, B, 3) in the wrist frame, m, after the last control step of the hold
+      and after the
         `stress_steps` that follow it.
       object_quaternion: (1 + T, B, 4) object frame to wrist frame.
       held: (B,) bool, True if the object was held until then.
@@ -225,14 +253,17 @@ def survival(
       height: height of the lift, m.
 
     Returns:
-      `lift_survival`, `push_survival_weight` (six pushes with half of the object's weight), and `push_survival` (these
-      and six with 1 N).
+      `lift_survival`, `push_survival_weight` (six pushes with half of the object's weight), and
+      `push_survival` (these and six with 1 N).
     """
     six = len(_DIRECTIONS) * push_steps(task)
     ends = np.cumsum([0, lift_steps(task, height), six, six])
     kept = [np.asarray(held, bool)]
     for first, last in itertools.pairwise(ends):
-        position, quaternion = object_position[first : last + 1], object_quaternion[first : last + 1]
+        position, quaternion = (
+            object_position[first : last + 1],
+            object_quaternion[first : last + 1],
+        )
         way = np.linalg.norm(position - position[:1], axis=-1)
         turn = 2 * np.arccos(np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0))
         kept.append(kept[-1] & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0))

@@ -29,7 +29,10 @@ class TrainingSet:
     """
 
     def __init__(
-        self, objects: list[GraspObject], form: Callable[[], ConstraintBank], build: Callable[[], ConstraintBank]
+        self,
+        objects: list[GraspObject],
+        form: Callable[[], ConstraintBank],
+        build: Callable[[], ConstraintBank],
     ):
         """Keeps the functions; nothing is built yet."""
         self.objects, self.form, self._build = objects, form, build
@@ -46,7 +49,8 @@ class TrainingSet:
 
 
 def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
-    """Returns procedural objects, those of a folder, or both, with procedural constraints or those of constraint sets.
+    """Returns procedural objects, those of a folder, or both, with procedural constraints or those
+    of constraint sets.
 
     Args:
       hand: the hand.
@@ -67,12 +71,14 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
         found, sets = load_for(pathlib.Path(objects.constraints), found, objects.split)
         if not sets:
             raise CongraspError(
-                f"{objects.constraints} holds no constraint set ({objects.split}) of an object in {objects.folder}.",
+                f"{objects.constraints} holds no constraint set ({objects.split}) of an object in "
+                f"{objects.folder}.",
                 "Pass folders that belong together.",
             )
         if sets[0].meta["hand"] != hand.name:
             raise CongraspError(
-                f"The constraint sets in {objects.constraints} are for the hand '{sets[0].meta['hand']}'.",
+                f"The constraint sets in {objects.constraints} are for the hand "
+                f"'{sets[0].meta['hand']}'.",
                 f"Generate them for '{hand.name}', or train that hand.",
             )
     pool = scale_objects(hand, task, found)
@@ -95,9 +101,13 @@ def _built(objects: list[GraspObject], bank: ConstraintBank) -> TrainingSet:
 
 
 _MEMORY = 50.0
-"""Average number of episodes of each object after which an outcome's weight decays by a factor e."""
+"""Average number of episodes of each object after which an outcome's weight decays by a factor
+e.
+"""
 _PRIOR = 5.0
-"""Number of episodes for which the rate of the larger group counts, in addition to those of the object or family."""
+"""Number of episodes for which the rate of the larger group counts, in addition to those of the
+object or family.
+"""
 _BOUND = 2.0
 """Largest factor on an object's weight, and the inverse of the smallest one."""
 
@@ -105,10 +115,11 @@ _BOUND = 2.0
 class FailureWeights:
     """Counts of the episodes of N objects, and the sampling weights that follow from them.
 
-    With n episodes of an object of which f failed, both forgotten exponentially, its failure rate is estimated as p =
-    (f + k p_family) / (n + k), k = 5, where the family's rate is regularised in the same way towards that of all
-    objects. With its variance v = p (1 - p) and the mean of all objects, m, the weight is (v + m) / 2m, between a half
-    and two: most is learnt where success is most uncertain.
+    With n episodes of an object of which f failed, both forgotten exponentially, its failure rate
+    is estimated as p = (f + k p_family) / (n + k), k = 5, where the family's rate is regularised in
+    the same way towards that of all objects. With its variance v = p (1 - p) and the mean of all
+    objects, m, the weight is (v + m) / 2m, between a half and two: most is learnt where success is
+    most uncertain.
     """
 
     def __init__(self, weight: np.ndarray, families: Sequence[str]):
@@ -126,7 +137,10 @@ class FailureWeights:
     def add(self, objects: np.ndarray, success: np.ndarray) -> None:
         """Counts E episodes with these objects (E,) int, and their success (E,)."""
         kept = np.exp(-len(objects) / (_MEMORY * len(self._weight)))
-        for total, outcome in ((self._episodes, np.ones(len(objects))), (self._failures, 1.0 - np.asarray(success))):
+        for total, outcome in (
+            (self._episodes, np.ones(len(objects))),
+            (self._failures, 1.0 - np.asarray(success)),
+        ):
             total *= kept
             np.add.at(total, np.asarray(objects, int), outcome)
 
@@ -134,7 +148,10 @@ class FailureWeights:
         """Failure rates by family, and the largest and least factor on an object's weight."""
         factor = self._factors
         return {
-            **{f"failure/{name}": float(rate) for name, rate in zip(self._families, self._family_rates, strict=True)},
+            **{
+                f"failure/{name}": float(rate)
+                for name, rate in zip(self._families, self._family_rates, strict=True)
+            },
             "weight_most": float(factor.max()),
             "weight_least": float(factor.min()),
         }
@@ -147,7 +164,9 @@ class FailureWeights:
     @property
     def _factors(self) -> np.ndarray:
         """Factors (N,) on the weights."""
-        rates = (self._failures + _PRIOR * self._family_rates[self._family]) / (self._episodes + _PRIOR)
+        rates = (self._failures + _PRIOR * self._family_rates[self._family]) / (
+            self._episodes + _PRIOR
+        )
         variance = rates * (1 - rates)
         mean = variance.mean()
         if mean == 0.0:
@@ -157,7 +176,9 @@ class FailureWeights:
     @property
     def _family_rates(self) -> np.ndarray:
         """Failure rates (families,); zero before any episode."""
-        episodes, failures = (np.bincount(self._family, total) for total in (self._episodes, self._failures))
+        episodes, failures = (
+            np.bincount(self._family, total) for total in (self._episodes, self._failures)
+        )
         return (failures + _PRIOR * self._rate) / (episodes + _PRIOR)
 
     @property

@@ -12,7 +12,16 @@ from congrasp.actors.env import EnvState
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics
-from congrasp.actors.rollout import ActFunction, Probe, Rollout, Traced, no_probe, programs_of, rollout_of, row_of
+from congrasp.actors.rollout import (
+    ActFunction,
+    Probe,
+    Rollout,
+    Traced,
+    no_probe,
+    programs_of,
+    rollout_of,
+    row_of,
+)
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import RewardWeights, TaskConfig
@@ -23,7 +32,7 @@ from congrasp.common.task.types import Array
 class RolloutWorker:
     """Environments that continue from one rollout to the next."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         hand: Hand,
         task: TaskConfig,
@@ -46,7 +55,8 @@ class RolloutWorker:
           hand: the hand.
           task: the task.
           physics: the engine, with the objects of the bank.
-          bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do not restart at their
+          bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do
+          not restart at their
             end.
           policy: a pure function; `collect` passes its parameters.
           batch: number B of environments.
@@ -54,7 +64,8 @@ class RolloutWorker:
           half_precision: rounds observations to half precision, for the policy and for the learner.
           probe: computes additional values to record at every step.
           traced: environments whose trace is recorded.
-          staggered: ends the first episodes early at different times, so that short rollouts then contain all phases of
+          staggered: ends the first episodes early at different times, so that short rollouts then
+          contain all phases of
             the task.
           taught: records `Rollout.teacher_observation`.
           privileged: the engine's objects, if `Rollout.privileged` is recorded.
@@ -87,15 +98,24 @@ class RolloutWorker:
         self.restart()
 
     def adjust(self, **settings: Any) -> None:
-        """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
+        """Changes `Settings` by name from the next control step on; new types or shapes are
+        recompiled.
+        """
         self._settings = self._settings._replace(**settings)
 
     def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
-        """Sets the reward weights, and whether the objects of episodes that start from now on are fixed."""
-        self._settings, self._stationary = self._settings._replace(weights=weights), np.array(stationary)
+        """Sets the reward weights, and whether the objects of episodes that start from now on are
+        fixed.
+        """
+        self._settings, self._stationary = (
+            self._settings._replace(weights=weights),
+            np.array(stationary),
+        )
 
     def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
-        """Replaces the objects by as many others, with their bank, for episodes that start from now on."""
+        """Replaces the objects by as many others, with their bank, for episodes that start from now
+        on.
+        """
         physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
         self._bank = _on_device(bank)
         if self._settings.masses is not None:
@@ -112,7 +132,9 @@ class RolloutWorker:
             return self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
         # By the program that replaces finished episodes: another one would take as long to compile.
         state = (self.state or self._blank(key))._replace(views=None)
-        state = self.programs.renew(self._bank, state, key, self._stationary, _on_device(np.ones(self.batch, bool)))
+        state = self.programs.renew(
+            self._bank, state, key, self._stationary, _on_device(np.ones(self.batch, bool))
+        )
         self._place(state._replace(hold=self._staggered_hold(state.hold, key)))
 
     def _blank(self, key: Array) -> EnvState:
@@ -122,11 +144,15 @@ class RolloutWorker:
         return jax.tree.map(lambda array: _on_device(np.zeros(array.shape, array.dtype)), form)
 
     def _staggered_hold(self, hold: Array, key: Array) -> Array:
-        """Control steps (B,) without the table of first episodes, which end early at different times if they shall."""
+        """Control steps (B,) without the table of first episodes, which end early at different
+        times if they shall.
+        """
         if not self._staggered:
             return hold
         whole = self._task.approach_steps + np.asarray(hold)
-        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(
+            size=whole.shape
+        )
         return _on_device(np.int32(hold - np.floor(share * whole)))
 
     def begin(self, conditions: InitialConditions) -> None:
@@ -138,7 +164,9 @@ class RolloutWorker:
             self._place(self.programs.begin(conditions, None))
 
     def _place(self, state: EnvState) -> None:
-        """Starts the engine's environments, of an engine that is not compiled, at the beginning of these episodes."""
+        """Starts the engine's environments, of an engine that is not compiled, at the beginning of
+        these episodes.
+        """
         kept = self.state
         if kept is None:
             self.physics.start(state.reset_state)
@@ -206,10 +234,14 @@ class RolloutWorker:
         """Returns the grasps that succeeded since the last call."""
         assert self.state is not None, "call `begin` first"
         grasps = self.state.grasps
-        self.state = self.state._replace(grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool))))
+        self.state = self.state._replace(
+            grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool)))
+        )
         return grasps
 
-    def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
+    def collect(
+        self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None
+    ) -> Rollout:
         """Simulates the next `steps` control steps with these policy parameters.
 
         Args:
@@ -224,14 +256,18 @@ class RolloutWorker:
             return self._collect_compiled(parameters, key, steps)
         return self._collect_stepwise(parameters, key, steps, progress)
 
-    def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
+    def _collect_stepwise(
+        self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]
+    ) -> Rollout:
         """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
-        # One more key than steps: the decision after the last step only yields `last_observation`. A split does not
-        # depend on how many follow it, so that one program serves many lengths.
+        # One more key than steps: the decision after the last step only yields `last_observation`.
+        # A split does not depend on how many follow it, so that one program serves many lengths.
         key_data = np.asarray(jax.random.key_data(jax.random.split(key, 1 << steps.bit_length())))
         parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
-        decision = self.programs.decide(parameters, settings, self.state, jax.random.wrap_key_data(key_data[0]))
+        decision = self.programs.decide(
+            parameters, settings, self.state, jax.random.wrap_key_data(key_data[0])
+        )
         state = self.state._replace(views=None)
         rows: list[dict[str, Any]] = []
         extras = []
@@ -246,7 +282,9 @@ class RolloutWorker:
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = _split(self._episode_key)
-                state = self.programs.renew(self._bank, state, episode_key, self._stationary, transition.terminal)
+                state = self.programs.renew(
+                    self._bank, state, episode_key, self._stationary, transition.terminal
+                )
                 self.physics.reset(None, transition.terminal, state.reset_state)
                 physics_state = self.physics.read(None)
                 state_key = jax.random.wrap_key_data(key_data[step])
@@ -254,12 +292,16 @@ class RolloutWorker:
                 decision = self.programs.decide(parameters, settings, scene, state_key)
             progress(step)
         self.state = self.programs.with_scene(state, physics_state)
-        columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))
+        columns, (trace, probed) = jax.tree.map(
+            lambda *x: np.stack(x), *zip(rows, extras, strict=True)
+        )
         return rollout_of(self.state, columns, decision.seen, trace, probed)
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """Collects a rollout as one program; see `collect`."""
-        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
+        parameters, bank, carry = _on_device(
+            (parameters, self._bank, (self.state, self._episode_key))
+        )
         (self.state, self._episode_key), rollout = self.programs.scan(
             parameters, self._settings, self._stationary, bank, carry, key, steps=steps
         )
@@ -267,14 +309,18 @@ class RolloutWorker:
 
 
 def _on_device(tree: Any) -> Any:
-    """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
+    """Commits the arrays to this process's device: uncommitted ones would cause another
+    compilation.
+    """
     return jax.device_put(tree, jax.local_devices()[0])
 
 
 def _shapes(tree: Any) -> Any:
     """Shapes and types of the arrays of a tree, on this process's device."""
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    return jax.tree.map(lambda array: jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=device), tree)
+    return jax.tree.map(
+        lambda array: jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=device), tree
+    )
 
 
 def _masses(objects: Sequence[GraspObject]) -> Array:

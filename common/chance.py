@@ -1,7 +1,8 @@
 """Random draws from uniform numbers.
 
-A reset needs hundreds of numbers for dozens of purposes. Each call of a generator would compile into a program of its
-own, so all numbers come from one call, and the functions below turn them into draws.
+A reset needs hundreds of numbers for dozens of purposes. Each call of a generator would compile
+into a program of its own, so all numbers come from one call, and the functions below turn them into
+draws.
 """
 
 import zlib
@@ -51,10 +52,13 @@ def weighted(uniform: Array, weights: Array) -> Array:
     """Indices (B,) int of weights (N,), as likely as these, of uniform numbers (B,)."""
     total = jnp.cumsum(jnp.asarray(weights))
     chosen = jnp.searchsorted(total, total[-1] * uniform, side="right")
-    return jnp.minimum(chosen, len(total) - 1).astype(jnp.int32)  # rounding may reach the upper bound
+    # Rounding may reach the upper bound
+    return jnp.minimum(chosen, len(total) - 1).astype(jnp.int32)
 
 
 def among(uniform: Array, allowed: Array) -> Array:
-    """Indices (B,) int of true flags (B, N), each as likely, of uniform numbers (B,); 0 where no flag is true."""
+    """Indices (B,) int of true flags (B, N), each as likely, of uniform numbers (B,); 0 where no
+    flag is true.
+    """
     rank = jnp.cumsum(allowed, -1)
     return jnp.argmax(rank > index(uniform, rank[:, -1])[:, None], -1)

@@ -1,7 +1,9 @@
-"""All settings of a run as frozen dataclasses; the string under a field is its help on the command line.
+"""All settings of a run as frozen dataclasses; the string under a field is its help on the command
+line.
 
-A run is described by one `RunConfig`. It is sent as JSON: the learner stores it in the run directory and sends it to
-every actor that connects. An actor therefore needs no argument but an address.
+A run is described by one `RunConfig`. It is sent as JSON: the learner stores it in the run
+directory and sends it to every actor that connects. An actor therefore needs no argument but an
+address.
 """
 
 import dataclasses
@@ -30,34 +32,42 @@ class ObjectsConfig:
     """Objects of a run."""
 
     families: tuple[str, ...] = ()
-    """Families of the procedural generator, or groups of them (basic, household, all); empty: basic."""
+    """Families of the procedural generator, or groups of them (basic, household, all); empty:
+    basic.
+    """
     count: int = 64
     """Procedural objects in one actor's pool."""
     seed: int = 0
-    """First seed; actors shift it so that each has different objects. Evaluation uses seeds from one million upward."""
+    """First seed; actors shift it so that each has different objects. Evaluation uses seeds from
+    one million upward.
+    """
     folder: str = ""
     """A folder of imported objects to use instead of procedural ones."""
     constraints: str = ""
-    """A folder of constraint sets for that folder's objects, such as captured ones ('congrasp constraints import'):
-    training draws headings, reference poses and trajectories from them. Objects without a set are left out."""
+    """A folder of constraint sets for that folder's objects, such as captured ones ('congrasp
+    constraints import'): training draws headings, reference poses and trajectories from them.
+    Objects without a set are left out."""
     split: Split = "training"
     """Split of these sets: training, held-out, or all."""
     procedural: int = 0
     """Procedural objects in addition to those of the folder."""
     folder_share: float = 0.0
-    """Share of the episodes with an object of the folder, if there are procedural ones as well; 0: all objects are
-    equally likely."""
+    """Share of the episodes with an object of the folder, if there are procedural ones as well; 0:
+    all objects are equally likely."""
     renew_every: int = 0
-    """Rollouts after which an actor's procedural objects are replaced by those of the next seeds and its episodes
-    restart; 0 keeps them. Generating them takes as long as at the start."""
+    """Rollouts after which an actor's procedural objects are replaced by those of the next seeds
+    and its episodes restart; 0 keeps them. Generating them takes as long as at the start."""
     by_failure: bool = False
-    """Draws objects whose success is less certain than that of others up to twice as often, and those whose success or
-    failure is more certain down to half as often, by the actor's episodes (the folder's share shifts with them)."""
+    """Draws objects whose success is less certain than that of others up to twice as often, and
+    those whose success or failure is more certain down to half as often, by the actor's episodes
+    (the folder's share shifts with them)."""
 
     def __post_init__(self) -> None:
         """Raises a CongraspError for constraint sets without objects."""
         if self.constraints and not self.folder:
-            raise CongraspError("Constraint sets need their objects.", "Pass --objects.folder FOLDER.")
+            raise CongraspError(
+                "Constraint sets need their objects.", "Pass --objects.folder FOLDER."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +79,14 @@ class NetworkConfig:
     encoder: int = 64
     """Units of each optional constraint's encoder."""
     points: tuple[int, ...] = (64, 128)
-    """Units of the layers through which each point of a camera's cloud passes before the maximum over the points."""
+    """Units of the layers through which each point of a camera's cloud passes before the maximum
+    over the points.
+    """
     initial_std: float = 0.6
     """Initial standard deviation of the action, in units of action."""
     privileged_critic: bool = True
-    """Gives the critic what the policy does not observe: the episode's true parameters, such as the object's mass, and
-    the true state if the policy has sensors (`common.task.privileged`)."""
+    """Gives the critic what the policy does not observe: the episode's true parameters, such as the
+    object's mass, and the true state if the policy has sensors (`common.task.privileged`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,28 +102,35 @@ class PPOConfig:
     importance_max: float = 4.0
     """Truncation of pi_proximal/pi_behaviour."""
     decoupled: bool = True
-    """Clips around the policy at the start of the update; otherwise around the behaviour policy, as plain PPO does."""
+    """Clips around the policy at the start of the update; otherwise around the behaviour policy, as
+    plain PPO does.
+    """
     gamma: float = 0.98
     """Discount."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
     bootstrap_truncated: bool = True
-    """Bootstraps from the critic if the time limit ends an episode with a held object; otherwise from zero."""
+    """Bootstraps from the critic if the time limit ends an episode with a held object; otherwise
+    from zero.
+    """
     learning_rate: float = 5e-4
     """Initial learning rate of Adam; a tenth of it with an initial policy."""
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
     """Bounds of the adaptive learning rate."""
     kl_target: float = 0.012
-    """Target of the KL divergence: the learning rate falls above twice this value and rises below half of it."""
+    """Target of the KL divergence: the learning rate falls above twice this value and rises below
+    half of it.
+    """
     settling: float = 0.0
-    """Share of the run's updates, at its end, over which `kl_target` falls linearly to a tenth and the action's
-    standard deviation to `final_std`, so that the policy converges; 0 keeps both."""
+    """Share of the run's updates, at its end, over which `kl_target` falls linearly to a tenth and
+    the action's standard deviation to `final_std`, so that the policy converges; 0 keeps both."""
     final_std: float = 0.1
-    """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, it is capped
-    at std (final_std / std)^(1/n): a geometric decay. Smaller deviations are kept; 0 sets no cap."""
+    """Standard deviation of the action at the end of `settling`, in units of action. With n updates
+    left, it is capped at std (final_std / std)^(1/n): a geometric decay. Smaller deviations are
+    kept; 0 sets no cap."""
     least_std: float = 0.0
-    """Smallest standard deviation of the action before `settling`, in units of action: each update raises smaller ones
-    to it. 0 sets no floor."""
+    """Smallest standard deviation of the action before `settling`, in units of action: each update
+    raises smaller ones to it. 0 sets no floor."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -126,22 +145,32 @@ class PPOConfig:
         return self.kl_target * (1.0 - 0.9 * min(max(self._settled(version, updates), 0.0), 1.0))
 
     def noise_kept_at(self, version: int, updates: int) -> float:
-        """Largest share k of log(std / final_std) that the update of this version keeps; infinity before `settling`.
+        """Largest share k of log(std / final_std) that the update of this version keeps; infinity
+        before `settling`.
 
-        With n updates left k = 1 - 1/n. After j of m updates std is at most std_0^(1 - j/m) final_std^(j/m).
+        With n updates left k = 1 - 1/n. After j of m updates std is at most std_0^(1 - j/m)
+        final_std^(j/m).
         """
         if self.final_std <= 0.0 or not self.settling or self._settled(version, updates) < 0.0:
             return math.inf
         return 1.0 - 1.0 / max(updates - version, 1)
 
     def least_std_at(self, version: int, updates: int) -> float:
-        """Returns the floor of the action's standard deviation in the update of this version; 0 during `settling`."""
+        """Returns the floor of the action's standard deviation in the update of this version; 0
+        during `settling`.
+        """
         settles = bool(self.settling) and self._settled(version, updates) >= 0.0
         return 0.0 if settles else self.least_std
 
     def _settled(self, version: int, updates: int) -> float:
-        """Share of `settling` completed before the update of this version; negative before it begins."""
-        return 1.0 - (updates - version) / (self.settling * updates) if self.settling and updates else 0.0
+        """Share of `settling` completed before the update of this version; negative before it
+        begins.
+        """
+        return (
+            1.0 - (updates - version) / (self.settling * updates)
+            if self.settling and updates
+            else 0.0
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,12 +191,16 @@ class DistillConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumConfig:
-    """The paper's two phases: stationary objects first, then free ones with larger constraint weights."""
+    """The paper's two phases: stationary objects first, then free ones with larger constraint
+    weights.
+    """
 
     stationary_updates: int = 0
     """Updates during which objects are fixed and the table stays."""
     ramp: tuple[int, int] = (0, 0)
-    """First and last update of the ramp from the task's weights to `reward`; no ramp if they are equal."""
+    """First and last update of the ramp from the task's weights to `reward`; no ramp if they are
+    equal.
+    """
     reward: RewardWeights = RewardWeights()
     """Weights of the reward terms at the end of the ramp."""
 
@@ -181,14 +214,17 @@ class CurriculumConfig:
         return version < self.stationary_updates
 
     def weights(self, first: RewardWeights, version: int) -> RewardWeights:
-        """Returns the reward weights under the policy of this version; `first` are those of the task."""
+        """Returns the reward weights under the policy of this version; `first` are those of the
+        task.
+        """
         if not self.ramped:
             return first
         begin, end = self.ramp
         share = min(max((version - begin) / (end - begin), 0.0), 1.0)
         return RewardWeights(
             **{
-                field.name: (1 - share) * getattr(first, field.name) + share * getattr(self.reward, field.name)
+                field.name: (1 - share) * getattr(first, field.name)
+                + share * getattr(self.reward, field.name)
                 for field in dataclasses.fields(RewardWeights)
             }
         )
@@ -219,14 +255,16 @@ class RunConfig:
     checkpoint_every: int = 25
     """Updates between two checkpoints."""
     write_ahead: bool = True
-    """Writes rollouts to disk before acknowledging them, until a checkpoint holds their outcome: a resumed run
-    continues with them whatever was killed. If false, a killed learner loses what it had accepted since the
-    checkpoint."""
+    """Writes rollouts to disk before acknowledging them, until a checkpoint holds their outcome: a
+    resumed run continues with them whatever was killed. If false, a killed learner loses what it
+    had accepted since the checkpoint."""
     collapse_patience: int = 60
-    """Consecutive updates without contact, or with less than half of the best success, that end the run; 0: never."""
+    """Consecutive updates without contact, or with less than half of the best success, that end the
+    run; 0: never.
+    """
     episode_every: int = 10
-    """Rollouts of an actor between two episodes published for logs. It is a minimum, since an episode may extend over
-    several rollouts."""
+    """Rollouts of an actor between two episodes published for logs. It is a minimum, since an
+    episode may extend over several rollouts."""
     log_rollout_every: int = 20
     """Rollouts of an actor between two published for logs; 1 publishes all of them, 0 none."""
     log_rollout_worlds: int = 4
@@ -259,8 +297,14 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         if not isinstance(fields, dict):
             raise ValueError("it is not an object")
         if isinstance(ppo := fields.get("ppo"), dict):  # files of earlier versions
-            fields |= {name: ppo.pop(name) for name in ("rollouts_per_update", "max_staleness") if name in ppo}
-        config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
+            fields |= {
+                name: ppo.pop(name)
+                for name in ("rollouts_per_update", "max_staleness")
+                if name in ppo
+            }
+        config = dacite.from_dict(
+            RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float])
+        )
     except (ValueError, RecursionError) as error:  # not UTF-8, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."

@@ -6,13 +6,20 @@ import re
 from collections.abc import Iterator
 
 _LONGEST = 2000  # characters: a line may quote input from elsewhere
-# Controls, line separators, lone surrogates, and marks that change the direction of the text around them.
-_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# Controls, line separators, lone surrogates, and marks that change the direction of the text around
+# them.
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 
 def printable(text: str) -> str:
-    """Returns a text as one line for a terminal: blanks for line ends, and escapes such as \\x1b for other controls."""
-    return _UNPRINTABLE.sub(lambda found: " " if found[0] in "\t\n\r\u2028\u2029" else ascii(found[0])[1:-1], text)
+    """Returns a text as one line for a terminal: blanks for line ends, and escapes such as \\x1b
+    for other controls.
+    """
+    return _UNPRINTABLE.sub(
+        lambda found: " " if found[0] in "\t\n\r\u2028\u2029" else ascii(found[0])[1:-1], text
+    )
 
 
 class CongraspError(Exception):
@@ -20,7 +27,8 @@ class CongraspError(Exception):
 
     Attributes:
       exit_code: exit code of the command line for this error.
-      code: kind of the error on the wire, alongside the message; empty where a program cannot handle the kind.
+      code: kind of the error on the wire, alongside the message; empty where a program cannot
+      handle the kind.
     """
 
     exit_code = 2
@@ -28,7 +36,9 @@ class CongraspError(Exception):
 
     def __init__(self, what: str, remedy: str = ""):
         text = printable(f"{what} {remedy}".strip())
-        super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
+        super().__init__(
+            text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}"
+        )
 
 
 PORT_ERRORS = OSError, OverflowError
@@ -68,11 +78,15 @@ class MissingPackageError(CongraspError):
           package: its import name.
         """
         extra = _EXTRAS.get(package, "train")
-        super().__init__(f"{what} needs the package '{package}'.", f"Run: pip install 'congrasp[{extra}]'")
+        super().__init__(
+            f"{what} needs the package '{package}'.", f"Run: pip install 'congrasp[{extra}]'"
+        )
 
 
 def need_package(what: str, package: str) -> None:
-    """Raises a `MissingPackageError` if a package that `what` needs is not installed; call it before the work."""
+    """Raises a `MissingPackageError` if a package that `what` needs is not installed; call it
+    before the work.
+    """
     if importlib.util.find_spec(package) is None:
         raise MissingPackageError(what, package)
 
@@ -89,7 +103,8 @@ class TooWideError(CongraspError):
           opening: widest opening of the hand, m.
         """
         super().__init__(
-            f"'{name}' is too wide: {100 * width:.1f} cm where the hand would close, but the hand opens to "
+            f"'{name}' is too wide: {100 * width:.1f} cm where the hand would close, but the hand "
+            f"opens to "
             f"{100 * opening:.1f} cm.",
             "Scale the object, approach a narrower part, or use a larger hand.",
         )
@@ -112,7 +127,9 @@ class RefusedError(TransportError):
 
 
 class OverloadedError(RefusedError):
-    """Too many requests are waiting; raised at once, so that the caller can use the rest of its deadline."""
+    """Too many requests are waiting; raised at once, so that the caller can use the rest of its
+    deadline.
+    """
 
     code = "overloaded"
 
@@ -144,10 +161,19 @@ class LayoutError(RefusedError):
 
 
 _BY_CODE = {
-    error.code: error for error in (OverloadedError, LateError, UnknownConstraintError, ContradictionError, LayoutError)
+    error.code: error
+    for error in (
+        OverloadedError,
+        LateError,
+        UnknownConstraintError,
+        ContradictionError,
+        LayoutError,
+    )
 }
 
 
 def error_of(code: str, message: str) -> RefusedError:
-    """Returns the exception for a peer's error: of the class of `code`, or else a `RefusedError`."""
+    """Returns the exception for a peer's error: of the class of `code`, or else a
+    `RefusedError`.
+    """
     return _BY_CODE.get(code, RefusedError)(message)

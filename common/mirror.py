@@ -1,8 +1,9 @@
 """Reflection at the plane x = 0, of the world and of every frame in it; needs nothing but numpy.
 
-A left hand is the mirror image of a right one, and so is everything that it does: a policy of the right hand grasps the
-mirrored object under mirrored constraints, and the mirror image of its motion is that of the left hand. Joint angles
-are unchanged, because joint axes are mirrored as axes of rotation.
+A left hand is the mirror image of a right one, and so is everything that it does: a policy of the
+right hand grasps the mirrored object under mirrored constraints, and the mirror image of its motion
+is that of the left hand. Joint angles are unchanged, because joint axes are mirrored as axes of
+rotation.
 """
 
 from collections.abc import Mapping
@@ -10,7 +11,18 @@ from typing import Any
 
 import numpy as np
 
-_VECTORS = ("position", "direction", "cross", "velocity", "force", "points", "cloud", "vertices", "normals", "pos")
+_VECTORS = (
+    "position",
+    "direction",
+    "cross",
+    "velocity",
+    "force",
+    "points",
+    "cloud",
+    "vertices",
+    "normals",
+    "pos",
+)
 _WRIST = ("u", "u_target", "u_velocity")
 
 
@@ -30,7 +42,9 @@ def quaternion(array: Any) -> np.ndarray:
 
 
 def wrist(array: Any) -> np.ndarray:
-    """Mirrored wrist joints in the last six places (..., 6 or more): x, y, z, then intrinsic x-y-z angles."""
+    """Mirrored wrist joints in the last six places (..., 6 or more): x, y, z, then intrinsic x-y-z
+    angles.
+    """
     array = np.asarray(array)
     return np.concatenate([array[..., :-6], vector(array[..., -6:-3]), axial(array[..., -3:])], -1)
 
@@ -52,4 +66,8 @@ def _field(name: str, array: Any) -> Any:
     if "quaternion" in last or last.endswith("_quat"):
         return quaternion(array)
     kind = last.removesuffix("_initial").rpartition("_")[2]
-    return vector(array) if kind in _VECTORS and last != "q_velocity" and np.shape(array)[-1:] == (3,) else array
+    return (
+        vector(array)
+        if kind in _VECTORS and last != "q_velocity" and np.shape(array)[-1:] == (3,)
+        else array
+    )

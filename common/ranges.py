@@ -12,7 +12,9 @@ from congrasp.common.task.config import TaskConfig
 MAX_SPEED = 400.0
 """A joint speed above this (m/s or rad/s) marks a diverged environment."""
 MAX_DISTANCE = 25.0
-"""A joint position beyond this (m or rad) marks a diverged environment; a free fall of 2 s stays below it."""
+"""A joint position beyond this (m or rad) marks a diverged environment; a free fall of 2 s stays
+below it.
+"""
 MAX_NUMBER = 1e6
 """Largest absolute value of any field."""
 MAX_INPUTS, MAX_ACTIONS = 16_384, 256
@@ -59,17 +61,34 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
             yield f"{name} is {low:g} to {high:g}, not within 0 and {most:g}"
 
 
-def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], action_size: int) -> Iterator[str]:
-    """Yields the sizes of a policy's networks, observation and action that are out of range, one phrase each."""
+def network_faults(
+    network: NetworkConfig, layout: Sequence[tuple[str, int]], action_size: int
+) -> Iterator[str]:
+    """Yields the sizes of a policy's networks, observation and action that are out of range, one
+    phrase each.
+    """
     yield from _numbers(network)
-    if not 1 <= len(network.hidden) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.hidden):
-        yield f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
-    if not 1 <= len(network.points) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.points):
-        yield f"points is {str(network.points)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
+    if not 1 <= len(network.hidden) <= _LAYERS or not all(
+        1 <= units <= _UNITS for units in network.hidden
+    ):
+        yield (
+            f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} "
+            f"units"
+        )
+    if not 1 <= len(network.points) <= _LAYERS or not all(
+        1 <= units <= _UNITS for units in network.points
+    ):
+        yield (
+            f"points is {str(network.points)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} "
+            f"units"
+        )
     if not 1 <= network.encoder <= _UNITS:
         yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
     sizes = [size for _, size in layout]  # a policy of headings only has no mask
-    if not all(size >= (name != "mask") for name, size in layout) or not 1 <= sum(sizes) <= MAX_INPUTS:
+    if (
+        not all(size >= (name != "mask") for name, size in layout)
+        or not 1 <= sum(sizes) <= MAX_INPUTS
+    ):
         yield f"the observation has {str(sizes)[:60]} values, not 1 to {MAX_INPUTS}"
     if not 1 <= action_size <= MAX_ACTIONS:
         yield f"the action has {action_size} values, not 1 to {MAX_ACTIONS}"
@@ -83,5 +102,7 @@ def _numbers(config: Any) -> Iterator[str]:
             yield from _numbers(value)
             continue
         for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, (int, float)) and not (math.isfinite(number) and abs(number) <= MAX_NUMBER):
+            if isinstance(number, (int, float)) and not (
+                math.isfinite(number) and abs(number) <= MAX_NUMBER
+            ):
                 yield f"{field.name} is not a finite number of at most {MAX_NUMBER:g}"

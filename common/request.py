@@ -1,4 +1,6 @@
-"""Grasp request: constraints on one object, for a policy in this process, a server, `congrasp grasp` and the studio."""
+"""Grasp request: constraints on one object, for a policy in this process, a server, `congrasp
+grasp` and the studio.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -15,13 +17,17 @@ Pose = tuple[np.ndarray, np.ndarray]
 class GraspRequest:
     """Constraints on one object, and the initial state of the episode.
 
-    Omitted fields are free: `congrasp grasp` then attempts several values. A control loop must set `surface`, `q`,
-    `wrist` and `object_pose`; for a policy with a camera `cloud`, `q` and `wrist`, and constraints in the world frame.
+    Omitted fields are free: `congrasp grasp` then attempts several values. A control loop must set
+    `surface`, `q`, `wrist` and `object_pose`; for a policy with a camera `cloud`, `q` and `wrist`,
+    and constraints in the world frame.
     """
 
-    constraints: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(default_factory=lambda: {"heading": {}})
-    """Goal arrays of the requested constraints by constraint and field, object frame, metres and radians
-    (`common.task.constraints`): `{"heading": {"direction": (0, 0, -1)}, "fingers": {"allowed": (1, 1, 0, 0, 0)}}`."""
+    constraints: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(
+        default_factory=lambda: {"heading": {}}
+    )
+    """Goal arrays of the requested constraints by constraint and field, object frame, metres and
+    radians (`common.task.constraints`): `{"heading": {"direction": (0, 0, -1)}, "fingers":
+    {"allowed": (1, 1, 0, 0, 0)}}`."""
     avoid: np.ndarray | None = None
     """(N,) bool: points of surface or cloud that must not be touched, for an affordance."""
     above: bool = False
@@ -39,18 +45,25 @@ class GraspRequest:
     cloud: np.ndarray | None = None
     """(N, 3) points of the visible part of the object's surface, world frame, m."""
     normals: np.ndarray | None = None
-    """(N, 3) outward unit normals at the points of surface or cloud, in their frame, for a policy that observes normals
-    (`TaskConfig.surface_normals`); without them, it estimates them."""
+    """(N, 3) outward unit normals at the points of surface or cloud, in their frame, for a policy
+    that observes normals (`TaskConfig.surface_normals`); without them, it estimates them."""
     camera: np.ndarray | None = None
-    """(3,) position of the camera of the cloud, world frame, m, toward which estimated normals point."""
+    """(3,) position of the camera of the cloud, world frame, m, toward which estimated normals
+    point.
+    """
 
     def __post_init__(self) -> None:
         """Raises a `RefusedError` unless the constraints are a dict of dicts."""
         if not isinstance(self.constraints, Mapping):
-            raise RefusedError("The constraints must be a dict of dicts.", "Pass {'heading': {'direction': …}}, say.")
+            raise RefusedError(
+                "The constraints must be a dict of dicts.",
+                "Pass {'heading': {'direction': …}}, say.",
+            )
         for name, own in self.constraints.items():
             if not isinstance(own, Mapping):
-                raise RefusedError(f"The constraint '{name}' must be a dict from its fields to arrays.")
+                raise RefusedError(
+                    f"The constraint '{name}' must be a dict from its fields to arrays."
+                )
 
     def given(self, constraint: str, field: str) -> np.ndarray | None:
         """Returns a goal array, or None if it is not requested."""

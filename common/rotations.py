@@ -1,7 +1,8 @@
-"""Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes.
+"""Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading
+axes.
 
-Products are written over whole vectors instead of components: each component would add a slice to programs that contain
-hundreds of rotations, and compiling takes longer than running them.
+Products are written over whole vectors instead of components: each component would add a slice to
+programs that contain hundreds of rotations, and compiling takes longer than running them.
 """
 
 import jax.numpy as jnp
@@ -16,7 +17,9 @@ _SKEW = np.array([[0, 2, 1], [2, 1, 0], [1, 0, 2]])
 _SKEW_SIGNS = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.float32)
 _IDENTITY, _AXES = np.eye(4, dtype=np.float32)[0], np.eye(4, dtype=np.float32)[1:]
 _UNDECIDED = 1e-5
-"""Cosine of the y angle below which the x angle keeps its previous value (`quaternion_to_euler`)."""
+"""Cosine of the y angle below which the x angle keeps its previous value
+(`quaternion_to_euler`).
+"""
 
 
 def multiply(a: Array, b: Array) -> Array:
@@ -42,9 +45,13 @@ def rotate(q: Array, v: Array) -> Array:
 
 
 def to_matrix(q: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4): (2 w^2 - 1) I + 2 (v v^T + w [v]_x)."""
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4): (2 w^2 - 1) I + 2 (v v^T + w
+    [v]_x).
+    """
     w, v = q[..., :1, None], q[..., 1:]
-    return (2.0 * w * w - 1.0) * np.eye(3, dtype=np.float32) + 2.0 * (v[..., :, None] * v[..., None, :] + w * skew(v))
+    return (2.0 * w * w - 1.0) * np.eye(3, dtype=np.float32) + 2.0 * (
+        v[..., :, None] * v[..., None, :] + w * skew(v)
+    )
 
 
 def skew(v: Array) -> Array:
@@ -53,7 +60,9 @@ def skew(v: Array) -> Array:
 
 
 def from_matrix(m: Array) -> Array:
-    """Unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3), stable for every rotation."""
+    """Unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3), stable for every
+    rotation.
+    """
     entries = m.reshape(*m.shape[:-2], 9)
     axes, trace = entries[..., ::4], jnp.sum(entries[..., ::4], -1, keepdims=True)
     diagonal = jnp.concatenate([trace, axes], -1)
@@ -61,7 +70,9 @@ def from_matrix(m: Array) -> Array:
     # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
     w_row = jnp.concatenate([1.0 + trace, opposite], -1)
     axis_rows = m + m.mT + (1.0 - trace)[..., None] * np.eye(3, dtype=np.float32)
-    rows = jnp.concatenate([w_row[..., None, :], jnp.concatenate([opposite[..., :, None], axis_rows], -1)], -2)
+    rows = jnp.concatenate(
+        [w_row[..., None, :], jnp.concatenate([opposite[..., :, None], axis_rows], -1)], -2
+    )
     best = jnp.argmax(diagonal, -1)
     q = jnp.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
     q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
@@ -85,14 +96,18 @@ def from_rotation_vector(vector: Array) -> Array:
 
 
 def axis_rotation(axis: Array, theta: Array) -> Array:
-    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by angles (...,), by Rodrigues' formula."""
+    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by angles (...,), by Rodrigues'
+    formula.
+    """
     s, c = jnp.sin(theta)[..., None, None], jnp.cos(theta)[..., None, None]
     outer = axis[..., :, None] * axis[..., None, :]
     return c * np.eye(3, dtype=np.float32) + s * skew(axis) + (1.0 - c) * outer
 
 
 def euler_to_quaternion(angles: Array) -> Array:
-    """Quaternions of intrinsic x-y-z angles (..., 3): R = Rx Ry Rz, the order of the wrist's hinges."""
+    """Quaternions of intrinsic x-y-z angles (..., 3): R = Rx Ry Rz, the order of the wrist's
+    hinges.
+    """
     half = 0.5 * angles[..., :, None]
     turns = jnp.cos(half) * _IDENTITY + jnp.sin(half) * _AXES
     return multiply(multiply(turns[..., 0, :], turns[..., 1, :]), turns[..., 2, :])
@@ -101,20 +116,22 @@ def euler_to_quaternion(angles: Array) -> Array:
 def quaternion_to_euler(q: Array, near: Array) -> Array:
     """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4), chosen nearest to given ones.
 
-    (x, y, z) and (x + pi, pi - y, z + pi) are the same rotation, up to whole turns. The result is the solution with the
-    least sum of squared differences from `near`, each within pi, so that a path followed step by step does not jump
-    where y passes +-90 degrees. There only x + z or x - z is determined, and x keeps its value.
+    (x, y, z) and (x + pi, pi - y, z + pi) are the same rotation, up to whole turns. The result is
+    the solution with the least sum of squared differences from `near`, each within pi, so that a
+    path followed step by step does not jump where y passes +-90 degrees. There only x + z or x - z
+    is determined, and x keeps its value.
 
     Args:
       q: unit quaternions.
       near: (..., 3) rad, such as the current angles.
     """
     m = to_matrix(q)
-    # A weight on the current x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
-    # than a third of a degree from 90. y and z are exact for any x.
+    # A weight on the current x decides where the matrix does not: it moves x by less than 0.1
+    # degrees while y is more than a third of a degree from 90. y and z are exact for any x.
     sine, cosine = _UNDECIDED * jnp.sin(near[..., 0]), _UNDECIDED * jnp.cos(near[..., 0])
     branches = [
-        _euler_given_x(m, jnp.arctan2(sine - side * m[..., 1, 2], cosine + side * m[..., 2, 2])) for side in (1.0, -1.0)
+        _euler_given_x(m, jnp.arctan2(sine - side * m[..., 1, 2], cosine + side * m[..., 2, 2]))
+        for side in (1.0, -1.0)
     ]
     first, second = (wrapped(angles - near) for angles in branches)
     nearer = jnp.sum(first**2, -1, keepdims=True) <= jnp.sum(second**2, -1, keepdims=True)
@@ -168,12 +185,16 @@ def apply(matrix: Array, points: Array) -> Array:
 
 
 def transform(position: Array, quaternion: Array, points: Array) -> Array:
-    """Transforms points (..., N, 3) of a body's frame into the frame of the body's pose (..., 3), (..., 4)."""
+    """Transforms points (..., N, 3) of a body's frame into the frame of the body's pose (..., 3),
+    (..., 4).
+    """
     return apply(to_matrix(quaternion), points) + position[..., None, :]
 
 
 def inverse_transform(position: Array, quaternion: Array, points: Array) -> Array:
-    """Transforms points (..., N, 3) into the frame of a body with this pose; the inverse of `transform`."""
+    """Transforms points (..., N, 3) into the frame of a body with this pose; the inverse of
+    `transform`.
+    """
     return apply(jnp.swapaxes(to_matrix(quaternion), -1, -2), points - position[..., None, :])
 
 
@@ -188,7 +209,9 @@ def relative_pose(
 def compose_pose(
     position: Array, quaternion: Array, local_position: Array, local_quaternion: Array
 ) -> tuple[Array, Array]:
-    """Composes poses: a pose local to the first one, expressed in the frame in which the first one is given."""
+    """Composes poses: a pose local to the first one, expressed in the frame in which the first one
+    is given.
+    """
     return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)
 
 

@@ -2,10 +2,11 @@
 
     import congrasp
 
-    found = congrasp.grasp("mug:7", heading="above")                             # or "mug.obj": a motion for an object
-    congrasp.save_motion("mug.npz", found.motion)
+    found = congrasp.grasp("mug:7", heading="above")                             # or "mug.obj": a
+    motion for an object congrasp.save_motion("mug.npz", found.motion)
 
-    with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or congrasp.load_policy()
+    with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or
+    congrasp.load_policy()
         policy.reset(congrasp.GraspRequest(...))
         answer = policy.act(state)
 

@@ -56,7 +56,9 @@ class Configuration(Directive):
 
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
-        rows = [(f"--{name}", _short(value), text) for name, value, text in _fields(RunConfig(), "")]
+        rows = [
+            (f"--{name}", _short(value), text) for name, value, text in _fields(RunConfig(), "")
+        ]
         return [_table(("option", "default", "meaning"), rows)]
 
 
@@ -90,7 +92,10 @@ class Messages(Directive):
     def run(self) -> list[nodes.Node]:
         """Returns a section for each kind."""
         specs = [value for value in vars(messages).values() if isinstance(value, MessageSpec)]
-        return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
+        return [
+            _section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))])
+            for spec in specs
+        ]
 
 
 class Constraints(Directive):
@@ -120,7 +125,13 @@ class Errors(Directive):
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
         rows = [
-            (kind.__name__, kind.__bases__[0].__name__, _first_line(kind), str(kind.exit_code), kind.code)
+            (
+                kind.__name__,
+                kind.__bases__[0].__name__,
+                _first_line(kind),
+                str(kind.exit_code),
+                kind.code,
+            )
             for kind in vars(errors).values()
             if isinstance(kind, type) and issubclass(kind, CongraspError)
         ]
@@ -132,7 +143,12 @@ class Methods(Directive):
 
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
-        return [_table(("name", "description"), [(name, method.meaning) for name, method in METHODS.items()])]
+        return [
+            _table(
+                ("name", "description"),
+                [(name, method.meaning) for name, method in METHODS.items()],
+            )
+        ]
 
 
 class Metrics(Directive):
@@ -140,7 +156,12 @@ class Metrics(Directive):
 
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
-        return [_table(("metric", "unit", "meaning"), [(name, *_meant(*entry)) for name, entry in TITLES.items()])]
+        return [
+            _table(
+                ("metric", "unit", "meaning"),
+                [(name, *_meant(*entry)) for name, entry in TITLES.items()],
+            )
+        ]
 
 
 class MotionArrays(Directive):
@@ -149,7 +170,11 @@ class MotionArrays(Directive):
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
         hints = typing.get_type_hints(GraspMotion, include_extras=True)
-        arrays = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+        arrays = {
+            name: hint.__metadata__[0]
+            for name, hint in hints.items()
+            if hasattr(hint, "__metadata__")
+        }
         return [_table(("array", "shape, unit, frame"), [*arrays.items(), *ARM_ARRAYS.items()])]
 
 
@@ -159,7 +184,12 @@ class Sensing(Directive):
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
         rows = [
-            (f"--task.sensing.{name}", _short(value), _short(getattr(CAMERAS, name.replace("-", "_"))), meaning)
+            (
+                f"--task.sensing.{name}",
+                _short(value),
+                _short(getattr(CAMERAS, name.replace("-", "_"))),
+                meaning,
+            )
             for name, value, meaning in _fields(TRACKERS, "")
         ]
         return [_table(("option", "tracker", "camera", "meaning"), rows)]
@@ -201,12 +231,16 @@ _written: dict[str, list[str]] = {}
 """Docstrings of values by name, before napoleon takes what precedes a colon for a type."""
 
 
-def _keep(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+def _keep(
+    app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]
+) -> None:
     if what in _VALUES:
         _written[name] = lines[:]
 
 
-def _restore(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+def _restore(
+    app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]
+) -> None:
     if what in _VALUES:
         lines[:] = _written.pop(name)
 
@@ -238,8 +272,14 @@ def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, 
 
 
 def _meanings(kind: type) -> dict[str, str]:
-    """Returns the meaning of each field of a dataclass: its docstring, or `Doc` where constraints declare it."""
-    ours = (base for base in kind.__mro__ if base.__module__.startswith("congrasp.") and base.__name__ != "Declared")
+    """Returns the meaning of each field of a dataclass: its docstring, or `Doc` where constraints
+    declare it.
+    """
+    ours = (
+        base
+        for base in kind.__mro__
+        if base.__module__.startswith("congrasp.") and base.__name__ != "Declared"
+    )
     written = "".join(map(inspect.getsource, ours))
     hints = typing.get_type_hints(kind, include_extras=True)
     declared = {
@@ -248,7 +288,10 @@ def _meanings(kind: type) -> dict[str, str]:
         for mark in getattr(hint, "__metadata__", ())
         if isinstance(mark, Doc)
     }
-    return {**declared, **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S))}
+    return {
+        **declared,
+        **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S)),
+    }
 
 
 def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:
@@ -312,5 +355,7 @@ def _inline(text: str) -> list[nodes.Node]:
     """Returns text with code in backquotes, and options, as literals."""
     parts = re.split(r"`([^`]+)`|(--[a-z][\w.-]*\w)", text)
     return [
-        nodes.Text(part) if i % 3 == 0 else nodes.literal(text=part) for i, part in enumerate(parts) if part is not None
+        nodes.Text(part) if i % 3 == 0 else nodes.literal(text=part)
+        for i, part in enumerate(parts)
+        if part is not None
     ]

@@ -4,8 +4,9 @@
     python examples/depth_grasp.py --depth depth.png --intrinsics 615 615 320 240 \
         --camera 0.5 0 0.4 0.271 -0.653 -0.653 0.271
 
-The image is a PNG of millimetres (16 bit) or an NPY of metres; without one, a cylinder is seen by a simulated camera.
-Points above the table are the object. Joints follow their targets like unloaded servos; a robot passes its readings.
+The image is a PNG of millimetres (16 bit) or an NPY of metres; without one, a cylinder is seen by a
+simulated camera. Points above the table are the object. Joints follow their targets like unloaded
+servos; a robot passes its readings.
 """
 
 import dataclasses
@@ -50,8 +51,8 @@ class Arguments:
         -0.65328,
         0.27060,
     )
-    """Position (m) and quaternion (w, x, y, z) of the optical frame (z forward, y down), world frame; the table's top
-    is at z = 0."""
+    """Position (m) and quaternion (w, x, y, z) of the optical frame (z forward, y down), world
+    frame; the table's top is at z = 0."""
     floor: float = 0.005
     """Height above which a point belongs to the object, m."""
     heading: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -71,11 +72,15 @@ def simulated(arguments: Arguments) -> np.ndarray:
     mujoco.mj_forward(model, data)
     fx, fy, cx, cy = arguments.intrinsics
     columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    local = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(columns.shape)], -1).reshape(-1, 3)
+    local = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(columns.shape)], -1).reshape(
+        -1, 3
+    )
     rays = np.asarray(rotations.rotate(np.asarray(arguments.camera[3:]), local))
     depth, hit, normal = np.zeros(len(rays)), np.zeros((1,), np.int32), np.zeros((3, 1))
     for i, ray in enumerate(rays):  # distances in lengths of the ray, which are depths
-        depth[i] = mujoco.mj_ray(model, data, np.asarray(arguments.camera[:3]), ray, None, 1, -1, hit, normal)
+        depth[i] = mujoco.mj_ray(
+            model, data, np.asarray(arguments.camera[:3]), ray, None, 1, -1, hit, normal
+        )
     return np.maximum(depth, 0.0).reshape(columns.shape)
 
 
@@ -94,7 +99,8 @@ def cloud_of(depth: np.ndarray, arguments: Arguments) -> np.ndarray:
     points = points[points[:, 2] > arguments.floor]
     if not len(points):
         raise congrasp.CongraspError(
-            "No point of the depth image is above the table.", "Check --camera, --intrinsics and --floor."
+            "No point of the depth image is above the table.",
+            "Check --camera, --intrinsics and --floor.",
         )
     return points.astype(np.float32)
 
@@ -107,9 +113,13 @@ def read_depth(file: pathlib.Path) -> np.ndarray:
         else:
             depth = np.asarray(Image.open(file), np.float32) / 1000.0
     except (OSError, ValueError) as error:
-        raise congrasp.CongraspError(f"--depth: {file} cannot be read ({error}).", "Pass a PNG or an NPY.") from None
+        raise congrasp.CongraspError(
+            f"--depth: {file} cannot be read ({error}).", "Pass a PNG or an NPY."
+        ) from None
     if depth.ndim != 2:
-        raise congrasp.CongraspError(f"--depth: {file} has shape {depth.shape}.", "Pass one depth a pixel.")
+        raise congrasp.CongraspError(
+            f"--depth: {file} has shape {depth.shape}.", "Pass one depth a pixel."
+        )
     return depth
 
 
@@ -119,7 +129,11 @@ def main(arguments: Arguments) -> None:
     cloud = cloud_of(depth, arguments)
     direction = np.asarray(arguments.heading) / np.linalg.norm(arguments.heading)
     cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-    heading = {"position": cloud.mean(0), "direction": direction, "cross": cross / np.linalg.norm(cross)}
+    heading = {
+        "position": cloud.mean(0),
+        "direction": direction,
+        "cross": cross / np.linalg.norm(cross),
+    }
     with congrasp.load_policy(arguments.policy) as policy:
         described = policy.metadata()
         hand, q, u = get_hand(described["hand"]), np.asarray(described["open_pose"]), np.zeros(6)
@@ -127,7 +141,11 @@ def main(arguments: Arguments) -> None:
         wrist = np.asarray(aligned) - arguments.back_off * direction, np.asarray(turn)
         policy.reset(
             congrasp.GraspRequest(
-                {"heading": heading}, cloud=cloud, camera=np.asarray(arguments.camera[:3]), q=q, wrist=wrist
+                {"heading": heading},
+                cloud=cloud,
+                camera=np.asarray(arguments.camera[:3]),
+                q=q,
+                wrist=wrist,
             )
         )
         rows = []

@@ -1,9 +1,10 @@
-"""Makes DexGraspBench's files of those that `python -m tests.benchmarks dexgraspbench` wrote, in its own environment.
+"""Makes DexGraspBench's files of those that `python -m tests.benchmarks dexgraspbench` wrote, in
+its own environment.
 
     python dexgraspbench.py dexgraspbench DexGraspBench/output/congrasp_allegro/graspdata
 
-Each becomes a .npy file with a pickled dictionary, which is what the benchmark reads. It needs numpy alone, and reads
-without unpickling anything.
+Each becomes a .npy file with a pickled dictionary, which is what the benchmark reads. It needs
+numpy alone, and reads without unpickling anything.
 """
 
 import argparse
@@ -37,8 +38,14 @@ def convert(source: pathlib.Path, target: pathlib.Path) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", type=pathlib.Path, help="folder that 'tests.benchmarks dexgraspbench' wrote")
-    parser.add_argument("target", type=pathlib.Path, help="the benchmark's output/<exp_name>_<hand>/graspdata")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "source", type=pathlib.Path, help="folder that 'tests.benchmarks dexgraspbench' wrote"
+    )
+    parser.add_argument(
+        "target", type=pathlib.Path, help="the benchmark's output/<exp_name>_<hand>/graspdata"
+    )
     arguments = parser.parse_args()
     print(f"{convert(arguments.source, arguments.target)} grasps in {arguments.target}")

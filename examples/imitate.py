@@ -1,9 +1,12 @@
-"""Moves a human demonstration to other hands: its heading and affordance drive each hand's own policy.
+"""Moves a human demonstration to other hands: its heading and affordance drive each hand's own
+policy.
 
-    python examples/imitate.py MyoHand_hammer_use1.npz --meshes object_sim --affordance contacts --hand allegro sharpa
+    python examples/imitate.py MyoHand_hammer_use1.npz --meshes object_sim --affordance contacts
+    --hand allegro sharpa
 
-The demonstration provides the approach direction, the point between the fingers, and the parts of the object that were
-touched; finger angles and the wrist's path, which belong to the human hand, are not used.
+The demonstration provides the approach direction, the point between the fingers, and the parts of
+the object that were touched; finger angles and the wrist's path, which belong to the human hand,
+are not used.
 """
 
 import dataclasses
@@ -40,7 +43,9 @@ class Arguments:
     mano: pathlib.Path | None = None
     """Your MANO_RIGHT.pkl, where the data set needs it."""
     affordance: Literal["auto", "contacts", "none"] = "auto"
-    """Graspable surface: the labelled parts that the demonstration touched, the surface near its contacts, or all."""
+    """Graspable surface: the labelled parts that the demonstration touched, the surface near its
+    contacts, or all.
+    """
     hand: tuple[str, ...] = ("allegro", "sharpa")
     """Hands that imitate; objects are scaled for each."""
     policy: pathlib.Path | None = None
@@ -50,7 +55,9 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> None:
-    """Extracts heading and affordance, grasps with each hand, and writes motions and a picture of each object."""
+    """Extracts heading and affordance, grasps with each hand, and writes motions and a picture of
+    each object.
+    """
     model = read_mano(arguments.mano) if arguments.mano else None
     pictures: dict[str, tuple[list[np.ndarray], list[str]]] = {}
     for name in arguments.hand:
@@ -69,7 +76,10 @@ def main(arguments: Arguments) -> None:
             labels += new[1]
     for name, (images, labels) in pictures.items():
         title = f"{name}: heading and affordance of a human demonstration"
-        save_png(arguments.out / f"{name}.png", contact_sheet(images, labels, columns=_FRAMES, title=title))
+        save_png(
+            arguments.out / f"{name}.png",
+            contact_sheet(images, labels, columns=_FRAMES, title=title),
+        )
 
 
 def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Message) -> Message:
@@ -79,16 +89,20 @@ def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Mess
         fitting,
         heading=constraints.arrays["heading/direction"][0, 0],
         at=constraints.arrays["heading/position"][0, 0] - fitting.origin,
-        affordance=",".join(np.array(obj.part_names)[obj.graspable]) if not obj.graspable.all() else "",
+        affordance=",".join(np.array(obj.part_names)[obj.graspable])
+        if not obj.graspable.all()
+        else "",
         hand=hand,
         policy=arguments.policy,
     )
     congrasp.save_motion(arguments.out / f"{obj.name}-{hand}.npz", done.motion)
     error = done.motion.metrics
     print(
-        f"{obj.name}, {hand} hand: {'held' if done.success else 'not held'} ({done.held} of {done.attempts} attempts); "
+        f"{obj.name}, {hand} hand: {'held' if done.success else 'not held'} ({done.held} of "
+        f"{done.attempts} attempts); "
         f"heading off by {error['heading_rad']:.2f} rad and {100 * error['heading_m']:.1f} cm, "
-        f"{error['affordance_ratio']:.0%} of the contacts outside of what the demonstration touched."
+        f"{error['affordance_ratio']:.0%} of the contacts outside of what the demonstration "
+        f"touched."
     )
     return done.episode
 

@@ -12,7 +12,9 @@ import trimesh
 
 RADIUS, HEIGHT, WALL = 0.040, 0.095, 0.004
 HANDLE_RADIUS, REACH, HALF = 0.0055, 0.032, 0.030
-"""Of the handle, m: radius of its tube, distance of its centre line from the wall, and half of its height."""
+"""Of the handle, m: radius of its tube, distance of its centre line from the wall, and half of its
+height.
+"""
 BAND_WIDTH = 0.016
 SECTIONS, SIDES, STEPS = 48, 12, 32
 GLAZE, BAND, INSIDE = (38, 84, 124), (239, 160, 75), (244, 238, 226)
@@ -53,12 +55,17 @@ def _arc(x: float, z: float, radius: float, angles: np.ndarray) -> np.ndarray:
 def handle() -> trimesh.Trimesh:
     """A tube along half an ellipse, whose ends are inside the cup's wall."""
     turn = np.linspace(-np.pi / 2, np.pi / 2, STEPS)
-    path = np.stack([RADIUS - WALL / 2 + REACH * np.cos(turn), 0 * turn, HEIGHT / 2 + HALF * np.sin(turn)], -1)
+    path = np.stack(
+        [RADIUS - WALL / 2 + REACH * np.cos(turn), 0 * turn, HEIGHT / 2 + HALF * np.sin(turn)], -1
+    )
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     side = np.array([0.0, 1.0, 0.0])
     angle = np.linspace(0, 2 * np.pi, SIDES, endpoint=False)
-    ring = np.cross(along, side)[:, None] * np.cos(angle)[:, None] + 1.3 * side * np.sin(angle)[:, None]
+    ring = (
+        np.cross(along, side)[:, None] * np.cos(angle)[:, None]
+        + 1.3 * side * np.sin(angle)[:, None]
+    )
     tube = (path[:, None] + HANDLE_RADIUS * ring).reshape(-1, 3)
     i, k = np.meshgrid(np.arange(STEPS - 1) * SIDES, np.arange(SIDES), indexing="ij")
     a, b = (i + k).ravel(), (i + (k + 1) % SIDES).ravel()
@@ -66,7 +73,10 @@ def handle() -> trimesh.Trimesh:
     turned = np.roll(rim, -1)
     faces = [
         *(np.stack([a, b, a + SIDES], -1), np.stack([b, b + SIDES, a + SIDES], -1)),
-        *(np.stack([turned, rim, 0 * rim + first], -1), np.stack([rim + far, turned + far, 0 * rim + first + 1], -1)),
+        *(
+            np.stack([turned, rim, 0 * rim + first], -1),
+            np.stack([rim + far, turned + far, 0 * rim + first + 1], -1),
+        ),
     ]
     mesh = trimesh.Trimesh(np.vstack([tube, path[[0, -1]]]), np.vstack(faces), process=False)
     mesh.fix_normals()

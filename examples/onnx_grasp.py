@@ -3,8 +3,9 @@
     congrasp export policy --to onnx --out policy.onnx
     python examples/onnx_grasp.py policy.onnx
 
-Everything about the hand, the observation and the action comes out of the ONNX file's metadata. The policy is given an
-approach heading; the other constraints stay off, so that their blocks of the observation are zero.
+Everything about the hand, the observation and the action comes out of the ONNX file's metadata. The
+policy is given an approach heading; the other constraints stay off, so that their blocks of the
+observation are zero.
 """
 
 import json
@@ -38,7 +39,9 @@ def shorten(vector, length):
 
 
 def turned(start, end):
-    """Twice the vector part of the rotation from one matrix to another, as a quaternion whose w is positive."""
+    """Twice the vector part of the rotation from one matrix to another, as a quaternion whose w is
+    positive.
+    """
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, (end @ start.T).ravel())
     return 2.0 * quaternion[1:] * (1.0 if quaternion[0] >= 0 else -1.0)
@@ -54,13 +57,18 @@ class Grasp:
         self.task, self.control = meta["task"], meta["task"]["control"]
         self.limits = np.array([motor["limits"] for motor in meta["motors"]])
         self.keypoint_links = np.array(meta["keypoint_links"])
-        self.keypoint_offsets = np.array(meta["keypoints"]) - np.array(meta["link_origins"])[self.keypoint_links]
-        self.tips = slice(len(meta["links"]), None)  # keypoints: the links' origins, then the tips, thumb first
+        self.keypoint_offsets = (
+            np.array(meta["keypoints"]) - np.array(meta["link_origins"])[self.keypoint_links]
+        )
+        # Keypoints: the links' origins, then the tips, thumb first
+        self.tips = slice(len(meta["links"]), None)
 
         scene, contact = meta["scene"], meta["scene"]["object_contact"]
         spec = mujoco.MjSpec.from_string(scene["mjcf"])
         body = spec.worldbody.add_body(name="object", pos=[0, 0, HALF_HEIGHT])
-        body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, damping=[contact["free_damping"], 0, 0])
+        body.add_joint(
+            name="object", type=mujoco.mjtJoint.mjJNT_FREE, damping=[contact["free_damping"], 0, 0]
+        )
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
             size=[RADIUS, HALF_HEIGHT, 0],
@@ -84,20 +92,30 @@ class Grasp:
         self.ctrl = [model.actuator(name).id for name in (*meta["wrist_joints"], *motors)]
         self.free = model.joint("object").dofadr[0]
 
-        # Points on the cylinder's surface with its normals there, as many as the policy was trained with.
+        # Points on the cylinder's surface with its normals there, as many as the policy was trained
+        # with.
         rng = np.random.default_rng(0)
-        angle, n = rng.uniform(0, 2 * np.pi, self.task["surface_points"]), self.task["surface_points"]
+        angle, n = (
+            rng.uniform(0, 2 * np.pi, self.task["surface_points"]),
+            self.task["surface_points"],
+        )
         height, radius = rng.uniform(-HALF_HEIGHT, HALF_HEIGHT, n), np.full(n, RADIUS)
         lid = rng.random(n) < RADIUS / (RADIUS + 2 * HALF_HEIGHT)
-        radius[lid], height[lid] = RADIUS * np.sqrt(rng.random(lid.sum())), np.sign(height[lid]) * HALF_HEIGHT
+        radius[lid], height[lid] = (
+            RADIUS * np.sqrt(rng.random(lid.sum())),
+            np.sign(height[lid]) * HALF_HEIGHT,
+        )
         outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], 1)
         self.points = radius[:, None] * outward + height[:, None] * [0.0, 0.0, 1.0]
         self.normals = np.where(lid[:, None], np.sign(height)[:, None] * [0.0, 0.0, 1.0], outward)
 
-        # The thumb and the fingers close around the cylinder's axis: across both the axis and the heading.
+        # The thumb and the fingers close around the cylinder's axis: across both the axis and the
+        # heading.
         self.heading_position = np.array([0.0, 0.0, 0.01])
         self.target = frame(HEADING, np.cross(HEADING, [0.0, 0.0, 1.0]))
-        self.own = frame(np.array(meta["grasp_frame"]["heading"]), np.array(meta["grasp_frame"]["cross"]))
+        self.own = frame(
+            np.array(meta["grasp_frame"]["heading"]), np.array(meta["grasp_frame"]["cross"])
+        )
         self._start()
 
     def _start(self):
@@ -105,11 +123,17 @@ class Grasp:
         model, data = self.model, self.data
         data.qpos[self.fingers] = self.meta["open_pose"]
         mujoco.mj_forward(model, data)
-        self.object_position, self.object_matrix = data.xpos[self.object].copy(), data.xmat[self.object].reshape(3, 3)
+        self.object_position, self.object_matrix = (
+            data.xpos[self.object].copy(),
+            data.xmat[self.object].reshape(3, 3),
+        )
         self.object_matrix = self.object_matrix.copy()
         self.base_position, self.base = np.zeros(3), np.eye(3)
         position, turn = self.guidance(self.seen()["center"])
-        self.base_position, self.base = position - self.task["back_off"] * (self.object_matrix @ HEADING), turn
+        self.base_position, self.base = (
+            position - self.task["back_off"] * (self.object_matrix @ HEADING),
+            turn,
+        )
         base = model.body("hand_base")
         base.pos = self.base_position
         mujoco.mju_mat2Quat(base.quat, turn.ravel())
@@ -142,7 +166,9 @@ class Grasp:
         }
 
     def forces(self):
-        """(L, 3) net force of the object on each link in the world, and (L,) which links touch it."""
+        """(L, 3) net force of the object on each link in the world, and (L,) which links touch
+        it.
+        """
         force, touching = np.zeros((len(self.links), 3)), np.zeros(len(self.links))
         for i in range(self.data.ncon):
             contact = self.data.contact[i]
@@ -159,13 +185,27 @@ class Grasp:
         return force, touching
 
     def read(self):
-        """Current joint positions of fingers and wrist, the targets of both, and the object's pose."""
+        """Current joint positions of fingers and wrist, the targets of both, and the object's
+        pose.
+        """
         data = self.data
-        position, matrix = data.xpos[self.object].copy(), data.xmat[self.object].reshape(3, 3).copy()
-        return data.qpos[self.fingers], data.qpos[self.wrist], self.q_target, self.u_target, position, matrix
+        position, matrix = (
+            data.xpos[self.object].copy(),
+            data.xmat[self.object].reshape(3, 3).copy(),
+        )
+        return (
+            data.qpos[self.fingers],
+            data.qpos[self.wrist],
+            self.q_target,
+            self.u_target,
+            position,
+            matrix,
+        )
 
     def past(self, wrist):
-        """Fields of a policy that looks back instead of seeing forces and velocities, turned to the wrist frame."""
+        """Fields of a policy that looks back instead of seeing forces and velocities, turned to the
+        wrist frame.
+        """
         q, u, _, _, position, matrix = self.read()
         steps = self.task.get("history", 2) - 1
         rows = (self.readings or [self.read()])[:steps]
@@ -201,7 +241,8 @@ class Grasp:
             "q_velocity": data.qvel[self.finger_speeds],
             "u_velocity": data.qvel[self.wrist_speeds],
             "touching": touching,
-            "force": force / (np.linalg.norm(force, axis=1, keepdims=True) + self.meta["force_scale"]),
+            "force": force
+            / (np.linalg.norm(force, axis=1, keepdims=True) + self.meta["force_scale"]),
             "nearest": points[nearest] - seen["keypoints"],
             "normal": normal,
             "height": ((seen["keypoints"] - points[nearest]) * normal).sum(1),
@@ -218,11 +259,15 @@ class Grasp:
             "object_matrix": local,
             **self.past(wrist),
         }
-        numbers = [np.ravel(fields.get(f["field"], np.zeros(f["size"]))) for f in self.meta["observation"]]
+        numbers = [
+            np.ravel(fields.get(f["field"], np.zeros(f["size"]))) for f in self.meta["observation"]
+        ]
         return np.concatenate(numbers).astype(np.float32)
 
     def lead(self, ahead, residual, speed):
-        """Lead of the wrist's targets over its position, within its limits of speed and acceleration."""
+        """Lead of the wrist's targets over its position, within its limits of speed and
+        acceleration.
+        """
         table = self.time < self.meta["task"]["approach_steps"]
         share = 1.0 if table else self.control["hold_acceleration"]
         found = []
@@ -232,8 +277,12 @@ class Grasp:
             wanted = shorten(shorten(ahead[part], most) + residual[part], most)
             limit = self.control[servo["limit"]]
             slowing = servo["kp"] / servo["kv"] * np.linalg.norm(speed[part])
-            hardest = servo["inertia"] / servo["kp"] * (np.clip(slowing, share * limit, limit) or np.inf)
-            carried = 0.0 if table else shorten(-self.load()[part] * servo["inertia"] / servo["kp"], most)
+            hardest = (
+                servo["inertia"] / servo["kp"] * (np.clip(slowing, share * limit, limit) or np.inf)
+            )
+            carried = (
+                0.0 if table else shorten(-self.load()[part] * servo["inertia"] / servo["kp"], most)
+            )
             found.append(steady + shorten(wanted - steady, hardest) + carried)
         return np.concatenate(found)
 
@@ -242,7 +291,9 @@ class Grasp:
         return self.control["load_rate"] * (self.generalised_speed() - self.momentum)
 
     def generalised_speed(self):
-        """(6,) v + (damping - stiffness dt / 2) u of the wrist; servos and load make up its rate of change."""
+        """(6,) v + (damping - stiffness dt / 2) u of the wrist; servos and load make up its rate of
+        change.
+        """
         stiffness, damping = self.servos()
         factor = damping - 0.5 * self.task["control_dt"] * stiffness
         return self.data.qvel[self.wrist_speeds] + factor * self.data.qpos[self.wrist]
@@ -250,7 +301,9 @@ class Grasp:
     def servos(self):
         """(2, 6) stiffness (1/s^2) and damping (1/s) of the wrist's servos."""
         kinds = [self.meta["wrist"][kind] for kind in ("position", "rotation")]
-        return np.repeat([[kind[gain] / kind["inertia"] for kind in kinds] for gain in ("kp", "kv")], 3, 1)
+        return np.repeat(
+            [[kind[gain] / kind["inertia"] for kind in kinds] for gain in ("kp", "kv")], 3, 1
+        )
 
     def track_load(self):
         """Updates the momentum of the load observer after a control step."""
@@ -268,7 +321,9 @@ class Grasp:
         motors = self.meta["motors"]
         fingers, wrist = np.split(scale * action[0], [len(motors)])
         before = dict(zip(self.meta["joints"], self.q_target, strict=True))
-        now = np.array([sum(c * before[joint] for joint, c in motor["pulls"].items()) for motor in motors])
+        now = np.array(
+            [sum(c * before[joint] for joint, c in motor["pulls"].items()) for motor in motors]
+        )
         now = np.clip(now + fingers, *self.limits.T)
         targets = {
             joint: place["ratio"] * position + place["rest"]
@@ -291,7 +346,9 @@ class Grasp:
 
         self.data.ctrl[self.ctrl] = np.concatenate([self.u_target, now])
         if self.time == self.task["approach_steps"]:
-            self.data.mocap_pos[self.model.body("table").mocapid[0]] = self.meta["scene"]["table_away"]
+            self.data.mocap_pos[self.model.body("table").mocapid[0]] = self.meta["scene"][
+                "table_away"
+            ]
         mujoco.mj_step(self.model, self.data, self.task["substeps"])
         mujoco.mj_forward(self.model, self.data)
         self.track_load()
@@ -313,7 +370,8 @@ def main():
     print(
         f"{grasp.meta['hand']} hand, policy version {grasp.meta['version']}: "
         f"the cylinder is {'held' if held else 'lost'} "
-        f"two seconds after the table is removed, {1000 * (heights[-1] - removal):+.1f} mm, {links} links in contact"
+        f"two seconds after the table is removed, {1000 * (heights[-1] - removal):+.1f} mm, "
+        f"{links} links in contact"
     )
     return 0 if held else 1
 

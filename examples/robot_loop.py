@@ -2,9 +2,10 @@
 
     python examples/robot_loop.py --seconds 600 --kill-every 30
 
-The policy answers over Zenoh from a separate process, which is killed (SIGKILL) and restarted every `--kill-every`
-seconds. The robot receives a target every 10 ms throughout, within the limits of position, speed and torque. At the end
-the loop prints how far joints, targets and torques were from their limits, and the deadlines that it missed.
+The policy answers over Zenoh from a separate process, which is killed (SIGKILL) and restarted every
+`--kill-every` seconds. The robot receives a target every 10 ms throughout, within the limits of
+position, speed and torque. At the end the loop prints how far joints, targets and torques were from
+their limits, and the deadlines that it missed.
 """
 
 import dataclasses
@@ -33,7 +34,9 @@ from congrasp.common.transport.ports import local_url
 from congrasp.services.serve.load import example_episode
 
 BUFFER = 0.01
-"""rad before the ends of the finger joints at which the robot's stops begin, which are springs in MuJoCo."""
+"""rad before the ends of the finger joints at which the robot's stops begin, which are springs in
+MuJoCo.
+"""
 HOLD_STEPS = 200
 """Control steps without the table, after which a grasp is held or lost."""
 
@@ -73,7 +76,11 @@ class MujocoRobot:
         for joint in hand.joints:
             index = self.model.joint(joint.name).id
             self.model.jnt_margin[index] = BUFFER
-            self.model.jnt_solref[index] = 2.0 * self.model.opt.timestep, 1.0  # as stiff as the time step allows
+            # As stiff as the time step allows
+            self.model.jnt_solref[index] = (
+                2.0 * self.model.opt.timestep,
+                1.0,
+            )
         strongest = np.roll(limits.torque, 6)  # in MuJoCo the wrist's servos come first
         self.model.actuator_forcerange[:] = np.stack([-strongest, strongest], 1)
         self.data = mujoco.MjData(self.model)
@@ -106,9 +113,9 @@ class MujocoRobot:
         """The state for `Policy.act`."""
         raw = (np.float32(x)[None] for x in (self.data.qpos, self.data.qvel, self.data.sensordata))
         found = physics_state(np, self._where, *raw, np.zeros(1, bool), np.zeros(2))._asdict()
-        return {name: x[0] for name, x in found.items() if name not in ("diverged", "occupancy")} | {
-            "table": np.asarray(self._table)
-        }
+        return {
+            name: x[0] for name, x in found.items() if name not in ("diverged", "occupancy")
+        } | {"table": np.asarray(self._table)}
 
     def move(self, command: congrasp.Command) -> None:
         """One control step towards the targets of a command."""
@@ -119,7 +126,9 @@ class MujocoRobot:
         for _ in range(self._task.substeps):
             mujoco.mj_step(self.model, self.data)
             q = self.data.qpos[self._where.finger_qpos]
-            self.beyond = max(self.beyond, float(np.maximum(self._hand.lower - q, q - self._hand.upper).max()))
+            self.beyond = max(
+                self.beyond, float(np.maximum(self._hand.lower - q, q - self._hand.upper).max())
+            )
             force = np.abs(np.roll(self.data.actuator_force, -6)) / self._limits.torque
             self.strongest = max(self.strongest, float(force.max()))
 
@@ -156,7 +165,9 @@ class Server:
 
 
 class Grasps:
-    """Repeated grasps: approach, table away, hold; after a fallback a new one starts once the policy answers again."""
+    """Repeated grasps: approach, table away, hold; after a fallback a new one starts once the
+    policy answers again.
+    """
 
     def __init__(self, robot: MujocoRobot, guard: congrasp.Guard, task: TaskConfig):
         self._robot, self._guard, self._task = robot, guard, task
@@ -178,7 +189,9 @@ class Grasps:
             self._end("held" if self._up() else "lost")
 
     def _up(self) -> bool:
-        """True if the object has not dropped since the table was removed, or the table is still there."""
+        """True if the object has not dropped since the table was removed, or the table is still
+        there.
+        """
         return self._height is None or self._robot.height > self._height - self._task.drop_height
 
     def _begin(self) -> None:
@@ -198,7 +211,8 @@ def run(arguments: Arguments) -> dict[str, object]:
     hand = get_hand(task.hand)
     if len(hand.motors) != len(hand.joints):
         raise congrasp.CongraspError(
-            f"Joints of the hand '{hand.name}' are coupled.", "Choose a hand with a motor for each joint."
+            f"Joints of the hand '{hand.name}' are coupled.",
+            "Choose a hand with a motor for each joint.",
         )
     limits = congrasp.JointLimits.of_hand(hand, task.control)
     robot = MujocoRobot(hand, task, arguments.object_seed, limits)
@@ -206,7 +220,9 @@ def run(arguments: Arguments) -> dict[str, object]:
     try:
         client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=180.0)
         period = task.control_dt
-        with congrasp.Guard(client, period=period, wait=0.6 * period, fallback=arguments.fallback) as guard:
+        with congrasp.Guard(
+            client, period=period, wait=0.6 * period, fallback=arguments.fallback
+        ) as guard:
             grasps = Grasps(robot, guard, task)
             ticker = congrasp.Ticker(1.0 / period)
             begin = ticker.wait()

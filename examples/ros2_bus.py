@@ -9,7 +9,11 @@ import numpy as np
 
 import congrasp
 
-JOINTS, POSE, FRAMES = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
+JOINTS, POSE, FRAMES = (
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+)
 CLOUD, CLOCK = "sensor_msgs/msg/PointCloud2", "rosgraph_msgs/msg/Clock"
 INPUTS = {
     "joint_states": JOINTS,
@@ -28,11 +32,15 @@ class Bus(Protocol):
     """Topics of typed messages."""
 
     def make(self, kind: str, **fields: Any) -> Any:
-        """A message of a type such as `geometry_msgs/msg/Point`; numbers of an array come as a list."""
+        """A message of a type such as `geometry_msgs/msg/Point`; numbers of an array come as a
+        list.
+        """
         ...
 
     def receive(self) -> list[tuple[str, Any]]:
-        """Topics and messages received since the last call; those of one topic are in their order."""
+        """Topics and messages received since the last call; those of one topic are in their
+        order.
+        """
         ...
 
     def publish(self, topic: str, message: Any) -> None:
@@ -57,21 +65,33 @@ class RosBus:
           CongraspError: rclpy is not installed.
         """
         try:
-            self._rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
+            self._rclpy, qos = (
+                importlib.import_module("rclpy"),
+                importlib.import_module("rclpy.qos"),
+            )
         except ImportError:
             raise congrasp.CongraspError(
-                "ROS 2's rclpy cannot be imported here.", "Source ROS 2's setup.bash, or use --zenoh (docs/ros2.md)."
+                "ROS 2's rclpy cannot be imported here.",
+                "Source ROS 2's setup.bash, or use --zenoh (docs/ros2.md).",
             ) from None
         self._rclpy.init()
         self._node = self._rclpy.create_node("congrasp")
         self._received: list[tuple[str, Any]] = []
         for topic, kind in inputs.items():
-            # Takes reliable publishers, too. Static transforms are published once and kept for later subscribers.
-            lasting = {"durability": qos.DurabilityPolicy.TRANSIENT_LOCAL} if topic == "tf_static" else {}
-            depth = 1 if kind in (POSE, CLOUD, CLOCK) else _MOST  # several nodes publish joints and frames
-            profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT, **lasting)
+            # Takes reliable publishers, too. Static transforms are published once and kept for
+            # later subscribers.
+            lasting = (
+                {"durability": qos.DurabilityPolicy.TRANSIENT_LOCAL} if topic == "tf_static" else {}
+            )
+            # Several nodes publish joints and frames
+            depth = 1 if kind in (POSE, CLOUD, CLOCK) else _MOST
+            profile = qos.QoSProfile(
+                depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT, **lasting
+            )
             self._node.create_subscription(self._type(kind), topic, self._keep(topic), profile)
-        self._publishers = {t: self._node.create_publisher(self._type(k), t, 1) for t, k in OUTPUTS.items()}
+        self._publishers = {
+            t: self._node.create_publisher(self._type(k), t, 1) for t, k in OUTPUTS.items()
+        }
 
     def make(self, kind: str, **fields: Any) -> Any:
         """See `Bus.make`."""
@@ -148,7 +168,11 @@ class ZenohBus:
 
     def make(self, kind: str, **fields: Any) -> Any:
         """See `Bus.make`."""
-        arrays = {name: np.array(x) for name, x in fields.items() if isinstance(x, list) and name != "name"}
+        arrays = {
+            name: np.array(x)
+            for name, x in fields.items()
+            if isinstance(x, list) and name != "name"
+        }
         return self._store.types[kind](**{**fields, **arrays})
 
     def receive(self) -> list[tuple[str, Any]]:
@@ -159,10 +183,15 @@ class ZenohBus:
                 if (sample := subscriber.try_recv()) is None:
                     break
                 try:
-                    message = self._store.deserialize_cdr(sample.payload.to_bytes(), self._inputs[topic])
+                    message = self._store.deserialize_cdr(
+                        sample.payload.to_bytes(), self._inputs[topic]
+                    )
                     received.append((topic, message))
                 except Exception as error:
-                    print(f"{topic}: not a {self._inputs[topic]} ({type(error).__name__})", file=sys.stderr)
+                    print(
+                        f"{topic}: not a {self._inputs[topic]} ({type(error).__name__})",
+                        file=sys.stderr,
+                    )
         return received
 
     def publish(self, topic: str, message: Any) -> None:

@@ -1,4 +1,6 @@
-"""Visible surface of the object in a camera's point clouds, for `ros2_node.py` with a camera policy."""
+"""Visible surface of the object in a camera's point clouds, for `ros2_node.py` with a camera
+policy.
+"""
 
 import dataclasses
 from typing import Any
@@ -56,12 +58,15 @@ class Eye:
         self.points: np.ndarray | None = None
         """(count, 3) m; None until an object was seen."""
         self.camera: dict[str, np.ndarray] = {}
-        """Its position, m, when it saw them, as the field `camera_position` of a query; none if it is unknown."""
+        """Its position, m, when it saw them, as the field `camera_position` of a query; none if it
+        is unknown.
+        """
         self.seen = ""
         """Text that counts the newest cloud's points on the object."""
 
     def look(self, message: Any, camera: Pose, palm: Pose, q: np.ndarray) -> None:
-        """Updates the points from a new PointCloud2; they stay if it is the last one again, or hides the object.
+        """Updates the points from a new PointCloud2; they stay if it is the last one again, or
+        hides the object.
 
         Args:
           message: the cloud.
@@ -76,16 +81,25 @@ class Eye:
         points = camera.rotation.apply(points) + camera.position if len(points) else points
         points = points[((points >= self._low) & (points <= self._high)).all(-1)]
         points = points[~self._on_hand(points, palm, q)]
-        self.seen = f"{len(points)} of {len(everything)} points in --box above the table, and none of the hand's"
+        self.seen = (
+            f"{len(points)} of {len(everything)} points in --box above the table, and none of the "
+            f"hand's"
+        )
         if len(points) >= _FEWEST:
             self.points = points[np.arange(self._count) * len(points) // self._count]
-            self.camera = {} if message.header.frame_id == self._world else {"camera_position": camera.position}
+            self.camera = (
+                {}
+                if message.header.frame_id == self._world
+                else {"camera_position": camera.position}
+            )
 
     def _on_hand(self, points: np.ndarray, palm: Pose, q: np.ndarray) -> np.ndarray:
         """(N,) true for points (N, 3) that belong to the hand."""
         local = palm.rotation.inv().apply(points - palm.position) if len(points) else points
         near = np.zeros(len(points), bool)
-        for link, position, quaternion in zip(self._hand.links, *mujoco_link_poses(self._hand, q), strict=True):
+        for link, position, quaternion in zip(
+            self._hand.links, *mujoco_link_poses(self._hand, q), strict=True
+        ):
             turn = Rotation.from_quat(quaternion, scalar_first=True)
             for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
                 start, end = turn.apply(ends) + position
@@ -97,13 +111,23 @@ class Eye:
 
 
 def read_points(message: Any) -> np.ndarray:
-    """(N, 3) finite points of a PointCloud2, evenly thinned if it is large; none if it has no x, y, z."""
-    order, fields = ">" if message.is_bigendian else "<", {field.name: field for field in message.fields}
+    """(N, 3) finite points of a PointCloud2, evenly thinned if it is large; none if it has no x, y,
+    z.
+    """
+    order, fields = (
+        ">" if message.is_bigendian else "<",
+        {field.name: field for field in message.fields},
+    )
     try:
         formats = [order + _KINDS[fields[name].datatype] for name in "xyz"]
         offsets = [fields[name].offset for name in "xyz"]
         kind = np.dtype(
-            {"names": ["x", "y", "z"], "formats": formats, "offsets": offsets, "itemsize": message.point_step}
+            {
+                "names": ["x", "y", "z"],
+                "formats": formats,
+                "offsets": offsets,
+                "itemsize": message.point_step,
+            }
         )
         shape, strides = (message.height, message.width), (message.row_step, message.point_step)
         points = np.ndarray(shape, kind, bytes(message.data), strides=strides).ravel()
@@ -115,7 +139,8 @@ def read_points(message: Any) -> np.ndarray:
 
 
 def seen_object(points: np.ndarray) -> GraspObject:
-    """Stand-in for an object of which only points (N, 3) are known; constraints on it are in their frame.
+    """Stand-in for an object of which only points (N, 3) are known; constraints on it are in their
+    frame.
 
     Its mass, which `--gentle` needs, is that of the box around the points at 300 kg/m^3.
     """
@@ -129,5 +154,7 @@ def seen_object(points: np.ndarray) -> GraspObject:
 
 
 def labelled(points: np.ndarray, first: np.ndarray, avoid: np.ndarray) -> np.ndarray:
-    """(N,) avoid labels of points (N, 3): that of the nearest of the first points (M, 3), which have labels (M,)."""
+    """(N,) avoid labels of points (N, 3): that of the nearest of the first points (M, 3), which
+    have labels (M,).
+    """
     return avoid[cKDTree(first).query(points)[1]]

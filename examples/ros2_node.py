@@ -1,23 +1,30 @@
 """A ROS 2 node between a policy server and a robot; without ROS 2 the same messages go over Zenoh.
 
     congrasp serve --policy allegro-student
-    python examples/ros2_node.py mug:7 --hand allegro --dry-run                       # where there is rclpy
-    python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      # zenoh-bridge-ros2dds, or a robot
+    python examples/ros2_node.py mug:7 --hand allegro --dry-run                       # where there
+    is rclpy python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      #
+    zenoh-bridge-ros2dds, or a robot
 
 | topic | type | what |
 |---|---|---|
 | in: `joint_states` | sensor_msgs/JointState | the finger joints, by name, any order |
 | in: `wrist_pose` | geometry_msgs/PoseStamped | what carries the hand; its palm without `--mount` |
 | in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file |
-| in: `--cloud-topic` | sensor_msgs/PointCloud2 | instead of `object_pose`, for a policy with a camera |
-| in: `tf`, `tf_static` | tf2_msgs/TFMessage | the frames of these poses in `--world`: z up, the table at z = 0 |
-| in: `clock` | rosgraph_msgs/Clock | a simulator's time, to which all stamps then refer; the time of day otherwise |
-| out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`) |
-| out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in `--world` |
+| in: `--cloud-topic` | sensor_msgs/PointCloud2 | instead of `object_pose`, for a policy with a
+camera |
+| in: `tf`, `tf_static` | tf2_msgs/TFMessage | the frames of these poses in `--world`: z up, the
+table at z = 0 |
+| in: `clock` | rosgraph_msgs/Clock | a simulator's time, to which all stamps then refer; the time
+of day otherwise |
+| out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`)
+|
+| out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in
+`--world` |
 
-The episode begins where the hand is when all have come: before the object, open. Commands keep to the limits that the
-server names. While a topic is silent, or the policy, the hand holds; then it freezes, or opens if nothing was lifted,
-until the node is started again. It is for hands with a motor for each joint.
+The episode begins where the hand is when all have come: before the object, open. Commands keep to
+the limits that the server names. While a topic is silent, or the policy, the hand holds; then it
+freezes, or opens if nothing was lifted, until the node is started again. It is for hands with a
+motor for each joint.
 """
 
 import contextlib
@@ -55,7 +62,9 @@ _MET = 0.01  # m around the line of approach within which the surface is met
 SETTLING_STEPS = 100
 """Control steps after the rise until the targets freeze."""
 TRACKER_AGE = 0.5
-"""Greatest age of a student's object or cloud, s: it was trained with 10 Hz, 100 ms delay and lost samples."""
+"""Greatest age of a student's object or cloud, s: it was trained with 10 Hz, 100 ms delay and lost
+samples.
+"""
 
 
 @dataclasses.dataclass
@@ -66,9 +75,11 @@ class Arguments:
     """A mesh, an object file, or FAMILY:SEED; none for a policy with a camera."""
     hand: str = "allegro"
     """Name of the hand."""
-    constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Constraints)
-    """Constraints on the grasp, in `--world` for a policy with a camera; without a heading the hand approaches along
-    -z."""
+    constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = dataclasses.field(
+        default_factory=Constraints
+    )
+    """Constraints on the grasp, in `--world` for a policy with a camera; without a heading the hand
+    approaches along -z."""
     connect: str = "tcp/127.0.0.1:7457"
     """The policy server's endpoint."""
     wait: float = 120.0
@@ -88,10 +99,12 @@ class Arguments:
     mount: str = "0 0 0 0 0 0"
     """X Y Z ROLL PITCH YAW of the palm in the frame of `wrist_pose`: metres, degrees."""
     hand_eye: str = "0 0 0 0 0 0"
-    """X Y Z ROLL PITCH YAW of the true camera frame in the frame of its messages: metres, degrees."""
+    """X Y Z ROLL PITCH YAW of the true camera frame in the frame of its messages: metres,
+    degrees.
+    """
     approach: float = 0.0
-    """Seconds of fresh answers, at full speed, until the object may leave the table; 0: twice as long as in training,
-    since the hand is slower by what the robot is late."""
+    """Seconds of fresh answers, at full speed, until the object may leave the table; 0: twice as
+    long as in training, since the hand is slower by what the robot is late."""
     lift: float = 0.0
     """Metres by which the hand then rises; a second after the rise its targets freeze."""
     slow: float = 1.0
@@ -103,9 +116,13 @@ class Arguments:
     hold: float = 0.5
     """Seconds without an answer after which the hand freezes or opens."""
     robot_age: float = 0.1
-    """Seconds after which joints and wrist count as not measured, from their stamps; without a stamp, from arrival."""
+    """Seconds after which joints and wrist count as not measured, from their stamps; without a
+    stamp, from arrival.
+    """
     object_age: float = 0.0
-    """The same for object or cloud; 0: as `--robot-age`, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
+    """The same for object or cloud; 0: as `--robot-age`, or 0.5 for a student (10 Hz, 100 ms, lost
+    samples).
+    """
 
 
 Read = Callable[[GraspObject, np.ndarray], congrasp.GraspRequest]
@@ -157,7 +174,9 @@ class Tracked:
 
     def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
         """See `Target.request`."""
-        return dataclasses.replace(self._request, object_pose=(fields["object_position"], fields["object_quaternion"]))
+        return dataclasses.replace(
+            self._request, object_pose=(fields["object_position"], fields["object_quaternion"])
+        )
 
 
 class Pictured:
@@ -190,16 +209,25 @@ class Pictured:
 class PolicyNode:
     """Commands of a guarded policy, from the measurements of the topics."""
 
-    def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"):
-        self._bus, self._guard, self._sensors, self._target, self._plan = bus, guard, sensors, target, plan
+    def __init__(
+        self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"
+    ):
+        self._bus, self._guard, self._sensors, self._target, self._plan = (
+            bus,
+            guard,
+            sensors,
+            target,
+            plan,
+        )
         self._base: Pose | None = None
         self._followed, self._last = 0, time.monotonic()
 
     def wait(self, period: float) -> float:
-        """Waits for the joints of the coming control step, at most half a period longer; returns the time then.
+        """Waits for the joints of the coming control step, at most half a period longer; returns
+        the time then.
 
-        Steps that are not in time with the measurements see some of them twice and others never, and are late by up to
-        a period: with both, a policy loses its grasp.
+        Steps that are not in time with the measurements see some of them twice and others never,
+        and are late by up to a period: with both, a policy loses its grasp.
         """
         due = self._last + period
         while (now := time.monotonic()) < due + 0.5 * period:
@@ -217,17 +245,25 @@ class PolicyNode:
         sensors = self._sensors
         sensors.take(self._bus.receive())
         (q, velocity), palm = sensors.joints(), sensors.palm()
-        down = Pose(-self._plan.rise(self._followed), Rotation.identity())  # the policy rises with the hand
+        # The policy rises with the hand
+        down = Pose(-self._plan.rise(self._followed), Rotation.identity())
         seen = self._target.fields(down, palm, q)
         if self._base is None:
             if palm is None or not all(np.isfinite(x).all() for x in (q, *seen.values())):
                 return None
             self._base = palm
-            self._guard.reset(dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays()))
+            self._guard.reset(
+                dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays())
+            )
         if self._plan.lifted(self._followed):
             self._guard.freeze()
         table = np.asarray(self._followed < self._plan.approach_steps)
-        state = {"q": q, "time": np.asarray(self._plan.time(self._followed)), "table": table, **seen}
+        state = {
+            "q": q,
+            "time": np.asarray(self._plan.time(self._followed)),
+            "table": table,
+            **seen,
+        }
         if np.isfinite(velocity).all():
             state["q_velocity"] = velocity
         if palm is not None:
@@ -247,14 +283,25 @@ class PolicyNode:
         now = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         header = make("std_msgs/msg/Header", stamp=now, frame_id=self._plan.world)
         position, effort = command.q_target.tolist(), command.q_torque.tolist()
-        joints = make(JOINTS, header=header, name=self._sensors.names, position=position, velocity=[], effort=effort)
-        palm = self._base @ Pose(command.u_target[:3], Rotation.from_euler("XYZ", command.u_target[3:]))
+        joints = make(
+            JOINTS,
+            header=header,
+            name=self._sensors.names,
+            position=position,
+            velocity=[],
+            effort=effort,
+        )
+        palm = self._base @ Pose(
+            command.u_target[:3], Rotation.from_euler("XYZ", command.u_target[3:])
+        )
         carrier = down.inverse() @ palm @ self._sensors.mount.inverse()
         place, turn = carrier.position.tolist(), carrier.rotation.as_quat().tolist()
         pose = make(
             "geometry_msgs/msg/Pose",
             position=make("geometry_msgs/msg/Point", **dict(zip("xyz", place, strict=True))),
-            orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))),
+            orientation=make(
+                "geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))
+            ),
         )
         self._bus.publish("joint_command", joints)
         self._bus.publish("wrist_command", make(POSE, header=header, pose=pose))
@@ -278,30 +325,42 @@ class Plan:
 
     def rise(self, followed: int) -> np.ndarray:
         """(3,) rise of the hand after a number of control steps, m: a smooth step."""
-        share = np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0) if self.lift else 0.0
+        share = (
+            np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0)
+            if self.lift
+            else 0.0
+        )
         return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
 
     def time(self, followed: int) -> float:
-        """Control steps on the policy's clock, which runs slower or faster until the object may leave the table."""
+        """Control steps on the policy's clock, which runs slower or faster until the object may
+        leave the table.
+        """
         over = followed - self.approach_steps
-        return self.trained_steps + (over if over > 0 else over * self.trained_steps / self.approach_steps)
+        return self.trained_steps + (
+            over if over > 0 else over * self.trained_steps / self.approach_steps
+        )
 
     def lifted(self, followed: int) -> bool:
-        """True a second after the end of the rise: no policy was trained to hold longer than two seconds."""
+        """True a second after the end of the rise: no policy was trained to hold longer than two
+        seconds.
+        """
         steps = self.approach_steps + self.lift / self.step + SETTLING_STEPS
         return self.lift > 0.0 and followed >= steps
 
 
 def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
     """Limits of a hand that moves at a share of the speed."""
-    return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
+    return dataclasses.replace(
+        limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2
+    )
 
 
 def below_surface(points: np.ndarray, middle: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """(3,) m, where a hand's centre that moves along `direction` towards the middle should stop.
 
-    As in training this is `INWARD` below the surface (N, 3) that it meets: the fingers do not reach the middle of a
-    thick object. A thin one is grasped at its middle.
+    As in training this is `INWARD` below the surface (N, 3) that it meets: the fingers do not reach
+    the middle of a thick object. A thin one is grasped at its middle.
     """
     ahead = (points - middle) @ direction
     off = np.linalg.norm(points - middle - ahead[:, None] * direction, axis=1)
@@ -309,34 +368,49 @@ def below_surface(points: np.ndarray, middle: np.ndarray, direction: np.ndarray)
     return np.asarray(middle + min(met + INWARD, 0.0) * direction)
 
 
-def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dict[str, Any]) -> Target:
+def target_of(
+    arguments: Arguments, sensors: Sensors, hand: Hand, described: dict[str, Any]
+) -> Target:
     """The object, as a policy with this metadata observes it."""
     camera = described["observation"] == "camera"
     if camera != bool(arguments.cloud_topic) or camera == bool(arguments.object):
         raise congrasp.CongraspError(
-            f"The server's policy observes {'a point cloud' if camera else 'the pose of an object'}.",
-            "Set --cloud-topic and name no object." if camera else "Name an object and leave out --cloud-topic.",
+            f"The server's policy observes "
+            f"{'a point cloud' if camera else 'the pose of an object'}.",
+            "Set --cloud-topic and name no object."
+            if camera
+            else "Name an object and leave out --cloud-topic.",
         )
 
     def read(obj: GraspObject, middle: np.ndarray) -> congrasp.GraspRequest:
         """The constraints on an object; by default the hand comes down towards its middle (3,)."""
-        request = read_request(obj, hand, described["trajectory_points"], **dataclasses.asdict(arguments.constraint))
+        request = read_request(
+            obj, hand, described["trajectory_points"], **dataclasses.asdict(arguments.constraint)
+        )
         heading = {"direction": np.array([0.0, 0.0, -1.0]), **request.constraints["heading"]}
         heading = {"position": below_surface(obj.points, middle, heading["direction"]), **heading}
         return dataclasses.replace(request, constraints={**request.constraints, "heading": heading})
 
     if camera:
-        return Pictured(sensors, Eye(hand, described["surface_points"], arguments.box, arguments.world), read)
+        return Pictured(
+            sensors, Eye(hand, described["surface_points"], arguments.box, arguments.world), read
+        )
     obj = find_object(arguments.object)
     request = dataclasses.replace(read(obj, np.zeros(3)), surface=obj.points)
     return Tracked(sensors, request, np.asarray(obj.origin))
 
 
-def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described: dict[str, Any]) -> None:
-    """Commands the robot by a policy with this metadata until interrupted, and prints changes of the mode."""
+def run(
+    arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described: dict[str, Any]
+) -> None:
+    """Commands the robot by a policy with this metadata until interrupted, and prints changes of
+    the mode.
+    """
     slow = arguments.slow
     if described["limits"] is None:
-        raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
+        raise congrasp.CongraspError(
+            f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others."
+        )
     period, hand = described["period"] / slow, get_hand(arguments.hand)
     student = described["observation"] in ("tracked", "camera")
     object_age = arguments.object_age or (TRACKER_AGE if student else arguments.robot_age)
@@ -344,10 +418,24 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
     target = target_of(arguments, sensors, hand, described)
     trained = described["approach_steps"]
     steps = round(arguments.approach / described["period"]) or 2 * trained
-    plan = Plan(arguments.world, steps, trained, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
+    plan = Plan(
+        arguments.world,
+        steps,
+        trained,
+        arguments.lift,
+        LIFT_SPEED * described["period"],
+        arguments.dry_run,
+    )
     limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
-    times = {"period": period, "wait": 0.6 * period, "stale": arguments.stale / slow, "hold": arguments.hold / slow}
-    with congrasp.Guard(client, limits, np.array(described["open_pose"]), fallback="open", **times) as guard:
+    times = {
+        "period": period,
+        "wait": 0.6 * period,
+        "stale": arguments.stale / slow,
+        "hold": arguments.hold / slow,
+    }
+    with congrasp.Guard(
+        client, limits, np.array(described["open_pose"]), fallback="open", **times
+    ) as guard:
         node, printed = PolicyNode(bus, guard, sensors, target, plan), ""
         begin = last = time.monotonic()
         try:
@@ -355,7 +443,9 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
                 now, command = node.wait(period), node.step()
                 waiting = "wait" if now > begin + WAITING else ""
                 mode = waiting if command is None else command.mode
-                if mode != printed or (mode in ("wait", "follow") and arguments.dry_run and now > last + 1.0):
+                if mode != printed or (
+                    mode in ("wait", "follow") and arguments.dry_run and now > last + 1.0
+                ):
                     print(report(command, guard, sensors), flush=True)
                     printed, last = mode, now
         except KeyboardInterrupt:
@@ -370,7 +460,10 @@ def report(command: congrasp.Command | None, guard: congrasp.Guard, sensors: Sen
     if command.mode != "follow":
         return f"{command.mode}: {guard.trouble or missing}"
     way, turn = np.linalg.norm(command.u_target.reshape(2, 3), axis=1)
-    return f"follow: the wrist is to be {100 * way:.1f} cm and {np.degrees(turn):.0f} degrees from where it began"
+    return (
+        f"follow: the wrist is to be {100 * way:.1f} cm and {np.degrees(turn):.0f} degrees from "
+        f"where it began"
+    )
 
 
 def main() -> int:
@@ -385,7 +478,11 @@ def main() -> int:
         with announced(f"Waiting for the policy server at {arguments.connect}", first=WAITING):
             client = stack.enter_context(
                 congrasp.PolicyClient(
-                    arguments.connect, hand=arguments.hand, timeout=0.2, wait=arguments.wait, certs=arguments.certs
+                    arguments.connect,
+                    hand=arguments.hand,
+                    timeout=0.2,
+                    wait=arguments.wait,
+                    certs=arguments.certs,
                 )
             )
             described = client.metadata()

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 _EPOCH = 1e9
-"""Stamps before this, s, are not the time of day (2001), but that since the start of a simulator."""
+"""Stamps before this, s, are not the time of day (2001), but that since the start of a
+simulator.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +29,12 @@ class Pose:
     rotation: Rotation
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        """Composes a pose in this frame with this one: the same pose in the frame that this one is in."""
-        return Pose(self.position + self.rotation.apply(other.position), self.rotation * other.rotation)
+        """Composes a pose in this frame with this one: the same pose in the frame that this one is
+        in.
+        """
+        return Pose(
+            self.position + self.rotation.apply(other.position), self.rotation * other.rotation
+        )
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and quaternion (4,), (w, x, y, z)."""
@@ -40,7 +46,9 @@ class Pose:
 
 
 class Sensors:
-    """Newest measurements of the topics, in the world frame; None or NaN for missing and outdated ones."""
+    """Newest measurements of the topics, in the world frame; None or NaN for missing and outdated
+    ones.
+    """
 
     def __init__(self, arguments: "Arguments", joints: list[str], object_age: float):
         """Reads the names and offsets.
@@ -77,10 +85,14 @@ class Sensors:
                 self.clock = seconds(message.clock)
             elif topic == "joint_states":
                 velocity = (
-                    message.velocity if len(message.velocity) == len(message.name) else [np.nan] * len(message.name)
+                    message.velocity
+                    if len(message.velocity) == len(message.name)
+                    else [np.nan] * len(message.name)
                 )
                 rows = zip(message.name, message.position, velocity, strict=False)
-                self._joints |= {name: (q, v, self._when(topic, message.header)) for name, q, v in rows}
+                self._joints |= {
+                    name: (q, v, self._when(topic, message.header)) for name, q, v in rows
+                }
             elif INPUTS.get(topic) != FRAMES:
                 self._newest[topic] = message, self._when(topic, message.header)
             else:
@@ -103,24 +115,35 @@ class Sensors:
         return frame @ pose @ self.mount if frame and pose else None
 
     def sight(self) -> tuple[Any, Pose | None]:
-        """The newest message that shows the object, and the camera's frame in the world; no frame if too old."""
+        """The newest message that shows the object, and the camera's frame in the world; no frame
+        if too old.
+        """
         message, frame = self._framed(self.eyes)
         return message, frame and frame @ self._hand_eye
 
     def missing(self) -> str:
         """Text that lists the missing measurements; empty if there are none."""
         lacking = []
-        if absent := [name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)]:
+        if absent := [
+            name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)
+        ]:
             others = ", ".join(sorted(set(self._joints) - set(absent))) or "none"
-            lacking.append(f"the joints {', '.join(absent)} in joint_states (there: {others}; see --joint-map)")
+            lacking.append(
+                f"the joints {', '.join(absent)} in joint_states (there: {others}; see --joint-map)"
+            )
         for topic, found in (("wrist_pose", self.palm()), (self.eyes, self.sight()[1])):
             message, when = self._newest.get(topic, (None, 0.0))
             if message is None:
                 lacking.append(topic)
             elif time.monotonic() - when > self._ages[topic]:
-                lacking.append(f"{topic} (the last one is {time.monotonic() - when:.1f} s old by its stamp)")
+                lacking.append(
+                    f"{topic} (the last one is {time.monotonic() - when:.1f} s old by its stamp)"
+                )
             elif found is None:
-                lacking.append(f"{topic}: a pose, and tf from its frame '{message.header.frame_id}' to '{self._world}'")
+                lacking.append(
+                    f"{topic}: a pose, and tf from its frame '{message.header.frame_id}' to "
+                    f"'{self._world}'"
+                )
             elif topic == self.eyes and self.unseen:
                 lacking.append(f"{topic}: {self.unseen}")
         return "; ".join(lacking)
@@ -130,13 +153,16 @@ class Sensors:
         if self.clock is None and 0 < seconds(header.stamp) < _EPOCH and not self._unsynchronised:
             self._unsynchronised = True
             print(
-                f"{topic}: its stamps are a simulator's, which publishes no clock: messages count from their arrival.",
+                f"{topic}: its stamps are a simulator's, which publishes no clock: messages count "
+                f"from their arrival.",
                 file=sys.stderr,
             )
         return stamped(header, self.clock)
 
     def _framed(self, topic: str) -> tuple[Any, Pose | None]:
-        """A topic's newest message, and the pose of its frame in the world; no pose if it is too old."""
+        """A topic's newest message, and the pose of its frame in the world; no pose if it is too
+        old.
+        """
         message, when = self._newest.get(topic, (None, -np.inf))
         fresh = time.monotonic() - when <= self._ages[topic]
         return message, self._frame(message.header.frame_id) if fresh else None
@@ -160,11 +186,13 @@ def seconds(stamp: Any) -> float:
 
 
 def stamped(header: Any, clock: float | None = None) -> float:
-    """Time of a message's stamp on the clock of `time.monotonic`; now if it has no stamp, or one in the future.
+    """Time of a message's stamp on the clock of `time.monotonic`; now if it has no stamp, or one in
+    the future.
 
     Args:
       header: the message's.
-      clock: simulated time, s, to which stamps refer. Without it they refer to the time of day; those of a simulator
+      clock: simulated time, s, to which stamps refer. Without it they refer to the time of day;
+      those of a simulator
         then count as now.
     """
     stamp = seconds(header.stamp)
@@ -174,8 +202,13 @@ def stamped(header: Any, clock: float | None = None) -> float:
 
 
 def read_pose(place: Any, turn: Any) -> Pose | None:
-    """The pose of a message's vector and quaternion; None if it is not finite, or the quaternion is far from unit."""
-    position, quaternion = np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])
+    """The pose of a message's vector and quaternion; None if it is not finite, or the quaternion is
+    far from unit.
+    """
+    position, quaternion = (
+        np.array([place.x, place.y, place.z]),
+        np.array([turn.x, turn.y, turn.z, turn.w]),
+    )
     if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quaternion) < 2.0):
         return None
     return Pose(position, Rotation.from_quat(quaternion))
@@ -191,7 +224,9 @@ def offset_of(text: str) -> Pose:
         x, y, z, *angles = map(float, text.split())
         return Pose(np.array([x, y, z]), Rotation.from_euler("xyz", angles, degrees=True))
     except ValueError:
-        raise congrasp.CongraspError(f"'{text}' is no offset.", "Write X Y Z ROLL PITCH YAW: 0 0 0.1 0 0 90.") from None
+        raise congrasp.CongraspError(
+            f"'{text}' is no offset.", "Write X Y Z ROLL PITCH YAW: 0 0 0.1 0 0 90."
+        ) from None
 
 
 def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
@@ -204,6 +239,7 @@ def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
     for hand, robot in renamed.items():
         if hand not in joints or not robot:
             raise congrasp.CongraspError(
-                f"--joint-map has '{hand}={robot}'.", f"Write HAND=ROBOT; the hand's are {', '.join(joints)}."
+                f"--joint-map has '{hand}={robot}'.",
+                f"Write HAND=ROBOT; the hand's are {', '.join(joints)}.",
             )
     return renamed

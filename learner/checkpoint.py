@@ -1,8 +1,9 @@
-"""Complete checkpoints in one safetensors file each: a pytree's arrays by path, and JSON for the rest.
+"""Complete checkpoints in one safetensors file each: a pytree's arrays by path, and JSON for the
+rest.
 
-A checkpoint is written to a temporary name, flushed and renamed, so that every file is complete whenever the process or
-the machine dies. Its name contains its update, and a run resumes from the newest intact one; the link `latest` is a
-convenience for users.
+A checkpoint is written to a temporary name, flushed and renamed, so that every file is complete
+whenever the process or the machine dies. Its name contains its update, and a run resumes from the
+newest intact one; the link `latest` is a convenience for users.
 """
 
 import contextlib
@@ -52,7 +53,8 @@ class Checkpoints:
           CongraspError: the disk is full; the previous checkpoints are intact.
         """
         path = self._directory / f"checkpoint_{version:09d}.safetensors"
-        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)  # as an array, since a header's length is limited
+        # As an array, since a header's length is limited
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         message = Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})
         write_atomically(path, encode(message))
         link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
@@ -69,7 +71,9 @@ class Checkpoints:
 
     def files(self) -> list[pathlib.Path]:
         """Files of the checkpoints, intact or not, the newest first."""
-        return sorted((path for path in self._directory.glob(_PATTERN) if _update(path) >= 0), key=_update)[::-1]
+        return sorted(
+            (path for path in self._directory.glob(_PATTERN) if _update(path) >= 0), key=_update
+        )[::-1]
 
     def newest(self) -> int:
         """Update of the newest checkpoint, intact or not; -1 if there is none."""
@@ -78,7 +82,8 @@ class Checkpoints:
     def load(
         self, template: Any, on_event: Callable[[str, str], None] = lambda level, text: None
     ) -> tuple[Any, dict[str, Any]]:
-        """Loads the newest intact checkpoint: its tree, shaped like `template` (see `restore`), and its metadata.
+        """Loads the newest intact checkpoint: its tree, shaped like `template` (see `restore`), and
+        its metadata.
 
         Raises:
           CongraspError: see `find`; or the checkpoint has another shape.
@@ -86,10 +91,13 @@ class Checkpoints:
         path, arrays, meta = self.find(on_event)
         return restore(arrays, template, str(path)), meta
 
-    def find(self, on_event: Callable[[str, str], None]) -> tuple[pathlib.Path, Mapping[str, Any], dict[str, Any]]:
+    def find(
+        self, on_event: Callable[[str, str], None]
+    ) -> tuple[pathlib.Path, Mapping[str, Any], dict[str, Any]]:
         """Finds the newest intact checkpoint; returns its file, arrays and metadata.
 
-        Newer damaged ones are renamed, so that training does not overwrite them when it reaches their update.
+        Newer damaged ones are renamed, so that training does not overwrite them when it reaches
+        their update.
 
         Args:
           on_event: called with (level, text) for each damaged checkpoint and for the result.
@@ -106,16 +114,23 @@ class Checkpoints:
                 continue
             for other, why in damaged:
                 kept = set_aside(other)
-                on_event("warning", f"The checkpoint {other} is damaged: {why} It is ignored, and kept as {kept.name}.")
+                on_event(
+                    "warning",
+                    f"The checkpoint {other} is damaged: {why} It is ignored, and kept as "
+                    f"{kept.name}.",
+                )
             on_event("info", f"Resuming from the checkpoint {path}.")
             return path, arrays, meta
         if damaged:
             raise CongraspError(
-                f"No checkpoint in {self._directory} is intact; the newest, {damaged[0][0].name}, is damaged: "
+                f"No checkpoint in {self._directory} is intact; the newest, {damaged[0][0].name}, "
+                f"is damaged: "
                 f"{damaged[0][1]}",
                 "Start again in another --run-dir.",
             )
-        raise CongraspError(f"There is no checkpoint in {self._directory}.", "Start again in another --run-dir.")
+        raise CongraspError(
+            f"There is no checkpoint in {self._directory}.", "Start again in another --run-dir."
+        )
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
@@ -137,7 +152,9 @@ def _update(path: pathlib.Path) -> int:
 
 
 def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
-    """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is not intact."""
+    """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is
+    not intact.
+    """
     with os_errors_as("It cannot be read"), open_file(path) as file:
         data = file.read()
     message = decode(data, max_bytes=len(data))
@@ -163,16 +180,22 @@ def checksum(tree: Any) -> int:
 def flatten(tree: Any) -> dict[str, np.ndarray]:
     """Returns the leaves of a pytree as arrays, by their paths with slashes."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf) for path, leaf in leaves}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf)
+        for path, leaf in leaves
+    }
 
 
 def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
-    """Returns a tree like `template` from arrays by path, with their types; the inverse of `flatten`.
+    """Returns a tree like `template` from arrays by path, with their types; the inverse of
+    `flatten`.
 
-    A leaf becomes a JAX array on the default device, a NumPy array, or an integer, like that of the template.
+    A leaf becomes a JAX array on the default device, a NumPy array, or an integer, like that of the
+    template.
 
     Raises:
-      CongraspError: a leaf is missing or has another shape or type; the message names `source` and the first such leaf.
+      CongraspError: a leaf is missing or has another shape or type; the message names `source` and
+      the first such leaf.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     restored: list[Any] = []
@@ -185,7 +208,8 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
                 "Resume with the run's configuration and version of congrasp.",
             )
         if isinstance(leaf, jax.Array):
-            restored.append(jnp.array(array))  # not committed to a device, as after `init`, to avoid recompilation
+            # Not committed to a device, as after `init`, to avoid recompilation
+            restored.append(jnp.array(array))
         else:
             restored.append(int(array) if isinstance(leaf, int) else np.array(array))
     return jax.tree_util.tree_unflatten(structure, restored)

@@ -1,8 +1,9 @@
-"""The learner process: consumes rollouts, publishes policy bundles, and keeps a run directory to resume from.
+"""The learner process: consumes rollouts, publishes policy bundles, and keeps a run directory to
+resume from.
 
-Several ranks (`learner.distributed`) train one policy, each with its own actors. The run directory belongs to rank 0.
-The others receive configuration, state and versions from it, and write only journals and failures. All are at the same
-update.
+Several ranks (`learner.distributed`) train one policy, each with its own actors. The run directory
+belongs to rank 0. The others receive configuration, state and versions from it, and write only
+journals and failures. All are at the same update.
 """
 
 import concurrent.futures
@@ -29,7 +30,13 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, collate, rollout_form
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    collate,
+    rollout_form,
+)
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.distributed.ranks import Ranks, ended_by
 from congrasp.learner.hub.admission import Admission, task_ranges
@@ -66,7 +73,7 @@ class ReplicasDiffer(CongraspError):
     """The replicas of the weights differ between ranks."""
 
 
-def run_learner(
+def run_learner(  # noqa: PLR0913
     run_dir: pathlib.Path,
     config: RunConfig,
     transport: Transport,
@@ -79,27 +86,31 @@ def run_learner(
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Notify = lambda level, text: None,
 ) -> PolicyBundle:
-    """Trains until `config.updates` updates are done or `stop_event` is set; returns the last policy.
+    """Trains until `config.updates` updates are done or `stop_event` is set; returns the last
+    policy.
 
     The run can be resumed in both cases and, after a crash, from its last checkpoint.
 
     Args:
       run_dir: created by `learner.run_directory.create_run`, if this is rank 0.
-      config: the run, the same for all ranks; a resumed run may change settings that affect no array.
-      transport: endpoint of the learner; the caller closes it.
+      config: the run, the same for all ranks; a resumed run may change settings that affect no
+      array. transport: endpoint of the learner; the caller closes it.
       stop_event: ends training after the current update.
-      resume: resumes from the newest intact checkpoint (of rank 0), which may come from any number of ranks.
-      ranks: processes of the learner, if there are several.
-      audit: writes the journal in `audit/` and, if configured, accepted rollouts in `accepted/`. Both need rollouts on
+      resume: resumes from the newest intact checkpoint (of rank 0), which may come from any number
+      of ranks. ranks: processes of the learner, if there are several.
+      audit: writes the journal in `audit/` and, if configured, accepted rollouts in `accepted/`.
+      Both need rollouts on
         the host, not on a device.
       recorder: context entered while the learner runs, for example to write the run's logs.
       on_update: called with the metrics of every update.
       on_event: called with level and text of every event.
 
     Raises:
-      CongraspError: the directory is not a run directory, or in use; the checkpoint does not match; the disk is full; a
+      CongraspError: the directory is not a run directory, or in use; the checkpoint does not match;
+      the disk is full; a
         thread of this process died; training collapsed; another rank ended the run.
-      PhysicsError: several batches in a row had values that were not finite; state and last batch are in `failure/`.
+      PhysicsError: several batches in a row had values that were not finite; state and last batch
+      are in `failure/`.
     """
     ranks = ranks or Ranks()
     check_lock: Callable[[], None] = lambda: None  # noqa: E731  of other ranks
@@ -107,10 +118,14 @@ def run_learner(
         with contextlib.ExitStack() as stack:
             if ranks.rank == 0:
                 open_run(run_dir)
-                check_lock = stack.enter_context(exclusive(run_dir, functools.partial(on_event, "warning")))
+                check_lock = stack.enter_context(
+                    exclusive(run_dir, functools.partial(on_event, "warning"))
+                )
             deaths = stack.enter_context(_watch_threads())
             stack.enter_context(recorder or contextlib.nullcontext())
-            learner = _Learner(run_dir, config, transport, ranks, resume, audit, on_event, check_lock)
+            learner = _Learner(
+                run_dir, config, transport, ranks, resume, audit, on_event, check_lock
+            )
             try:
                 learner.train(stop_event, deaths, on_update)
             finally:
@@ -123,14 +138,18 @@ def run_learner(
 
 @contextlib.contextmanager
 def _watch_threads() -> Iterator[list[str]]:
-    """Collects exceptions that ended threads of this process, so that it does not continue without them."""
+    """Collects exceptions that ended threads of this process, so that it does not continue without
+    them.
+    """
     deaths: list[str] = []
     previous = threading.excepthook
 
     def note(arguments: threading.ExceptHookArgs) -> None:
         previous(arguments)
         thread = arguments.thread.name if arguments.thread else "?"
-        deaths.append(f"thread '{thread}' died of {arguments.exc_type.__name__}: {arguments.exc_value}")
+        deaths.append(
+            f"thread '{thread}' died of {arguments.exc_type.__name__}: {arguments.exc_value}"
+        )
 
     threading.excepthook = note
     try:
@@ -142,7 +161,7 @@ def _watch_threads() -> Iterator[list[str]]:
 class _Learner:
     """State of one run between two updates."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         run_dir: pathlib.Path,
         config: RunConfig,
@@ -154,7 +173,12 @@ class _Learner:
         check_lock: Callable[[], None],
     ):
         self._check_lock = check_lock
-        self._run_dir, self._config, self._transport, self._ranks = run_dir, config, transport, ranks
+        self._run_dir, self._config, self._transport, self._ranks = (
+            run_dir,
+            config,
+            transport,
+            ranks,
+        )
         self._keys = Keys(config.name)
 
         def notify(level: str, text: str) -> None:
@@ -175,7 +199,9 @@ class _Learner:
         log_error = functools.partial(self._event, "error")
         folder = run_dir / FOLDER / name
         # Computed meanwhile: the first rollout needs them.
-        ranges = concurrent.futures.ThreadPoolExecutor(1, "ranges").submit(task_ranges, config.task, config.curriculum)
+        ranges = concurrent.futures.ThreadPoolExecutor(1, "ranges").submit(
+            task_ranges, config.task, config.curriculum
+        )
         self._rollouts = RolloutQueue(
             self._run_id,
             self._form,
@@ -184,12 +210,19 @@ class _Learner:
             events,
             durable=_durable(hubs, ranks.rank),
             audit=AuditLog(run_dir, name, log_error) if audit else None,
-            log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error) if audit else None,
+            log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error)
+            if audit
+            else None,
         )
-        self._hub = LearnerHub(transport, self._rollouts, events, to_json(config), Admission(ranges.result))
+        self._hub = LearnerHub(
+            transport, self._rollouts, events, to_json(config), Admission(ranges.result)
+        )
         self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
-            self._event("warning", f"The checkpoint has {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}.")
+            self._event(
+                "warning",
+                f"The checkpoint has {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}.",
+            )
 
     def _first_state(self, resume: bool) -> tuple[TrainState, dict[str, Any]]:
         """Returns the initial state and a checkpoint's metadata, those of rank 0 for all ranks."""
@@ -208,13 +241,17 @@ class _Learner:
                 write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
             elif newest >= 0:
                 raise CongraspError(
-                    f"{self._run_dir} has checkpoints of a run.", "Pass --resume to continue it, or another --run-dir."
+                    f"{self._run_dir} has checkpoints of a run.",
+                    "Pass --resume to continue it, or another --run-dir.",
                 )
             version, newest = state.version + meta["skipped"], newest + meta["skipped"]
             meta = {**meta, "skipped": self._skip_lost_versions(version, newest) + meta["skipped"]}
         if ranks.count > 1:
             message = ranks.exchange(meta, flatten(state) if ranks.rank == 0 else None)
-            state, meta = restore(message.arrays, state, "The state of rank 0"), message.meta["entries"][0]
+            state, meta = (
+                restore(message.arrays, state, "The state of rank 0"),
+                message.meta["entries"][0],
+            )
         return state, meta
 
     def close(self) -> None:
@@ -238,19 +275,28 @@ class _Learner:
             **policy._asdict(),
         )
 
-    def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
+    def train(  # noqa: C901
+        self,
+        stop: threading.Event,
+        deaths: list[str],
+        on_update: Callable[[dict[str, float]], None],
+    ) -> None:
         """Updates until the end, a stop, or a thread's death; writes a checkpoint in each case."""
-        if self._is_new:  # before any rollout is accepted, so that a resume can recover what a kill undoes
+        if (
+            self._is_new
+        ):  # before any rollout is accepted, so that a resume can recover what a kill undoes
             self._save_if_possible()
         if self._ranks.count > 1:
-            # Its collectives must not start while an actor in this process captures its engine's graph, which it does
-            # in its first rollout. Until there are weights, the actor builds its training set and its programs.
+            # Its collectives must not start while an actor in this process captures its engine's
+            # graph, which it does in its first rollout. Until there are weights, the actor builds
+            # its training set and its programs.
             self._warm_up()
         self._publish()
         if self._ranks.count == 1:
             self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        # Soon after a resume: until there is a checkpoint, rollouts of new versions cannot be recovered.
+        # Soon after a resume: until there is a checkpoint, rollouts of new versions cannot be
+        # recovered.
         end, saved, due = None, -1, not self._is_new
         while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
@@ -259,12 +305,20 @@ class _Learner:
                 break
             arrived = time.monotonic()
             values, steps = self._update()
-            values["wait_seconds"], values["update_seconds"] = arrived - began, time.monotonic() - arrived
+            values["wait_seconds"], values["update_seconds"] = (
+                arrived - began,
+                time.monotonic() - arrived,
+            )
             values["steps_per_second"] = pace.steps_per_second(steps)
             values["transitions"] = float(self._state.transitions)
             if self._ranks.rank == 0:
-                self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
-            on_update({"update": float(self._state.version), "version": float(self.version), **values})
+                self._log(
+                    "metrics",
+                    {"update": self._state.version, "version": self.version, "values": values},
+                )
+            on_update(
+                {"update": float(self._state.version), "version": float(self.version), **values}
+            )
             # Success is expected to drop when objects are released after the stationary phase.
             stationary = self._config.curriculum.stationary(self.version)
             if not stationary and (collapse := watch.add(values)):
@@ -285,15 +339,18 @@ class _Learner:
         self._ranks.close()
         if deaths:
             raise CongraspError(
-                f"The learner stopped: {deaths[0]}.", "A checkpoint was written. Pass --resume to continue."
+                f"The learner stopped: {deaths[0]}.",
+                "A checkpoint was written. Pass --resume to continue.",
             )
         if end is not None and end[0] != self._ranks.rank and not stop.is_set():
             raise TransportError(
-                f"Rank {end[0]} ended the run: {end[1]}.", "A checkpoint was written. Pass --resume to continue."
+                f"Rank {end[0]} ended the run: {end[1]}.",
+                "A checkpoint was written. Pass --resume to continue.",
             )
 
     def _wait(self, stop: threading.Event, deaths: list[str]) -> tuple[int, str] | None:
-        """Waits until every rank has a batch; returns the rank that ends training instead, and the reason.
+        """Waits until every rank has a batch; returns the rank that ends training instead, and the
+        reason.
 
         A long wait is an event, not an end, since actors may return.
         """
@@ -339,21 +396,28 @@ class _Learner:
     def _drop(self, batch: Mapping[str, Any], error: NonFiniteUpdate) -> TrainState:
         """Returns the state after an unusable batch: one version later, with the same policy.
 
-        Batch and state are written to `failure/`. All ranks decide alike, because they share the update.
+        Batch and state are written to `failure/`. All ranks decide alike, because they share the
+        update.
         """
         self._dropped, self._dropped_in_a_row = self._dropped + 1, self._dropped_in_a_row + 1
-        folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
+        folder, number = (
+            self._run_dir / "failure",
+            f"-{self._ranks.rank}" if self._ranks.count > 1 else "",
+        )
         with contextlib.suppress(CongraspError):
             write_atomically(folder / f"batch{number}.safetensors", encode(Message(batch, {})))
             if self._ranks.rank == 0:
-                write_atomically(folder / "state.safetensors", encode(Message(flatten(error.state), {})))
+                write_atomically(
+                    folder / "state.safetensors", encode(Message(flatten(error.state), {}))
+                )
         if self._dropped_in_a_row < _MOST_DROPPED:
             self._event("error", f"{error} The batch was dropped; state and batch are in {folder}.")
             return error.state._replace(version=error.state.version + 1)
         self._ranks.close()
         self._event("fatal", str(error))
         raise PhysicsError(
-            f"{error} It was the {self._dropped_in_a_row}th such batch in a row.", f"State and batch are in {folder}."
+            f"{error} It was the {self._dropped_in_a_row}th such batch in a row.",
+            f"State and batch are in {folder}.",
         ) from None
 
     def _publish(self) -> None:
@@ -367,10 +431,14 @@ class _Learner:
         if self._ranks.rank:
             return
         meta = {"version": self.version, "run_id": self._run_id, "schema": self._spec.schema}
-        self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
+        self._log(
+            "version",
+            {**meta, "update": self._state.version, "transitions": self._state.transitions},
+        )
 
     def _skip_lost_versions(self, version: int, newest: int) -> int:
-        """Skips versions that were published after the checkpoint and lost with the process, so that none is reused.
+        """Skips versions that were published after the checkpoint and lost with the process, so
+        that none is reused.
 
         `newest` is a lower bound of the version of the newest checkpoint, intact or not.
         """
@@ -392,14 +460,22 @@ class _Learner:
         durable = self._rollouts.durable()
         state = checksum(self._state) if self._ranks.count > 1 else 0
         everyone = self._ranks.exchange({"hub": durable, "state": state}).meta["entries"]
-        if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
+        if odd := [
+            rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]
+        ]:
             raise ReplicasDiffer(
-                f"The weights of ranks {odd} differ from those of rank 0 after update {self._state.version}.",
-                "All ranks need the same GPUs and versions. --resume continues from the last checkpoint.",
+                f"The weights of ranks {odd} differ from those of rank 0 after update "
+                f"{self._state.version}.",
+                "All ranks need the same GPUs and versions. --resume continues from the last "
+                "checkpoint.",
             )
         failure = ""
         if self._ranks.rank == 0:
-            meta = {"run_id": self._run_id, "skipped": self._skipped, "hubs": [entry["hub"] for entry in everyone]}
+            meta = {
+                "run_id": self._run_id,
+                "skipped": self._skipped,
+                "hubs": [entry["hub"] for entry in everyone],
+            }
             try:
                 self._checkpoints.save(self._state, meta, self._state.version)
                 bundles.save(self.bundle(), self._run_dir / POLICY_FILE)
@@ -420,20 +496,31 @@ class _Learner:
             lost = self._state.version - self._saved
             loss = f"A kill now would lose {lost} update(s), those since update {self._saved}."
             self._hub.trouble = f"No checkpoint can be written: {error} {loss}"
-            if not self._unsaved or lost >= 4 * self._unsaved:  # again when there is much more to lose
+            if (
+                not self._unsaved or lost >= 4 * self._unsaved
+            ):  # again when there is much more to lose
                 self._unsaved = max(1, lost)
-                self._event("error", f"{error} Training continues and retries after every update. {loss}")
+                self._event(
+                    "error", f"{error} Training continues and retries after every update. {loss}"
+                )
             return False
         if self._unsaved:
-            self._event("info", f"Checkpoints can be written again; the newest is of update {self._state.version}.")
+            self._event(
+                "info",
+                f"Checkpoints can be written again; the newest is of update {self._state.version}.",
+            )
         self._unsaved, self._hub.trouble = 0, ""
         return True
 
     def _shut_actors_down(self) -> None:
-        """Notifies the actors that the run is finished, and waits some seconds for them to leave."""
+        """Notifies the actors that the run is finished, and waits some seconds for them to
+        leave.
+        """
         self._hub.finish()
         deadline = time.monotonic() + _SHUTDOWN_SECONDS
-        while time.monotonic() < deadline and any(who["role"] == "actor" for who in self._hub.status()["roles"]):
+        while time.monotonic() < deadline and any(
+            who["role"] == "actor" for who in self._hub.status()["roles"]
+        ):
             time.sleep(_POLL_SECONDS / 4)
 
     def _log(self, kind: str, meta: dict[str, object]) -> None:
@@ -442,7 +529,14 @@ class _Learner:
 
 
 def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
-    """Returns a checkpoint's data of this rank's rollouts; a new rank gets empty data at its version."""
+    """Returns a checkpoint's data of this rank's rollouts; a new rank gets empty data at its
+    version.
+    """
     if not hubs or rank < len(hubs):
         return hubs[rank] if hubs else None
-    return {**hubs[0], "counters": dataclasses.asdict(Counters()), "forgotten_missing": 0, "sequences": []}
+    return {
+        **hubs[0],
+        "counters": dataclasses.asdict(Counters()),
+        "forgotten_missing": 0,
+        "sequences": [],
+    }

@@ -1,11 +1,12 @@
 """The directory of a run.
 
-It holds `config.json`, `initial.safetensors` (unless training starts from random weights), `checkpoints/`,
-`policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
-(rollouts that no checkpoint holds yet), `version` (the newest version ever published, so that versions increase across
-a crash), `endpoint` (address of its learner, while it runs), `lock` (held by the process of its learner) and, after an
-update that was not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed to
-`*.aside`.
+It holds `config.json`, `initial.safetensors` (unless training starts from random weights),
+`checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
+of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
+version ever published, so that versions increase across a crash), `endpoint` (address of its
+learner, while it runs), `lock` (held by the process of its learner) and, after an update that was
+not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed
+to `*.aside`.
 """
 
 import contextlib
@@ -37,24 +38,38 @@ _LOCK_FILE = "lock"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
-CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo", "distill")
+CHANGEABLE = (
+    "updates",
+    "checkpoint_every",
+    "write_ahead",
+    "collapse_patience",
+    "physics",
+    "ppo",
+    "distill",
+)
 """Fields of the configuration that a resumed run may change; running actors do not use them."""
 
 
-def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
+def create_run(
+    run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None
+) -> None:
     """Creates a run directory.
 
     Args:
       run_dir: path of the directory.
       config: the run.
-      initial: initial policy instead of random weights: its networks and normalisers. Inputs of the state and of the
+      initial: initial policy instead of random weights: its networks and normalisers. Inputs of the
+      state and of the
         critic that it lacks get zero weight.
 
     Raises:
-      CongraspError: the directory already has a run, or remains of one; or the initial policy does not match the run.
+      CongraspError: the directory already has a run, or remains of one; or the initial policy does
+      not match the run.
     """
     if (run_dir / CONFIG_FILE).exists():
-        raise CongraspError(f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it.")
+        raise CongraspError(
+            f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it."
+        )
     if remains := _remains(run_dir):
         raise CongraspError(
             f"{run_dir} has {remains[0].name} of a run, but no {CONFIG_FILE}.",
@@ -69,11 +84,14 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:
-    """Returns the configuration of a run directory; raises a CongraspError if it is not one, or the file is damaged."""
+    """Returns the configuration of a run directory; raises a CongraspError if it is not one, or the
+    file is damaged.
+    """
     path = run_dir / CONFIG_FILE
     if not path.exists():
         raise CongraspError(
-            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Pass one created by 'congrasp train'."
+            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.",
+            "Pass one created by 'congrasp train'.",
         )
     text = read_file(path, _MAX_CONFIG)
     try:
@@ -83,7 +101,9 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
 
 
 @contextlib.contextmanager
-def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None) -> Iterator[Callable[[], None]]:
+def exclusive(
+    run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None
+) -> Iterator[Callable[[], None]]:
     """Context that locks a run directory; the lock ends with the process.
 
     Args:
@@ -91,8 +111,8 @@ def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text
       notify: called if the file system has no locks.
 
     Yields:
-      A function that locks the directory again if the lock's file was removed; it raises a CongraspError if another
-      process has taken the directory since.
+      A function that locks the directory again if the lock's file was removed; it raises a
+      CongraspError if another process has taken the directory since.
 
     Raises:
       CongraspError: another process holds the lock.
@@ -129,9 +149,13 @@ def _locked(run_dir: pathlib.Path, notify: Callable[[str], None]) -> BinaryIO:
                 f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
                 "Stop it first, or choose another --run-dir.",
             ) from None
-        notify(f"{run_dir} is on a file system without locks: a second learner would not be detected.")
+        notify(
+            f"{run_dir} is on a file system without locks: a second learner would not be detected."
+        )
     else:
-        with contextlib.suppress(OSError):  # a full disk only removes the number from another process's error
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk only removes the number from another process's error
             file.truncate(0)
             file.write(f"{os.getpid()}".encode())
     return file
@@ -160,7 +184,8 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
     """True if a run has a checkpoint to resume from; False before its first one.
 
     Raises:
-      CongraspError: the run had checkpoints that are gone; restarting it here would overwrite the rest.
+      CongraspError: the run had checkpoints that are gone; restarting it here would overwrite the
+      rest.
     """
     if Checkpoints(run_dir / CHECKPOINTS).files():
         return True
@@ -168,7 +193,8 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
         policy = run_dir / POLICY_FILE
         begin = f" with --initial {policy}" if policy.exists() else ""
         raise CongraspError(
-            f"{run_dir} has no checkpoint to resume from, although {remains[0].name} shows that it had one.",
+            f"{run_dir} has no checkpoint to resume from, although {remains[0].name} shows that it "
+            f"had one.",
             f"Start again in another --run-dir{begin}.",
         )
     return False
@@ -188,11 +214,14 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
       config: that of `open_run`, with changed settings.
 
     Raises:
-      CongraspError: a setting differs that may not, this is not a run directory, or a learner is using it.
+      CongraspError: a setting differs that may not, this is not a run directory, or a learner is
+      using it.
     """
     before = open_run(run_dir)
     for field in dataclasses.fields(config):
-        if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(before, field.name):
+        if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(
+            before, field.name
+        ):
             raise CongraspError(
                 f"A run cannot change '{field.name}' when it is resumed.",
                 f"Start another run with --initial {run_dir / POLICY_FILE}.",
@@ -205,20 +234,25 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
 def note_version(run_dir: pathlib.Path, version: int) -> None:
     """Stores the newest published version.
 
-    The file is overwritten in place, which needs no space on a full disk, and not flushed: it must survive the process,
-    and a power failure loses at most a version.
+    The file is overwritten in place, which needs no space on a full disk, and not flushed: it must
+    survive the process, and a power failure loses at most a version.
 
     Raises:
       CongraspError: it could not be written.
     """
     path = run_dir / _VERSION_FILE
     how = os.O_WRONLY | os.O_CREAT
-    with os_errors_as(f"{path} could not be written"), open(os.open(path, how, 0o644), "wb", 0) as file:
+    with (
+        os_errors_as(f"{path} could not be written"),
+        open(os.open(path, how, 0o644), "wb", 0) as file,
+    ):
         file.write(f"{version:020d}\n".encode())
 
 
 def published_version(run_dir: pathlib.Path) -> int:
-    """Newest version known to the run directory, from `version`, the policy or the journals; -1 if there is none."""
+    """Newest version known to the run directory, from `version`, the policy or the journals; -1 if
+    there is none.
+    """
     try:
         noted = int((run_dir / _VERSION_FILE).read_text())
     except (OSError, ValueError):
@@ -242,7 +276,9 @@ def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, st
     path = run_dir / POLICY_FILE
     found = _policy_version(run_dir)
     if os.path.lexists(path) and (found is None or found > version):
-        what = "cannot be read" if found is None else f"has version {found}, newer than the checkpoint"
+        what = (
+            "cannot be read" if found is None else f"has version {found}, newer than the checkpoint"
+        )
         on_event("warning", f"{path} {what}; it is kept as {set_aside(path)}.")
 
 

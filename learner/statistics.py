@@ -1,4 +1,6 @@
-"""Figures of a batch of rollouts that are not part of the update: episodes, staleness, pace and signs of collapse."""
+"""Figures of a batch of rollouts that are not part of the update: episodes, staleness, pace and
+signs of collapse.
+"""
 
 import collections
 import time
@@ -28,12 +30,14 @@ def summary(messages: Sequence[Message], lags: Sequence[int]) -> dict[str, Any]:
 
 
 def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Means over all episodes that ended in the batches of all ranks, their number, and the transitions' lag.
+    """Means over all episodes that ended in the batches of all ranks, their number, and the
+    transitions' lag.
 
-    `episode/…` metrics and `term/…` sums are means over all of them, but errors of a constraint only over episodes in
-    which it was active (`Constraint.among`, or the block without which an error is undefined). `success/heading` covers
-    episodes with only the heading; `success/pose` and so on those with that constraint active, alone or with others. A
-    rollout without a finished episode contributes nothing; a figure without any episode is absent.
+    `episode/…` metrics and `term/…` sums are means over all of them, but errors of a constraint
+    only over episodes in which it was active (`Constraint.among`, or the block without which an
+    error is undefined). `success/heading` covers episodes with only the heading; `success/pose` and
+    so on those with that constraint active, alone or with others. A rollout without a finished
+    episode contributes nothing; a figure without any episode is absent.
     """
     totals: dict[str, list[float]] = {}
     for part in summaries:
@@ -50,7 +54,9 @@ def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], int]:
-    """Sum and number of each figure's values, and the number of episodes; rollouts may have different figures."""
+    """Sum and number of each figure's values, and the number of episodes; rollouts may have
+    different figures.
+    """
     sums: dict[str, list[float]] = {}
     episodes = 0
     for message in messages:
@@ -71,11 +77,18 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
 def _figures(columns: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
     """Figures (E,) of one rollout, NaN for episodes to which they do not apply."""
     none = np.zeros(count)
-    blocks = {block: columns.get(f"episode/mask_{block}", none) > 0 for c in _OPTIONAL for block in c.blocks}
+    blocks = {
+        block: columns.get(f"episode/mask_{block}", none) > 0
+        for c in _OPTIONAL
+        for block in c.blocks
+    }
     active = {constraint.name: constraint.among(blocks) for constraint in _OPTIONAL}
     active["heading"] = ~np.any(list(active.values()), 0)
     success = columns.get("episode/success", np.full(count, np.nan))
-    figures = {**columns, **{f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()}}
+    figures = {
+        **columns,
+        **{f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()},
+    }
     for constraint in CONSTRAINTS:
         for spec in constraint.errors:
             if (name := f"episode/{spec.name}") in columns:
@@ -108,8 +121,9 @@ _UNTOUCHED = 0.1  # links in contact below which the hand avoids the object
 class CollapseWatch:
     """Counts consecutive updates that look like a collapse.
 
-    There are two criteria: a success, averaged over ten updates, below half of its best, once that was 30 %; and less
-    than 0.1 links in contact at table removal (the local optimum "never touch", if penalties outweigh contact).
+    There are two criteria: a success, averaged over ten updates, below half of its best, once that
+    was 30 %; and less than 0.1 links in contact at table removal (the local optimum "never touch",
+    if penalties outweigh contact).
     """
 
     def __init__(self, patience: int):
@@ -120,7 +134,9 @@ class CollapseWatch:
         self._fallen = self._untouched = 0
 
     def add(self, values: dict[str, float]) -> str | None:
-        """Adds an update's metrics; returns a description of the collapse once it has lasted long enough."""
+        """Adds an update's metrics; returns a description of the collapse once it has lasted long
+        enough.
+        """
         success, links = (values.get(f"episode/{name}") for name in ("success", "links_at_removal"))
         if success is None or links is None or not self._patience:
             return None
@@ -131,7 +147,10 @@ class CollapseWatch:
         self._fallen = self._fallen + 1 if self._best >= _LEARNT and mean < self._best / 2 else 0
         self._untouched = self._untouched + 1 if links < _UNTOUCHED else 0
         if self._fallen >= self._patience:
-            return f"success fell from {self._best:.0%} to {mean:.0%} and stayed there for {self._patience} updates"
+            return (
+                f"success fell from {self._best:.0%} to {mean:.0%} and stayed there for "
+                f"{self._patience} updates"
+            )
         if self._untouched >= self._patience:
             return f"for {self._patience} updates the hand has hardly touched the object"
         return None

@@ -6,9 +6,15 @@ import zenoh
 
 
 def bare_session(mode: str, *, shared_memory: bool = False, **endpoints: str) -> zenoh.Session:
-    """A session that listens at, or connects to, an endpoint; Zenoh's defaults bound nothing of it."""
+    """A session that listens at, or connects to, an endpoint; Zenoh's defaults bound nothing of
+    it.
+    """
     settings = {f"{way}/endpoints": [endpoint] for way, endpoint in endpoints.items()}
-    settings |= {"mode": mode, "scouting/multicast/enabled": False, "transport/shared_memory/enabled": shared_memory}
+    settings |= {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": shared_memory,
+    }
     config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))

@@ -1,4 +1,6 @@
-"""Python with numpy and zenoh alone, as a control loop has it, and a policy server for it that costs nothing."""
+"""Python with numpy and zenoh alone, as a control loop has it, and a policy server for it that
+costs nothing.
+"""
 
 import contextlib
 import subprocess
@@ -37,7 +39,11 @@ def run_in_base_install(code: str) -> subprocess.CompletedProcess[str]:
 @contextlib.contextmanager
 def steady_server(hand: str = "allegro") -> Iterator[int]:
     """Port of a server whose policy wants every joint at zero."""
-    port, keys, function = free_port(), Keys("policy"), PolicyFunction(get_hand(hand), TaskConfig(hand=hand))
+    port, keys, function = (
+        free_port(),
+        Keys("policy"),
+        PolicyFunction(get_hand(hand), TaskConfig(hand=hand)),
+    )
 
     def act(key: str, query: Message) -> Message:
         targets = np.zeros((1, 2 * (len(get_hand(hand).joints) + 6)), np.float32)  # and the action

@@ -14,19 +14,30 @@ from congrasp.common.errors import CongraspError
 
 SIZE = {"width": 1280, "height": 760}
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--force-color-profile=srgb",
+]
 
 
 @contextlib.contextmanager
 def chromium() -> Iterator[Any]:
-    """Chromium, drawing without a graphics card; raises a CongraspError if it or its package is absent."""
+    """Chromium, drawing without a graphics card; raises a CongraspError if it or its package is
+    absent.
+    """
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:
-        raise CongraspError("The package playwright is not installed.", "Run 'make install'.") from None
+        raise CongraspError(
+            "The package playwright is not installed.", "Run 'make install'."
+        ) from None
     with sync_playwright() as running:
         own = pathlib.Path(running.chromium.executable_path)
-        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
+        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (
+            str(own) if own.exists() else None
+        )
         if found is None:
             raise CongraspError("There is no browser here.", "Run tests/install_browser.sh.")
         started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
@@ -37,13 +48,19 @@ def chromium() -> Iterator[Any]:
 def picture(page: Any) -> np.ndarray:
     """(H, W, 3) the three-dimensional picture, 0 to 255, once all requests are done."""
     page.wait_for_selector("body:not([data-busy])")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.evaluate(
+        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
     image = Image.open(io.BytesIO(page.locator("#scene").screenshot())).convert("RGB")
     return np.asarray(image).astype(int)
 
 
 def orange(image: np.ndarray) -> np.ndarray:
-    return (image[..., 0] > 130) & (image[..., 0] > 1.25 * image[..., 1]) & (image[..., 1] > 1.6 * image[..., 2])
+    return (
+        (image[..., 0] > 130)
+        & (image[..., 0] > 1.25 * image[..., 1])
+        & (image[..., 1] > 1.6 * image[..., 2])
+    )
 
 
 def on_object(page: Any) -> tuple[float, float]:

@@ -1,8 +1,9 @@
-"""A learner and actors as real processes over Zenoh, without networks and physics, for tests that do damage.
+"""A learner and actors as real processes over Zenoh, without networks and physics, for tests that
+do damage.
 
-Run as a script, this file is the learner or the actor. The hub, the link, the wire and the journals are the real ones;
-the "policy" is a version number, an "update" consumes two rollouts and may take some time, and a checkpoint is a JSON
-file.
+Run as a script, this file is the learner or the actor. The hub, the link, the wire and the journals
+are the real ones; the "policy" is a version number, an "update" consumes two rollouts and may take
+some time, and a checkpoint is a JSON file.
 """
 
 import contextlib
@@ -57,12 +58,17 @@ class SlowLog(WriteAheadLog):
 
 
 def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=0.0):
-    """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed.
+    """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or
+    killed.
 
     Its disk takes `disk` seconds for a rollout.
     """
     path = folder / "checkpoint"
-    saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
+    saved = (
+        json.loads(path.read_text())
+        if path.exists()
+        else {"durable": None, "history": [], "version": 0}
+    )
     history, version = saved["history"], saved["version"]
     published = folder / "version"
     if saved["durable"] is not None and int(published.read_text()) > version:
@@ -71,9 +77,14 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with urls.listen(endpoint, "learner") as transport:
         hub, rollouts = learner_hub(
-            transport, "chaos", form=form_of(steps), staleness=StalenessManager(1, BATCH), durable=saved["durable"],
-            audit=AuditLog(folder, "0"), log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
-        )  # fmt: skip
+            transport,
+            "chaos",
+            form=form_of(steps),
+            staleness=StalenessManager(1, BATCH),
+            durable=saved["durable"],
+            audit=AuditLog(folder, "0"),
+            log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
+        )
         save(published, version)
         hub.publish_weights(bundle(version), version)
         print("ready", flush=True)
@@ -86,7 +97,9 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
                 expected = message.meta["sequence"] % 1000
                 for name, array in message.arrays.items():
                     assert array.dtype == bool or (array == expected).all(), f"corrupted: {name}"
-                history.append([message.meta[name] for name in ("actor", "incarnation", "sequence")])
+                history.append(
+                    [message.meta[name] for name in ("actor", "incarnation", "sequence")]
+                )
             time.sleep(pause)
             version, updates = version + 1, updates + 1
             save(published, version)
@@ -98,7 +111,10 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
         hub.finish()
         time.sleep(0.5)  # actors hear of it; what is on its way still comes in
         rollouts.close()
-        save(folder / "final", {"history": history, "counters": hub.status()["counters"], "version": version})
+        save(
+            folder / "final",
+            {"history": history, "counters": hub.status()["counters"], "version": version},
+        )
 
 
 def save(path, content):
@@ -113,7 +129,9 @@ def run_actor(folder, endpoint, *, name, steps=FORM.steps, pause=0.0, request_ti
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
         urls.connect(endpoint, "actor") as transport,
-        ActorLink(transport, "chaos", name, window=2, request_timeout=request_timeout, journal=journal) as link,
+        ActorLink(
+            transport, "chaos", name, window=2, request_timeout=request_timeout, journal=journal
+        ) as link,
     ):
         with contextlib.suppress(RunFinished):
             work(link, steps, pause, log)
@@ -130,7 +148,9 @@ def work(link, steps, pause, log):
         version = pulled.meta["version"] if pulled else version
         time.sleep(pause)
         entry = {"incarnation": link.incarnation, "sequence": sequence}
-        link.upload(rollout(sequence % 1000, form_of(steps), version=version), ticket).add_done_callback(
+        link.upload(
+            rollout(sequence % 1000, form_of(steps), version=version), ticket
+        ).add_done_callback(
             lambda f, entry=entry: log.write(json.dumps({**entry, "outcome": outcome_of(f)}) + "\n")
         )
 
@@ -166,11 +186,18 @@ class Cluster:
     def start(self, role, endpoint=None, **options):
         """Starts a process; options are those of its function in this file, or `clock`."""
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        arguments = {"folder": str(self.folder), "endpoint": endpoint or self.endpoint, **self.options, **options}
+        arguments = {
+            "folder": str(self.folder),
+            "endpoint": endpoint or self.endpoint,
+            **self.options,
+            **options,
+        }
         process = subprocess.Popen(
             [sys.executable, __file__, role, json.dumps(arguments)],
-            env=environment, stdout=subprocess.PIPE, stderr=(self.folder / f"{role}.err").open("ab"),
-        )  # fmt: skip
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=(self.folder / f"{role}.err").open("ab"),
+        )
         self.processes.append(process)
         return process
 
@@ -191,7 +218,9 @@ class Cluster:
             return None
 
     def wait(self, condition, timeout=_PATIENCE):
-        """Polls the learner's status until it is as wanted; the timeout only ends a test that hangs."""
+        """Polls the learner's status until it is as wanted; the timeout only ends a test that
+        hangs.
+        """
         deadline = time.monotonic() + timeout
         while True:
             status = self.status()
@@ -212,7 +241,8 @@ class Cluster:
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def stop(self, learner):
-        """Ends the learner and the actors gently; returns what the learner found in its books, and the audit's counts.
+        """Ends the learner and the actors gently; returns what the learner found in its books, and
+        the audit's counts.
 
         Whatever happened before: nothing that was accepted is lost, duplicated or corrupted.
         """
@@ -242,7 +272,10 @@ def assert_books_balance(final):
     """What a learner left when it ended: everything was counted once, and used once."""
     ledger = final["counters"]
     assert ledger["accepted"] == ledger["consumed"] + ledger["dropped"] + ledger["queued"]
-    assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
+    assert (
+        ledger["granted"]
+        == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
+    )
     assert ledger["consumed"] == len(final["history"])
     assert len({tuple(identity) for identity in final["history"]}) == len(final["history"])
 
@@ -251,4 +284,6 @@ if __name__ == "__main__":
     given = json.loads(sys.argv[2])
     if given.pop("clock", "") == "jumps":
         jump_about()
-    {"learner": run_learner, "actor": run_actor}[sys.argv[1]](pathlib.Path(given.pop("folder")), **given)
+    {"learner": run_learner, "actor": run_actor}[sys.argv[1]](
+        pathlib.Path(given.pop("folder")), **given
+    )

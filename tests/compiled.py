@@ -1,4 +1,6 @@
-"""Functions of a module as one program each: alone, every operation in them would be compiled for itself."""
+"""Functions of a module as one program each: alone, every operation in them would be compiled for
+itself.
+"""
 
 import functools
 import types

@@ -6,13 +6,17 @@ import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Nobody's own hands and policies.
-os.environ["XDG_CONFIG_HOME"] = os.path.join(tempfile.gettempdir(), "congrasp-tests-without-configuration")
-# Every compiled program is kept, so that neither the other modules nor the processes that tests start compile it again.
+os.environ["XDG_CONFIG_HOME"] = os.path.join(
+    tempfile.gettempdir(), "congrasp-tests-without-configuration"
+)
+# Every compiled program is kept, so that neither the other modules nor the processes that tests
+# start compile it again.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Most of the time goes into compiling programs that run for a moment.
 if os.environ["JAX_PLATFORMS"] == "cpu":
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
-    # The older emitters of fused loops compile in half the time; one thread without LLVM's optimiser saves a fifth.
+    # The older emitters of fused loops compile in half the time; one thread without LLVM's
+    # optimiser saves a fifth.
     flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     flags += "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     os.environ.setdefault("XLA_FLAGS", flags)
@@ -24,10 +28,12 @@ import psutil
 import pytest
 from hypothesis import settings
 
-# The same examples every time, so that a red run tells of a change; HYPOTHESIS_PROFILE=search looks for new ones.
+# The same examples every time, so that a red run tells of a change; HYPOTHESIS_PROFILE=search looks
+# for new ones.
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, deadline=None)
-# Tracing makes millions of objects that live on: looking through them often takes a twentieth of the time.
+# Tracing makes millions of objects that live on: looking through them often takes a twentieth of
+# the time.
 gc.set_threshold(200_000, 20, 100)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
@@ -36,7 +42,12 @@ _MOST_MEMORY = 4 << 30  # bytes of a worker
 
 
 _LONGEST = (
-    *("actors/test_physics_warp", "services/evaluate/test_evaluate", "services/grasp/test_grasp", "e2e/test_faults"),
+    *(
+        "actors/test_physics_warp",
+        "services/evaluate/test_evaluate",
+        "services/grasp/test_grasp",
+        "e2e/test_faults",
+    ),
     *("e2e/test_train", "e2e/test_security", "services/assets/test_cases"),
     *("services/serve/test_robot_loop", "services/assets/objects/test_import", "services/test_cli"),
     *("actors/test_rollout", "services/dataset/test_dataset", "test_congrasp"),
@@ -45,7 +56,9 @@ _LONGEST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest modules come first, so that at the end no worker runs one while the others wait."""
+    """The longest modules come first, so that at the end no worker runs one while the others
+    wait.
+    """
     place = {str(ROOT / "tests" / f"{name}.py"): i for i, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: place.get(str(item.path), len(place)))
 

@@ -1,4 +1,6 @@
-"""A fake episode: the hand approaches a cylinder, closes, and holds it after the removal of the table."""
+"""A fake episode: the hand approaches a cylinder, closes, and holds it after the removal of the
+table.
+"""
 
 import numpy as np
 import trimesh
@@ -18,15 +20,18 @@ FORCE = 1.5  # N on each fingertip while it touches
 def episode(
     steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True
 ) -> Message:
-    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that on.
+    """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that
+    on.
 
-    Its errors are those of its way: the wrist comes straight along its path and ends, like the fingers, where the
-    reference pose has it. `mask` says which of `BLOCKS` are active.
+    Its errors are those of its way: the wrist comes straight along its path and ends, like the
+    fingers, where the reference pose has it. `mask` says which of `BLOCKS` are active.
     """
     hand = get_hand("human")
     frame = grasp_frame(hand)
     direction = np.array([-1.0, 0.3, -0.35]) / np.linalg.norm([-1.0, 0.3, -0.35])
-    cross = np.cross(direction, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(direction, [0.0, 0.0, 1.0]))
+    cross = np.cross(direction, [0.0, 0.0, 1.0]) / np.linalg.norm(
+        np.cross(direction, [0.0, 0.0, 1.0])
+    )
     wrist_turn = Rotation.align_vectors([direction, cross], [frame.heading, frame.cross])[0]
     center = np.array([0.0, 0.0, HEIGHT / 2])
     tips = list(hand.tip_links)
@@ -40,7 +45,9 @@ def episode(
         force = np.zeros((len(hand.links), 3))
         force[tips] = [0.0, 0.0, FORCE * (share == 1.0)]
         turned = wrist_turn * Rotation.from_quat(quaternion, scalar_first=True)
-        frames.append((wrist_turn.apply(position) + wrist, turned.as_quat(scalar_first=True), force, q))
+        frames.append(
+            (wrist_turn.apply(position) + wrist, turned.as_quat(scalar_first=True), force, q)
+        )
     positions, quaternions, forces, q = (np.array(a, np.float32) for a in zip(*frames, strict=True))
     mesh = trimesh.creation.cylinder(RADIUS, HEIGHT, sections=24)
     points = np.asarray(trimesh.sample.sample_surface(mesh, 128, seed=0)[0], np.float32)
@@ -73,7 +80,9 @@ def episode(
         "goal/pose_q": q[-1],
         "goal/pose_position": wrist_local.astype(np.float32),
         "goal/pose_quaternion": turn,
-        "goal/trajectory_position": np.linspace(wrist_local - 0.12 * direction, wrist_local, 5).astype(np.float32),
+        "goal/trajectory_position": np.linspace(
+            wrist_local - 0.12 * direction, wrist_local, 5
+        ).astype(np.float32),
         "goal/trajectory_quaternion": np.tile(turn, (5, 1)),
         **{f"active/{name}": np.bool_(bit) for name, bit in zip(BLOCKS, mask, strict=True)},
         "piece_kind": np.array([1], np.int32),
@@ -100,6 +109,8 @@ def episode(
 
 def older(message: Message) -> Message:
     """The episode as recordings had it before they named blocks and kept errors."""
-    arrays = {name: x for name, x in message.arrays.items() if not name.startswith(("active/", "error/"))}
+    arrays = {
+        name: x for name, x in message.arrays.items() if not name.startswith(("active/", "error/"))
+    }
     mask = np.array([message.arrays[f"active/{name}"] for name in BLOCKS], np.float32)
     return Message({**arrays, "goal/mask": mask}, message.meta)

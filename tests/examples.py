@@ -7,7 +7,9 @@ from typing import Any
 from unittest import mock
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / "examples"
-"""Not by way of `tests.conftest`, whose settings of JAX are for tests: benchmarks import this module."""
+"""Not by way of `tests.conftest`, whose settings of JAX are for tests: benchmarks import this
+module.
+"""
 
 
 def example(name: str) -> Any:

@@ -13,20 +13,28 @@ from congrasp.common.policy.network import gated
 
 
 def difference(bundle: PolicyBundle, path: pathlib.Path) -> float:
-    """Largest difference over the largest action, both rounded to float32, also far beyond the policy's range."""
+    """Largest difference over the largest action, both rounded to float32, also far beyond the
+    policy's range.
+    """
     observations = sample_observations(bundle, 64)
-    expected = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, observations))
+    expected = np.asarray(
+        mean_action(bundle.spec.layout, bundle.inference_parameters, observations)
+    )
     assert np.abs(expected).max() > 1e-3
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             found = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(observations)
     else:
-        (found,) = onnxruntime.InferenceSession(path.read_bytes()).run(None, {"observation": observations})
+        (found,) = onnxruntime.InferenceSession(path.read_bytes()).run(
+            None, {"observation": observations}
+        )
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
 def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:
-    """Observations (count, D) of 3 and, the second half, of 150 times the policy's spread, with random masks."""
+    """Observations (count, D) of 3 and, the second half, of 150 times the policy's spread, with
+    random masks.
+    """
     rng = np.random.default_rng(9)
     known = bundle.observation
     spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3

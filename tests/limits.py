@@ -1,4 +1,6 @@
-"""Runs what a hostile file may make of a reader where it can hurt nobody: a process with little memory and time."""
+"""Runs what a hostile file may make of a reader where it can hurt nobody: a process with little
+memory and time.
+"""
 
 import multiprocessing
 import resource
@@ -11,8 +13,11 @@ MEMORY = 768 << 20
 SECONDS = 15.0
 
 
-def limited(function: Callable[..., Any], *arguments: Any, memory: int = MEMORY, seconds: float = SECONDS) -> str:
-    """What `function(*arguments)` returns as text, or the error that it raises with its type in front.
+def limited(
+    function: Callable[..., Any], *arguments: Any, memory: int = MEMORY, seconds: float = SECONDS
+) -> str:
+    """What `function(*arguments)` returns as text, or the error that it raises with its type in
+    front.
 
     An AssertionError where it takes longer, or its process dies.
     """
@@ -44,5 +49,7 @@ def _run(pipe: Any, memory: int, function: Callable[..., Any], arguments: tuple[
         said = f"MemoryError: {error}"
     except BaseException as error:
         kind = type(error).__name__
-        said = f"{kind}: {error}" if kind == "CongraspError" else f"{kind}: {traceback.format_exc()}"
+        said = (
+            f"{kind}: {error}" if kind == "CongraspError" else f"{kind}: {traceback.format_exc()}"
+        )
     pipe.send(said)

@@ -1,7 +1,8 @@
-"""A file of MANO's exact layout with the skeleton of the human hand, since MANO itself may not be passed on.
+"""A file of MANO's exact layout with the skeleton of the human hand, since MANO itself may not be
+passed on.
 
-It is written opcode by opcode as Python 2 wrote it: NumPy arrays, a SciPy matrix, and chumpy's variables and
-selections, none of whose packages are needed to write or to read it.
+It is written opcode by opcode as Python 2 wrote it: NumPy arrays, a SciPy matrix, and chumpy's
+variables and selections, none of whose packages are needed to write or to read it.
 """
 
 import pickle
@@ -50,7 +51,9 @@ def _opcodes(value: Any) -> bytes:
 
 
 def _array(value: np.ndarray) -> Reduced:
-    kind = Reduced("numpy dtype", (value.dtype.str[1:], 0, 1), (3, "<", None, None, None, -1, -1, 0))
+    kind = Reduced(
+        "numpy dtype", (value.dtype.str[1:], 0, 1), (3, "<", None, None, None, -1, -1, 0)
+    )
     fortran = not value.flags.c_contiguous
     return Reduced(
         "numpy.core.multiarray _reconstruct",
@@ -73,20 +76,30 @@ def sparse(matrix: np.ndarray) -> Reduced:
 
 
 def selection(chosen: np.ndarray, whole: np.ndarray) -> Reduced:
-    """The first columns of `whole` as chumpy keeps them: a variable, indices into it, and a shape."""
+    """The first columns of `whole` as chumpy keeps them: a variable, indices into it, and a
+    shape.
+    """
     index = np.arange(whole.size).reshape(whole.shape)[..., : chosen.shape[-1]].ravel()
-    inside = Reduced("chumpy.ch Ch", (), {"x": whole, "_dirty_vars": Reduced("__builtin__ set", ([],))}, new=True)
+    inside = Reduced(
+        "chumpy.ch Ch", (), {"x": whole, "_dirty_vars": Reduced("__builtin__ set", ([],))}, new=True
+    )
     state = {"a": inside, "idxs": index, "preferred_shape": chosen.shape}
     return Reduced("chumpy.reordering Select", (), state, new=True)
 
 
 def skeleton() -> tuple[np.ndarray, np.ndarray]:
-    """Joints (16, 3) and fingertips (5, 3) of the human hand, in MANO's order and frame, away from the origin."""
+    """Joints (16, 3) and fingertips (5, 3) of the human hand, in MANO's order and frame, away from
+    the origin.
+    """
     hand = get_hand("human")
     links = {link.name: link for link in hand.links}
     joints, tips = [np.zeros(3)], []
     for finger in MANO_FINGERS:
-        names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+        names = (
+            ("metacarpal", "proximal", "distal")
+            if finger == "thumb"
+            else ("proximal", "middle", "distal")
+        )
         joints += [np.array(link_origin(links[f"{finger}_{name}"])) for name in names]
         tips.append(np.array(links[f"{finger}_distal"].tip))
     offset = np.array([0.095, 0.006, 0.006])
@@ -94,7 +107,9 @@ def skeleton() -> tuple[np.ndarray, np.ndarray]:
 
 
 def content(seed: int = 0) -> dict[str, Any]:
-    """What the file says, by MANO's names; joints and tips are vertices of their own, the rest is random."""
+    """What the file says, by MANO's names; joints and tips are vertices of their own, the rest is
+    random.
+    """
     rng = np.random.default_rng(seed)
     vertices = rng.normal(0.0, 0.03, (778, 3))
     joints, tips = skeleton()
@@ -112,7 +127,9 @@ def content(seed: int = 0) -> dict[str, Any]:
         "J": joints,
         "weights": rng.uniform(0.0, 1.0, (778, 16)),
         "f": rng.integers(0, 778, (1538, 3)).astype(np.uint32),
-        "kintree_table": np.array([[2**32 - 1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14], list(range(16))]),
+        "kintree_table": np.array(
+            [[2**32 - 1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14], list(range(16))]
+        ),
         "hands_components": rng.normal(0.0, 1.0, (45, 45)),
         "hands_mean": rng.normal(0.0, 0.2, 45),
         "hands_coeffs": rng.normal(0.0, 1.0, (20, 45)),

@@ -1,4 +1,6 @@
-"""Readers of exported motions, independent of the writers, and the distance between a file and its motion."""
+"""Readers of exported motions, independent of the writers, and the distance between a file and its
+motion.
+"""
 
 import json
 import pathlib
@@ -36,7 +38,9 @@ class Track(NamedTuple):
 
 
 def read_glb(path: pathlib.Path) -> list[Track]:
-    """The animation at its keyframes by the standard's layout, and the meshes as trimesh loads them."""
+    """The animation at its keyframes by the standard's layout, and the meshes as trimesh loads
+    them.
+    """
     content = path.read_bytes()
     size = int.from_bytes(content[12:16], "little")
     document, blob = json.loads(content[20 : 20 + size]), content[28 + size :]
@@ -50,7 +54,10 @@ def read_glb(path: pathlib.Path) -> list[Track]:
 
     time = values(animation["samplers"][0]["input"])[:, 0]
     local = [
-        {"translation": np.array(node.get("translation", [0, 0, 0])), "rotation": np.array(node.get("rotation"))}
+        {
+            "translation": np.array(node.get("translation", [0, 0, 0])),
+            "rotation": np.array(node.get("rotation")),
+        }
         for node in nodes
     ]
     for channel in animation["channels"]:
@@ -67,22 +74,34 @@ def read_glb(path: pathlib.Path) -> list[Track]:
     visit(document["scenes"][0]["nodes"][0], FROM_Y_UP)  # the other node is the skin
     del poses["world"]
     meshes = trimesh.load_scene(path, process=False, merge_primitives=True).geometry
-    return [Track(time, poses, {name: np.asarray(mesh.triangles) for name, mesh in meshes.items() if name != "skin"})]
+    return [
+        Track(
+            time,
+            poses,
+            {name: np.asarray(mesh.triangles) for name, mesh in meshes.items() if name != "skin"},
+        )
+    ]
 
 
 def read_usd(path: pathlib.Path) -> list[Track]:
     """Transforms and meshes as Pixar's library composes them."""
     stage = Usd.Stage.Open(str(path))
-    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert (
+        UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+        and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    )
     codes = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
     caches = [UsdGeom.XformCache(code) for code in codes]
     poses: dict[str, np.ndarray] = {}
     triangles: dict[str, list[np.ndarray]] = {}
     for prim in stage.Traverse():
         if name := prim.GetAttribute("congrasp:name").Get():
-            rows = np.array([cache.GetLocalToWorldTransform(prim) for cache in caches])  # USD's vectors are rows
+            # USD's vectors are rows
+            rows = np.array([cache.GetLocalToWorldTransform(prim) for cache in caches])
             poses[name] = rows.swapaxes(1, 2)
-        elif prim.IsA(UsdGeom.Mesh) and (name := prim.GetParent().GetAttribute("congrasp:name").Get()):
+        elif prim.IsA(UsdGeom.Mesh) and (
+            name := prim.GetParent().GetAttribute("congrasp:name").Get()
+        ):
             mesh = UsdGeom.Mesh(prim)
             corners = np.array(mesh.GetPointsAttr().Get())[mesh.GetFaceVertexIndicesAttr().Get()]
             triangles.setdefault(name, []).append(corners.reshape(-1, 3, 3))
@@ -98,7 +117,9 @@ def read_bvh(path: pathlib.Path) -> list[Track]:
 
     def visit(joint: Any, parent: np.ndarray) -> None:
         position = np.array([key.Position.to_tuple() for key in joint.Keyframes]) / 100
-        turn = Rotation.from_quat([key.Rotation.to_tuple() for key in joint.Keyframes], scalar_first=True)
+        turn = Rotation.from_quat(
+            [key.Rotation.to_tuple() for key in joint.Keyframes], scalar_first=True
+        )
         pose = parent @ pose_matrices(position, turn)
         if joint.Name in names:
             poses[names[joint.Name]] = pose
@@ -110,11 +131,15 @@ def read_bvh(path: pathlib.Path) -> list[Track]:
 
 
 def read_ros2(path: pathlib.Path) -> list[Track]:
-    """Messages by mcap-ros2-support: links by joint trajectory and URDF, with which TF must agree."""
+    """Messages by mcap-ros2-support: links by joint trajectory and URDF, with which TF must
+    agree.
+    """
     (file,) = path.glob("*.mcap")
     messages: dict[str, list[Any]] = {}
     with file.open("rb") as stream:
-        for _, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        for _, channel, _, message in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
             messages.setdefault(channel.topic, []).append(message)
     trees = [{t.child_frame_id: t for t in message.transforms} for message in messages["/tf"]]
     tf: dict[str, np.ndarray] = {}
@@ -129,30 +154,54 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
     for name in trees[0]:
         visit(name)
     (trajectory,), (wrist,) = messages["/joint_trajectory"], messages["/wrist_trajectory"]
-    angles = dict(zip(trajectory.joint_names, np.array([list(p.positions) for p in trajectory.points]).T, strict=True))
-    palm, urdf = _transforms([p.transforms[0] for p in wrist.points]), messages["/robot_description"][0].data
+    angles = dict(
+        zip(
+            trajectory.joint_names,
+            np.array([list(p.positions) for p in trajectory.points]).T,
+            strict=True,
+        )
+    )
+    palm, urdf = (
+        _transforms([p.transforms[0] for p in wrist.points]),
+        messages["/robot_description"][0].data,
+    )
     root = ET.fromstring(urdf)[0].attrib["name"]
     described = forward_kinematics(urdf, angles, palm, wrist.joint_names[0], tf[root])
     poses = {name: described.get(name, tf[name]) for name in tf}
     assert max(float(np.abs(poses[name] - tf[name]).max()) for name in tf) < 1e-4
-    since = [p.time_from_start.sec - 1 + 1e-9 * p.time_from_start.nanosec for p in trajectory.points]
+    since = [
+        p.time_from_start.sec - 1 + 1e-9 * p.time_from_start.nanosec for p in trajectory.points
+    ]
     triangles: dict[str, list[np.ndarray]] = {}
-    for marker in [*messages["/object"], *(m for array in messages.get("/arm", ()) for m in array.markers)]:
+    for marker in [
+        *messages["/object"],
+        *(m for array in messages.get("/arm", ()) for m in array.markers),
+    ]:
         corners = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3, 3)
         triangles.setdefault(marker.header.frame_id, []).append(corners)
-    return [Track(np.array(since), poses, {name: np.concatenate(parts) for name, parts in triangles.items()})]
+    return [
+        Track(
+            np.array(since),
+            poses,
+            {name: np.concatenate(parts) for name, parts in triangles.items()},
+        )
+    ]
 
 
 def _transforms(transforms: list[Any]) -> np.ndarray:
     """(T, 4, 4) of T transforms."""
     position = np.array([[t.translation.x, t.translation.y, t.translation.z] for t in transforms])
-    turns = Rotation.from_quat([[t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w] for t in transforms])
+    turns = Rotation.from_quat(
+        [[t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w] for t in transforms]
+    )
     return pose_matrices(position, turns)
 
 
 def read_lerobot(path: pathlib.Path) -> list[Track]:
     """Every episode by the description in the files: features by name, kinematics by the URDF."""
-    info, about = (json.loads((path / "meta" / f"{name}.json").read_text()) for name in ("info", "congrasp"))
+    info, about = (
+        json.loads((path / "meta" / f"{name}.json").read_text()) for name in ("info", "congrasp")
+    )
     (urdf,) = (file.read_text() for file in (path / "meta").glob("*.urdf"))
     links = [*about["links"], *about.get("arm_links", ())]
     tracks = []
@@ -165,21 +214,41 @@ def read_lerobot(path: pathlib.Path) -> list[Track]:
             part: column
             for feature in ("observation.state", "observation.environment_state")
             for part, column in zip(
-                info["features"][feature]["names"], np.array(rows[feature].to_pylist()).T, strict=True
+                info["features"][feature]["names"],
+                np.array(rows[feature].to_pylist()).T,
+                strict=True,
             )
         }
         palm, thing = (
-            _poses(np.stack([values.pop(f"{name}_{part}") for part in ("x", "y", "z", "qw", "qx", "qy", "qz")], -1))
+            _poses(
+                np.stack(
+                    [
+                        values.pop(f"{name}_{part}")
+                        for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
+                    ],
+                    -1,
+                )
+            )
             for name in ("wrist", "object")
         )
-        base = _poses(np.array([about["arm_base"][row["episode_index"]]])) if "arm_base" in about else palm
+        base = (
+            _poses(np.array([about["arm_base"][row["episode_index"]]]))
+            if "arm_base" in about
+            else palm
+        )
         poses = forward_kinematics(urdf, values, palm, links[0], base)
         kept = {name: pose for name, pose in poses.items() if name in links} | {"object": thing}
         tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
     return tracks
 
 
-READERS = {"glb": read_glb, "usd": read_usd, "bvh": read_bvh, "ros2": read_ros2, "lerobot": read_lerobot}
+READERS = {
+    "glb": read_glb,
+    "usd": read_usd,
+    "bvh": read_bvh,
+    "ros2": read_ros2,
+    "lerobot": read_lerobot,
+}
 """By the name of the format."""
 
 
@@ -219,24 +288,33 @@ def _poses(rows: np.ndarray) -> np.ndarray:
 def error_mm(motion: GraspMotion, track: Track) -> float:
     """Largest distance in mm between points of the motion and of the file.
 
-    The points are each frame's origin and three a decimetre away along its axes, at every time, and the triangles of
-    object and arm in their frames.
+    The points are each frame's origin and three a decimetre away along its axes, at every time, and
+    the triangles of object and arm in their frames.
     """
     arm = motion.arm
-    expected = {"object": _poses(np.concatenate([motion.object_position, motion.object_quaternion], 1))}
+    expected = {
+        "object": _poses(np.concatenate([motion.object_position, motion.object_quaternion], 1))
+    }
     for links in (motion, arm) if arm else (motion,):
         rows = np.concatenate([links.link_position, links.link_quaternion], -1)
         expected |= {str(name): _poses(rows[:, i]) for i, name in enumerate(links.link_names)}
     assert expected.keys() == track.poses.keys()
     np.testing.assert_allclose(track.time, motion.time, atol=1e-6)
     points = np.concatenate([LEVER * np.eye(4, 3, -1), np.ones((4, 1))], 1).T
-    apart = [np.linalg.norm(((pose - track.poses[name]) @ points)[:, :3], axis=1) for name, pose in expected.items()]
+    apart = [
+        np.linalg.norm(((pose - track.poses[name]) @ points)[:, :3], axis=1)
+        for name, pose in expected.items()
+    ]
     if track.triangles:
         vertices, faces, _ = object_mesh(motion)
         meshes = {"object": [vertices[faces]]}
-        meshes |= {name: [part.vertices[part.faces] for part in parts] for name, parts in arm_meshes(motion).items()}
+        meshes |= {
+            name: [part.vertices[part.faces] for part in parts]
+            for name, parts in arm_meshes(motion).items()
+        }
         assert meshes.keys() == track.triangles.keys()
         apart += [
-            np.linalg.norm(np.concatenate(parts) - track.triangles[name], axis=-1) for name, parts in meshes.items()
+            np.linalg.norm(np.concatenate(parts) - track.triangles[name], axis=-1)
+            for name, parts in meshes.items()
         ]
     return 1000 * max(float(distance.max()) for distance in apart)

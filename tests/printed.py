@@ -2,5 +2,7 @@
 
 
 def errors(printed: str) -> list[str]:
-    """Lines of standard error, without empty ones and those that say for how long the command works already."""
+    """Lines of standard error, without empty ones and those that say for how long the command works
+    already.
+    """
     return [line for line in printed.splitlines() if line and not line.endswith(" s so far.")]

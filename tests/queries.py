@@ -12,12 +12,18 @@ from congrasp.services.serve.requests import Layout
 _POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals", "camera_position")
 
 
-def packed(layout: Layout, fields: Mapping[str, Any], constraints: Sequence[str] = ("heading",)) -> Message:
+def packed(
+    layout: Layout, fields: Mapping[str, Any], constraints: Sequence[str] = ("heading",)
+) -> Message:
     """The query of one state, whose points and goals are those of its episode."""
     rest = {name: np.asarray(value) for name, value in fields.items()}
     episode = {name: rest.pop(name) for name in _POINTS if name in rest}
     goals = {
-        name: {field.removeprefix(f"{name}_"): rest.pop(field) for field in list(rest) if field.startswith(f"{name}_")}
+        name: {
+            field.removeprefix(f"{name}_"): rest.pop(field)
+            for field in list(rest)
+            if field.startswith(f"{name}_")
+        }
         for name in constraints
     }
     return Packer({**layout.description(), "digest": layout.digest}, episode, goals).pack([rest])

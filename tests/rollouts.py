@@ -24,16 +24,31 @@ def rollout(value: float = 0.0, form: RolloutForm = FORM, **meta: Any) -> Messag
     for array in arrays.values():
         if array.dtype != bool:
             array.fill(value)
-    return Message(arrays, {"version": 0, "schema": SCHEMA, "steps": form.steps * form.worlds, **meta})
+    return Message(
+        arrays, {"version": 0, "schema": SCHEMA, "steps": form.steps * form.worlds, **meta}
+    )
 
 
-def bundle(version: int, run_id: str = RUN_ID, form: RolloutForm = FORM, parameters: int = 1000) -> Message:
+def bundle(
+    version: int, run_id: str = RUN_ID, form: RolloutForm = FORM, parameters: int = 1000
+) -> Message:
     """A policy whose parameters are its version."""
     shapes = {"observation": (form.observation,), "value": ()}
-    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in shapes.items() for name in ("mean", "m2")}
+    arrays = {
+        f"{kind}/{name}": np.zeros(shape)
+        for kind, shape in shapes.items()
+        for name in ("mean", "m2")
+    }
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     arrays["actor/w"] = np.full(parameters, version, np.float32)
-    meta = {"version": version, "run_id": run_id, "schema": SCHEMA, "hand": "human", "layout": [], "format": 1}
+    meta = {
+        "version": version,
+        "run_id": run_id,
+        "schema": SCHEMA,
+        "hand": "human",
+        "layout": [],
+        "format": 1,
+    }
     return Message(arrays, {**meta, "action_size": form.action})
 
 
@@ -44,7 +59,7 @@ class Learner(NamedTuple):
     rollouts: RolloutQueue
 
 
-def learner_hub(
+def learner_hub(  # noqa: PLR0913
     transport: Transport,
     run: str,
     *,
@@ -60,5 +75,7 @@ def learner_hub(
 ) -> Learner:
     """The learner's end of a run; options are those of `RolloutQueue`."""
     events = Events(transport, run, name, on_event)
-    rollouts = RolloutQueue(run_id, form, schema, staleness or StalenessManager(1, 2), events, **options)
+    rollouts = RolloutQueue(
+        run_id, form, schema, staleness or StalenessManager(1, 2), events, **options
+    )
     return Learner(LearnerHub(transport, rollouts, events, config_json, admission), rollouts)

@@ -3,11 +3,27 @@
 from congrasp.services.evaluate.paper import paper_row
 from congrasp.services.evaluate.scores import ERRORS, Row
 
-FORCES = {f"{name}_{of}": 1.0 for name in ("link_force", "force_sum", "torque_share") for of in ("mean", "p95")}
+FORCES = {
+    f"{name}_{of}": 1.0
+    for name in ("link_force", "force_sum", "torque_share")
+    for of in ("mean", "p95")
+}
 FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
 
 
-def row(constraint, success, low, high, *, hand="human", method="ours", group="", errors=None, margins=None, source=""):
+def row(  # noqa: PLR0913
+    constraint,
+    success,
+    low,
+    high,
+    *,
+    hand="human",
+    method="ours",
+    group="",
+    errors=None,
+    margins=None,
+    source="",
+):
     """A row of 100 episodes on 8 objects."""
     return Row(
         constraint=constraint,

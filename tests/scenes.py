@@ -69,7 +69,8 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
         object_velocity=normal(3),
         object_angular_velocity=normal(3),
         contact_force=normal(L, CONTACTS_PER_LINK, 3, scale=5.0),
-        contact_position=object_position[:, None, None] + normal(L, CONTACTS_PER_LINK, 3, scale=0.03),
+        contact_position=object_position[:, None, None]
+        + normal(L, CONTACTS_PER_LINK, 3, scale=0.03),
         contact_found=rng.random((batch, L, CONTACTS_PER_LINK)) < 0.4,
         base_position=object_position + normal(3, scale=0.15),
         base_quaternion=quaternions(rng, batch),
@@ -94,20 +95,32 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
             position=normal(3, scale=0.1),
             quaternion=quaternions(rng, batch),
         ),
-        "trajectory": TrajectoryGoal(position=normal(K, 3, scale=0.15), quaternion=quaternions(rng, batch, K)),
+        "trajectory": TrajectoryGoal(
+            position=normal(K, 3, scale=0.15), quaternion=quaternions(rng, batch, K)
+        ),
     }
     surface = Surface(normal(N, 3, scale=0.03), rng.random((batch, N)) < 0.5)
-    values["fingers"] = FingersGoal(np.arange(len(HAND.fingers)) < rng.integers(2, len(HAND.fingers), (batch, 1)))
+    values["fingers"] = FingersGoal(
+        np.arange(len(HAND.fingers)) < rng.integers(2, len(HAND.fingers), (batch, 1))
+    )
     values["force"] = ForceGoal(rng.uniform(1.0, 8.0, batch).astype(np.float32))
-    return state, surface, Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch))
+    return (
+        state,
+        surface,
+        Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch)),
+    )
 
 
 def lone_scene(task: TaskConfig, *blocks: str, **goals: dict[str, np.ndarray]) -> Scene:
-    """The first environment of a scene, with other goal arrays of some constraints, and these blocks active."""
+    """The first environment of a scene, with other goal arrays of some constraints, and these
+    blocks active.
+    """
     state, surface, goal = (jax.tree.map(lambda array: array[:1], part) for part in scene(0))
     for name, arrays in goals.items():
         goal = goal.replace(name, **arrays)
-    return scene_of(task, state, surface, dataclasses.replace(goal, active=active(*blocks, batch=1)))
+    return scene_of(
+        task, state, surface, dataclasses.replace(goal, active=active(*blocks, batch=1))
+    )
 
 
 def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:
@@ -116,7 +129,9 @@ def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:
 
 
 def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
-    """The goal with every wrist target within some centimetres and a third of a radian of where the wrist is."""
+    """The goal with every wrist target within some centimetres and a third of a radian of where the
+    wrist is.
+    """
     rng = np.random.default_rng(seed)
     world = Rotation.from_quat(state.base_quaternion, scalar_first=True)
     body = Rotation.from_quat(state.object_quaternion, scalar_first=True).inv()
@@ -124,7 +139,10 @@ def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
     position = body.apply(world.apply(state.u[:, :3]) + state.base_position - state.object_position)
 
     def near(count: int) -> tuple[np.ndarray, np.ndarray]:
-        turns = [wrist * Rotation.from_rotvec(rng.normal(scale=0.1, size=position.shape)) for _ in range(count)]
+        turns = [
+            wrist * Rotation.from_rotvec(rng.normal(scale=0.1, size=position.shape))
+            for _ in range(count)
+        ]
         points = position[:, None] + rng.normal(scale=0.03, size=(len(position), count, 3))
         quaternions = np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
         return points.astype(np.float32), quaternions.astype(np.float32)
@@ -136,7 +154,9 @@ def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
 
 
 def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState:
-    """The whole scene carried by a rigid motion of the world: first turned about the origin, then shifted."""
+    """The whole scene carried by a rigid motion of the world: first turned about the origin, then
+    shifted.
+    """
 
     def point(x: np.ndarray) -> np.ndarray:
         return (turn.apply(x.reshape(-1, 3)).reshape(x.shape) + position).astype(np.float32)
@@ -145,7 +165,11 @@ def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState
         return turn.apply(x.reshape(-1, 3)).reshape(x.shape).astype(np.float32)
 
     def attitude(q: np.ndarray) -> np.ndarray:
-        return (turn * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True).astype(np.float32)
+        return (
+            (turn * Rotation.from_quat(q, scalar_first=True))
+            .as_quat(scalar_first=True)
+            .astype(np.float32)
+        )
 
     return state._replace(
         object_position=point(state.object_position),
@@ -172,13 +196,19 @@ def _features(task: TaskConfig) -> Callable[..., Any]:
 
 
 def evaluated(function: Callable[..., Any], scene: Scene, *rest: Any) -> Any:
-    """A function of a scene, compiled as one program: hundreds of single operations would be compiled one by one."""
-    return jax.device_get(_compiled(function, scene.hand, scene.task)(scene._replace(hand=None, task=None), *rest))
+    """A function of a scene, compiled as one program: hundreds of single operations would be
+    compiled one by one.
+    """
+    return jax.device_get(
+        _compiled(function, scene.hand, scene.task)(scene._replace(hand=None, task=None), *rest)
+    )
 
 
 @functools.cache
 def _compiled(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
-    return jax.jit(lambda scene, *rest: function(scene._replace(hand=static[0], task=static[1]), *rest))
+    return jax.jit(
+        lambda scene, *rest: function(scene._replace(hand=static[0], task=static[1]), *rest)
+    )
 
 
 points_of = jax.jit(lambda q: keypoints(HAND, link_transforms(HAND, q)))

@@ -1,7 +1,8 @@
 """A transport from outside: importing this file makes URLs `socket/PATH` open, over Unix sockets.
 
-The listener keeps an in-memory hub; each connection has an endpoint of its own in it, which does what the frames ask
-for and sends back the outcome. A frame is a length, a line of JSON and, where there is one, an encoded message.
+The listener keeps an in-memory hub; each connection has an endpoint of its own in it, which does
+what the frames ask for and sends back the outcome. A frame is a length, a line of JSON and, where
+there is one, an encoded message.
 """
 
 import contextlib
@@ -25,11 +26,23 @@ LENGTH = struct.Struct("<Q")
 
 
 class Frames:
-    """One end of a connection: sends frames, and gives those that arrive to `handle(head, message) -> reply`."""
+    """One end of a connection: sends frames, and gives those that arrive to `handle(head, message)
+    -> reply`.
+    """
 
     def __init__(self, connection, handle, on_end):
-        self._socket, self._file, self._handle, self._on_end = connection, connection.makefile("rb"), handle, on_end
-        self._numbers, self._answers, self._lock, self.ended = itertools.count(), {}, threading.Lock(), False
+        self._socket, self._file, self._handle, self._on_end = (
+            connection,
+            connection.makefile("rb"),
+            handle,
+            on_end,
+        )
+        self._numbers, self._answers, self._lock, self.ended = (
+            itertools.count(),
+            {},
+            threading.Lock(),
+            False,
+        )
         threading.Thread(target=self._read, daemon=True).start()
 
     def send(self, head, message=None):
@@ -110,11 +123,14 @@ class Connection:
             self.endpoint.declare_alive(key)
         elif head["do"] == "watch":
             self.endpoint.watch_alive(
-                key, lambda token, alive: self.frames.send({"name": name, "key": token, "alive": alive})
+                key,
+                lambda token, alive: self.frames.send({"name": name, "key": token, "alive": alive}),
             )
         elif head["do"] == "serve":
             self.endpoint.serve(
-                key, lambda key, request: self.frames.call({"name": name, "key": key}, request, 60), **head["options"]
+                key,
+                lambda key, request: self.frames.call({"name": name, "key": key}, request, 60),
+                **head["options"],
             )
         else:
             subscription = self.endpoint.subscribe(key, depth=10_000)
@@ -162,7 +178,11 @@ class SocketTransport:
                 raise TransportError(f"No response from socket/{path}.")
             time.sleep(0.01)
         self._names, self._handlers = itertools.count(), {}
-        self._frames = Frames(connection, lambda head, message: self._handlers[head["name"]](head, message), self.close)
+        self._frames = Frames(
+            connection,
+            lambda head, message: self._handlers[head["name"]](head, message),
+            self.close,
+        )
 
     def serve(self, key, handler, *, on_damage=None, admission=None, **options):
         def answer(head, message):
@@ -172,21 +192,27 @@ class SocketTransport:
         self._declare("serve", key, answer, options=options)
 
     def query(self, key, request, *, timeout):
-        return self._frames.call({"do": "query", "key": key, "timeout": timeout}, request, timeout + 1.0)
+        return self._frames.call(
+            {"do": "query", "key": key, "timeout": timeout}, request, timeout + 1.0
+        )
 
     def publish(self, key, message):
         self._frames.send({"do": "publish", "key": key}, message)
 
     def subscribe(self, key_expression, *, depth):
         subscription = Subscription(depth)
-        self._declare("subscribe", key_expression, lambda head, m: subscription.push(head["key"], lambda: m))
+        self._declare(
+            "subscribe", key_expression, lambda head, m: subscription.push(head["key"], lambda: m)
+        )
         return subscription
 
     def declare_alive(self, key):
         self._declare("declare", key, None)
 
     def watch_alive(self, key_expression, on_change):
-        self._declare("watch", key_expression, lambda head, message: on_change(head["key"], head["alive"]))
+        self._declare(
+            "watch", key_expression, lambda head, message: on_change(head["key"], head["alive"])
+        )
 
     def _declare(self, what, key, handler, **more):
         name = next(self._names)

@@ -11,13 +11,17 @@ from congrasp.common.objects.mjcf import GEOM_TYPES
 from congrasp.common.objects.spec import Piece
 
 
-def mujoco_mass_properties(pieces: Sequence[Piece], densities: Sequence[float]) -> tuple[float, np.ndarray, np.ndarray]:
+def mujoco_mass_properties(
+    pieces: Sequence[Piece], densities: Sequence[float]
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass (3,) and inertia (3, 3) of a body of geoms with these densities."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body()
     body.add_freejoint()
     for i, (piece, density) in enumerate(zip(pieces, densities, strict=True)):
-        geom = body.add_geom(type=GEOM_TYPES[piece.kind], pos=piece.pos, quat=piece.quat, density=density)
+        geom = body.add_geom(
+            type=GEOM_TYPES[piece.kind], pos=piece.pos, quat=piece.quat, density=density
+        )
         if piece.vertices is None:
             geom.size = piece.size
         else:

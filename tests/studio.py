@@ -41,14 +41,25 @@ class FakePolicy:
     def newest(self) -> dict[str, Any]:
         return {"source": "fake", "version": 7, "trouble": ""}
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
+    def grasp(
+        self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
+    ) -> Message:
         self.asked.append((obj, request, phases))
         progress("grasping", 0.5)
         if self.fails:
             raise RuntimeError(self.fails)
-        found = episode(STEPS, removal=REMOVAL, mask=tuple(int(name in request.constraints) for name in
-                        ("affordance", "pose", "pose", "trajectory")))  # fmt: skip
-        return Message(found.arrays, {**found.meta, "metrics": {**found.meta["metrics"], "held": 1.0}, "note": ""})
+        found = episode(
+            STEPS,
+            removal=REMOVAL,
+            mask=tuple(
+                int(name in request.constraints)
+                for name in ("affordance", "pose", "pose", "trajectory")
+            ),
+        )
+        return Message(
+            found.arrays,
+            {**found.meta, "metrics": {**found.meta["metrics"], "held": 1.0}, "note": ""},
+        )
 
 
 def objects() -> Catalogue:
@@ -66,31 +77,58 @@ def _short() -> Message:
 
 def actor_episode(number: int, success: bool = True) -> Message:
     """A short episode of an actor, whose number is in the name of the object."""
-    meta = {**_short().meta, "actor": f"a{number:03d}", "object": f"thing-{number}", "success": success}
+    meta = {
+        **_short().meta,
+        "actor": f"a{number:03d}",
+        "object": f"thing-{number}",
+        "success": success,
+    }
     return Message(_short().arrays, meta)
 
 
 def status(actors: int, version: int = 12) -> dict[str, Any]:
     """Status of a run with many actors."""
     roles = [
-        {"role": "actor", "id": f"a{n:03d}", "incarnation": "i", "version": version - n % 3, "lag": n % 3,
-         "rollouts": 5 * n, "rollouts_per_second": 0.5, "steps_per_second": 1000.0 + n}
+        {
+            "role": "actor",
+            "id": f"a{n:03d}",
+            "incarnation": "i",
+            "version": version - n % 3,
+            "lag": n % 3,
+            "rollouts": 5 * n,
+            "rollouts_per_second": 0.5,
+            "steps_per_second": 1000.0 + n,
+        }
         for n in range(actors)
-    ]  # fmt: skip
+    ]
     ledger = {"granted": 3, "running": 1, "redeemed": 2, "returned": 0, "expired": 0}
     return {
-        "run": "fake", "version": version, "run_id": "e", "finished": False, "roles": roles, "warnings": [],
+        "run": "fake",
+        "version": version,
+        "run_id": "e",
+        "finished": False,
+        "roles": roles,
+        "warnings": [],
         "rates": {"rollouts_per_second": 50.0, "steps_per_second": 123456.0},
-        "queue": {"length": 1, "limit": 4}, "counters": ledger,
-    }  # fmt: skip
+        "queue": {"length": 1, "limit": 4},
+        "counters": ledger,
+    }
 
 
 def metrics(update: int) -> Message:
     """A learner's figures; its success dips at `DIP`."""
     success = 0.1 if update == DIP else min(0.95, 0.02 * update)
-    values = {"episode/success": success, "episode/return": 3.0 * update, "staleness_mean": 0.5,
-              "steps_per_second": 1e5, "success/heading": success, "success/pose": 0.5}  # fmt: skip
-    return Message({}, {"time": BEGIN + 10.0 * update, "update": update, "version": update, "values": values})
+    values = {
+        "episode/success": success,
+        "episode/return": 3.0 * update,
+        "staleness_mean": 0.5,
+        "steps_per_second": 1e5,
+        "success/heading": success,
+        "success/pose": 0.5,
+    }
+    return Message(
+        {}, {"time": BEGIN + 10.0 * update, "update": update, "version": update, "values": values}
+    )
 
 
 def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
@@ -100,7 +138,11 @@ def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
         made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
     made.take_status(status(actors), now)
     for number in range(actors):
-        made.take(keys.log("episode", "actor", f"a{number:03d}"), actor_episode(number, number % 4 > 0), now)
+        made.take(
+            keys.log("episode", "actor", f"a{number:03d}"),
+            actor_episode(number, number % 4 > 0),
+            now,
+        )
     return made
 
 
@@ -108,20 +150,28 @@ def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     """Recordings of episodes: times (s since 1970) and numbers of actors."""
     writer, channels = LogWriter(folder, "log", run="fake"), JsonChannels()
     for when, number in moments:
-        writer.write(*episode_entries(f"a{number:03d}", actor_episode(number), int(1e9 * when), 0, channels))
+        writer.write(
+            *episode_entries(f"a{number:03d}", actor_episode(number), int(1e9 * when), 0, channels)
+        )
     writer.close()
 
 
 class FakeImporter:
-    """Makes a bottle of every file: 6 x 6 x 20 cm, by default in m; `cm` is in cm, and `unknown` of ambiguous unit."""
+    """Makes a bottle of every file: 6 x 6 x 20 cm, by default in m; `cm` is in cm, and `unknown` of
+    ambiguous unit.
+    """
 
     def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
         if path.suffix != ".stl":
             raise CongraspError(f"{path} is not an STL file.", "Convert it.")
-        return {"cm": (6.0, 6.0, 20.0), "unknown": (0.9, 0.9, 3.0)}.get(path.stem, (0.06, 0.06, 0.2))
+        return {"cm": (6.0, 6.0, 20.0), "unknown": (0.9, 0.9, 3.0)}.get(
+            path.stem, (0.06, 0.06, 0.2)
+        )
 
     def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
-        factor = max(self.sides(path)) * {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit] / 0.2
+        factor = (
+            max(self.sides(path)) * {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit] / 0.2
+        )
         return procedural.generate(5, "bottle").scaled(factor), ["It was a bit small"]
 
 

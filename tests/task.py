@@ -1,6 +1,7 @@
 """The task of the suite: a module that needs another one says why.
 
-Modules that share hand, task, policy and batch share compiled programs, in one process and through the disk's cache.
+Modules that share hand, task, policy and batch share compiled programs, in one process and through
+the disk's cache.
 """
 
 import functools
@@ -39,16 +40,23 @@ CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 
 @functools.cache
 def bank() -> ConstraintBank:
-    """The constraint bank of `OBJECTS`; kept on disk like those of large pools, for the other workers."""
+    """The constraint bank of `OBJECTS`; kept on disk like those of large pools, for the other
+    workers.
+    """
     folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
-    with mock.patch.dict(os.environ, XDG_CACHE_HOME=folder), mock.patch.object(build, "LEAST_OBJECTS", 1):
+    with (
+        mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
+        mock.patch.object(build, "LEAST_OBJECTS", 1),
+    ):
         return build.build_bank(HAND, TASK, OBJECTS, 0)
 
 
 def bank_of(index: int, points: int) -> ConstraintBank:
     """The constraint bank of one of `OBJECTS`, with its first surface points."""
     own = jax.tree.map(lambda rows: rows[index : index + 1], bank())
-    return own._replace(**{name: getattr(own, name)[:, :points] for name in ("points", "avoid", "normals")})
+    return own._replace(
+        **{name: getattr(own, name)[:, :points] for name in ("points", "avoid", "normals")}
+    )
 
 
 @functools.cache
@@ -68,8 +76,8 @@ def warp_engine(objects: Sequence[GraspObject], **options: Any) -> Physics:
 
 
 def start_of(**fields: Any) -> ResetState:
-    """An environment that starts with what is given: else a free object of its own mass at the origin, and the open
-    hand at the world's pose."""
+    """An environment that starts with what is given: else a free object of its own mass at the
+    origin, and the open hand at the world's pose."""
     level, place = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), np.zeros((1, 3), np.float32)
     neutral = {
         **dict.fromkeys(("mass_scale", "friction", "gain_scale"), np.ones(1, np.float32)),
@@ -82,19 +90,25 @@ def start_of(**fields: Any) -> ResetState:
 
 
 def commanded(parameters: Array, observation: Array, key: Array) -> tuple[Array, Array]:
-    """A policy for `worker`: acts by its parameters (A + 1,), a mean action and the size of its noise."""
+    """A policy for `worker`: acts by its parameters (A + 1,), a mean action and the size of its
+    noise.
+    """
     noise = jax.random.normal(key, (len(observation), len(parameters) - 1))
     return parameters[:-1] + parameters[-1] * noise, -0.5 * jnp.sum(noise**2, -1)
 
 
 def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.ndarray:
-    """Parameters of `commanded`: the action of every finger joint, that of the wrist along z, and the noise."""
+    """Parameters of `commanded`: the action of every finger joint, that of the wrist along z, and
+    the noise.
+    """
     mean = np.zeros(len(HAND.motors) + 7, np.float32)
     mean[: len(HAND.motors)], mean[len(HAND.motors) + 2], mean[-1] = fingers, lift, noise
     return mean
 
 
-def worker(seed: int = 0, physics: Physics | None = None, *, renewed: bool = True, **options: Any) -> RolloutWorker:
+def worker(
+    seed: int = 0, physics: Physics | None = None, *, renewed: bool = True, **options: Any
+) -> RolloutWorker:
     """Environments of the suite's task in which `commanded` acts.
 
     Args:
@@ -105,28 +119,45 @@ def worker(seed: int = 0, physics: Physics | None = None, *, renewed: bool = Tru
     """
     physics = physics or NativePhysics(HAND, TASK, OBJECTS, 2)
     settings = {"batch": BATCH, "half_precision": True, "traced": "all", **options}
-    return RolloutWorker(HAND, TASK, physics, bank() if renewed else None, commanded, seed=seed, **settings)
+    return RolloutWorker(
+        HAND, TASK, physics, bank() if renewed else None, commanded, seed=seed, **settings
+    )
 
 
 def placed(tree: Any) -> Any:
-    """The arrays on this process's device, as a worker places them: others would compile its programs again."""
+    """The arrays on this process's device, as a worker places them: others would compile its
+    programs again.
+    """
     return jax.device_put(tree, jax.local_devices()[0])
 
 
 def programs(probe: Probe = no_probe, task: TaskConfig = TASK) -> Programs:
     """The programs of `worker`, or of those of another task."""
-    settings = {"batch": BATCH, "half_precision": True, "probe": probe, "traced": "all", "taught": False}
+    settings = {
+        "batch": BATCH,
+        "half_precision": True,
+        "probe": probe,
+        "traced": "all",
+        "taught": False,
+    }
     return programs_of(HAND, task, NativePhysics, commanded, **settings)
 
 
-def episodes(count: int, episode_bank: ConstraintBank | None = None, task: TaskConfig = TASK) -> InitialConditions:
-    """Initial conditions of many episodes of the suite's task, by the program that draws those of `worker`.
+def episodes(
+    count: int, episode_bank: ConstraintBank | None = None, task: TaskConfig = TASK
+) -> InitialConditions:
+    """Initial conditions of many episodes of the suite's task, by the program that draws those of
+    `worker`.
 
     Args:
       count: number of episodes, rounded up to a multiple of `BATCH`.
       episode_bank: a bank with the shapes of that of the suite; by default, that.
       task: another task, which costs another program.
     """
-    given, keys = placed((episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH))))
-    drawn = [jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys]
+    given, keys = placed(
+        (episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH)))
+    )
+    drawn = [
+        jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys
+    ]
     return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

@@ -1,4 +1,6 @@
-"""The source: layers, sizes of modules, the one module that unpickles, and plain engineering English in its texts."""
+"""The source: layers, sizes of modules, the one module that unpickles, and plain engineering
+English in its texts.
+"""
 
 import ast
 import functools
@@ -15,11 +17,18 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 FOLDERS = ("common", "actors", "learner", "services")
-KNOWN = {"common": set(), "actors": {"common"}, "learner": {"common"}, "services": {"common", "actors", "learner"}}
+KNOWN = {
+    "common": set(),
+    "actors": {"common"},
+    "learner": {"common"},
+    "services": {"common", "actors", "learner"},
+}
 
 
 def imported(body: Sequence[ast.stmt]) -> Iterator[str]:
-    """Names of modules and of what is taken from them, as far as importing a module imports them."""
+    """Names of modules and of what is taken from them, as far as importing a module imports
+    them.
+    """
     for node in body:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -34,25 +43,38 @@ def imported(body: Sequence[ast.stmt]) -> Iterator[str]:
 @functools.cache
 def trees(*folders: str) -> dict[pathlib.Path, ast.Module]:
     """Syntax trees of all modules in some folders."""
-    return {path: ast.parse(path.read_text()) for folder in folders for path in (ROOT / folder).rglob("*.py")}
+    return {
+        path: ast.parse(path.read_text())
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+    }
 
 
 @functools.cache
 def graph(everything: bool) -> dict[str, set[str]]:
     """Modules by those that they import: at once, or `everything` that is anywhere in them."""
-    paths = {path: ".".join(("congrasp", *path.relative_to(ROOT).with_suffix("").parts)) for path in trees(*FOLDERS)}
+    paths = {
+        path: ".".join(("congrasp", *path.relative_to(ROOT).with_suffix("").parts))
+        for path in trees(*FOLDERS)
+    }
     names = {name.removesuffix(".__init__") for name in paths.values()}
     found = {}
     for path, name in paths.items():
         tree = trees(*FOLDERS)[path]
-        body = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)] if everything else tree.body
+        body = (
+            [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
+            if everything
+            else tree.body
+        )
         targets = (t if t in names else t.rpartition(".")[0] for t in imported(body))
         found[name.removesuffix(".__init__")] = {target for target in targets if target in names}
     return found
 
 
 def test_every_import_of_ours_exists():
-    """Those in functions, too, which nothing finds before they run; mypy takes what it does not find for granted."""
+    """Those in functions, too, which nothing finds before they run; mypy takes what it does not
+    find for granted.
+    """
     names = graph(everything=False).keys() | {"congrasp"}
     for path, tree in {**trees(*FOLDERS), **trees("tests", "examples")}.items():
         body = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
@@ -79,7 +101,8 @@ def test_no_two_services_import_each_other():
 def test_no_module_needs_itself():
     """Not even for types, or in functions.
 
-    Kahn's algorithm takes away modules of which nothing is left that they import: a cycle would remain.
+    Kahn's algorithm takes away modules of which nothing is left that they import: a cycle would
+    remain.
     """
     left = graph(everything=True)
     while free := [module for module, targets in left.items() if not targets & left.keys()]:
@@ -88,26 +111,46 @@ def test_no_module_needs_itself():
 
 
 def test_constraints_are_used_by_their_hooks():
-    """No module outside their folder imports one of them, but for the heading, which every episode has."""
+    """No module outside their folder imports one of them, but for the heading, which every episode
+    has.
+    """
     folder = "congrasp.common.task.constraints"
     shared = {folder, *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority"))}
-    used = {t for m, targets in graph(everything=True).items() if not m.startswith(folder) for t in targets}
+    used = {
+        t
+        for m, targets in graph(everything=True).items()
+        if not m.startswith(folder)
+        for t in targets
+    }
     assert {target for target in used if target.startswith(folder)} <= shared
 
 
-LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+}
 
 
 def lines_of_code(text: str, tree: ast.AST) -> int:
     """Lines without blanks, comments and docstrings."""
-    strings = (n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))
+    strings = (
+        n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)
+    )
     documented = {line for n in strings for line in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
-    tokens = (t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in LAYOUT)
+    tokens = (
+        t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in LAYOUT
+    )
     return len({line for t in tokens for line in range(t.start[0], t.end[0] + 1)} - documented)
 
 
 def test_modules_and_functions_are_short():
-    """A module has at most 400 lines of code; a function's body, without its docstring, at most 60 lines."""
+    """A module has at most 400 lines of code; a function's body, without its docstring, at most 60
+    lines.
+    """
     long = []
     for path, tree in trees(*FOLDERS).items():
         text = path.read_text()
@@ -129,7 +172,11 @@ RUNS_DATA = re.compile(
 
 def test_one_module_imports_what_can_run_code_out_of_data():
     """The child process with an allow-list."""
-    found = [str(path.relative_to(ROOT)) for path in trees(*FOLDERS) if RUNS_DATA.search(path.read_text())]
+    found = [
+        str(path.relative_to(ROOT))
+        for path in trees(*FOLDERS)
+        if RUNS_DATA.search(path.read_text())
+    ]
     assert found == ["common/io/unpickle.py"]
 
 
@@ -149,7 +196,9 @@ def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Line and text of the docstrings of a module, its classes and functions, and of the strings under fields."""
+    """Line and text of the docstrings of a module, its classes and functions, and of the strings
+    under fields.
+    """
     for found in ast.walk(tree):
         if isinstance(found, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             for statement in found.body:
@@ -158,7 +207,9 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def test_the_rules_find_what_they_ban():
-    tree = ast.parse('"""Whether it is mended."""\nx = 1\n"""What x is."""\nraise ValueError("nobody came")\n')
+    tree = ast.parse(
+        '"""Whether it is mended."""\nx = 1\n"""What x is."""\nraise ValueError("nobody came")\n'
+    )
     assert [line for line, text in docstrings(tree) if OPENINGS.match(text)] == [1, 3]
     assert [line for line, text in texts(tree) if BANNED.search(text)] == [1, 4]
 
@@ -166,12 +217,20 @@ def test_the_rules_find_what_they_ban():
 @pytest.mark.parametrize(("read", "wrong"), [(docstrings, OPENINGS.match), (texts, BANNED.search)])
 def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
     modules = trees(*FOLDERS).items()
-    found = [f"{path}:{line}: {text[:100]}" for path, tree in modules for line, text in read(tree) if wrong(text)]
+    found = [
+        f"{path}:{line}: {text[:100]}"
+        for path, tree in modules
+        for line, text in read(tree)
+        if wrong(text)
+    ]
     assert not found, "\n".join(found)
 
 
 def test_benchmarks_need_no_pytest():
-    script = "import sys; sys.modules['pytest'] = None; import importlib, tests.benchmarks.__main__ as benchmarks; "
+    script = (
+        "import sys; sys.modules['pytest'] = None; import importlib, tests.benchmarks.__main__ as "
+        "benchmarks; "
+    )
     script += "[importlib.import_module(f'tests.benchmarks.{name}') for name in benchmarks.NAMES]"
     subprocess.run([sys.executable, "-c", script], check=True)
 

@@ -1,4 +1,6 @@
-"""The public face: every name is there, is imported when it is used, and the client needs numpy and zenoh alone."""
+"""The public face: every name is there, is imported when it is used, and the client needs numpy and
+zenoh alone.
+"""
 
 import importlib.metadata
 import inspect
@@ -70,13 +72,17 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
     assert lines[0].startswith("congrasp.load_policy needs the package '")
     assert lines[0].endswith("'. Run: pip install 'congrasp[train]'")
     assert lines[1:] == [
-        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop starts from measured poses.",
+        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop starts "
+        "from measured poses.",
         "follow (16,) True",
     ]
 
 
 def test_a_probe_of_a_server_s_health_and_options_without_presets_load_neither_jax_nor_mujoco():
-    code = "import sys, congrasp.services.serve.load as _\nfrom congrasp.services.cli.main import load\n"
+    code = (
+        "import sys, congrasp.services.serve.load as _\nfrom congrasp.services.cli.main import "
+        "load\n"
+    )
     code += "[load(name) for name in ('query', 'serve', 'view', 'doctor', 'plot', 'export')]\n"
     code += "print({'jax', 'mujoco'} & {*sys.modules})"
     assert python("-c", code).stdout == "set()\n"
@@ -91,7 +97,9 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     congrasp.save_motion(str(tmp_path / "block.npz"), found.motion)
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"
-    with pytest.raises(congrasp.UnknownConstraintError, match="does not support the constraint 'fingers'"):
+    with pytest.raises(
+        congrasp.UnknownConstraintError, match="does not support the constraint 'fingers'"
+    ):
         congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)
 
 
@@ -109,7 +117,9 @@ def test_a_grasp_names_a_missing_policy_no_attempts_and_an_impossible_seed(optio
 
 
 @pytest.mark.slow
-def test_the_first_example_of_grasp_runs_on_the_policy_that_comes_with_congrasp(capsys: pytest.CaptureFixture) -> None:
+def test_the_first_example_of_grasp_runs_on_the_policy_that_comes_with_congrasp(
+    capsys: pytest.CaptureFixture,
+) -> None:
     assert congrasp.grasp.__doc__ is not None
     example = congrasp.grasp.__doc__.partition("Example:")[2].partition("Args:")[0]
     exec(textwrap.dedent(example.strip("\n")), {})

@@ -21,7 +21,17 @@ def wheel(tmp_path_factory) -> pathlib.Path:
         shutil.copytree(ROOT / folder, source / folder, symlinks=True, ignore=ignored)
     for file in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, source)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(target), str(source)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(target),
+        str(source),
+    ]
     subprocess.run(command, check=True, timeout=300)
     return next(target.glob("*.whl"))
 
@@ -30,7 +40,9 @@ def test_a_wheel_installs_one_name_and_all_its_files(wheel):
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
     assert {name.partition("/")[0] for name in names} == {"congrasp"}
     for folder in FOLDERS:
-        tracked = subprocess.run(["git", "ls-files", folder], cwd=ROOT, capture_output=True, text=True, check=True)
+        tracked = subprocess.run(
+            ["git", "ls-files", folder], cwd=ROOT, capture_output=True, text=True, check=True
+        )
         assert {f"congrasp/{name}" for name in tracked.stdout.split()} <= set(names)
 
 
@@ -39,9 +51,19 @@ def test_a_program_may_have_folders_of_the_same_names(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(installed)
     for folder in FOLDERS:
         (program / folder).mkdir(parents=True)
-        (program / folder / "__init__.py").write_text("raise ImportError('the module of another program')")
-    options = {"env": {"PYTHONPATH": str(installed)}, "capture_output": True, "text": True, "timeout": 60}
+        (program / folder / "__init__.py").write_text(
+            "raise ImportError('the module of another program')"
+        )
+    options = {
+        "env": {"PYTHONPATH": str(installed)},
+        "capture_output": True,
+        "text": True,
+        "timeout": 60,
+    }
     code = "import congrasp; congrasp.PolicyClient, congrasp.Guard; print(congrasp.__file__)"
-    for command, printed in ((["-c", code], str(installed)), (["-m", "congrasp", "--help"], "congrasp train")):
+    for command, printed in (
+        (["-c", code], str(installed)),
+        (["-m", "congrasp", "--help"], "congrasp train"),
+    ):
         done = subprocess.run([sys.executable, *command], cwd=program, **options)
         assert done.returncode == 0 and printed in done.stdout, done.stderr

@@ -1,4 +1,6 @@
-"""Waits (`eventually` has no deadline but the suite's own, `timeout` in pyproject.toml), and a clock that tests set."""
+"""Waits (`eventually` has no deadline but the suite's own, `timeout` in pyproject.toml), and a
+clock that tests set.
+"""
 
 import threading
 import time
@@ -28,7 +30,9 @@ def eventually(look: Callable[[], T], pause: float = 0.02) -> T:
 
 
 def together(call: Callable[[A], T], arguments: Iterable[A], seconds: float = 60.0) -> list[T]:
-    """Results of calls at the same time; their threads are daemons, so that one that hangs ends with the tests."""
+    """Results of calls at the same time; their threads are daemons, so that one that hangs ends
+    with the tests.
+    """
 
     def answer(future: Future[T], argument: A) -> None:
         try:

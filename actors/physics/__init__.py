@@ -1,4 +1,6 @@
-"""Physics engines behind one interface: registers those of the project; `make_physics` builds one by name."""
+"""Physics engines behind one interface: registers those of the project; `make_physics` builds one
+by name.
+"""
 
 import concurrent.futures
 import functools
@@ -19,7 +21,9 @@ from congrasp.common.task.config import TaskConfig
 _NVIDIA = ("gpu", "cuda")
 
 
-def _make_warp(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
+def _make_warp(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int
+) -> Physics:
     """Builds MuJoCo Warp, which ignores `threads`."""
     from congrasp.actors.physics.warp import WarpPhysics
 
@@ -34,7 +38,9 @@ def _prepare_warp(hand: Hand, task: TaskConfig) -> None:
     begin_kernels(hand, task)
 
 
-def _make_jax(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
+def _make_jax(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int
+) -> Physics:
     """Builds MJX-JAX, which ignores `threads`."""
     from congrasp.actors.physics.mjx import MjxPhysics
 
@@ -56,19 +62,32 @@ def _missing_warp(backend: str) -> CongraspError | None:
             "Install the 'cuda' extra and check 'congrasp doctor', or pass --physics native.",
         )
     if importlib.util.find_spec("warp") is None:
-        return CongraspError("The 'warp' engine is not installed.", "Run: pip install 'congrasp[cuda]'.")
+        return CongraspError(
+            "The 'warp' engine is not installed.", "Run: pip install 'congrasp[cuda]'."
+        )
     return None
 
 
 ENGINES["warp"] = Engine(
-    _make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, _prepare_warp, on_device=True, title="MJX-Warp"
+    _make_warp,
+    4096,
+    lambda backend: backend in _NVIDIA,
+    _missing_warp,
+    _prepare_warp,
+    on_device=True,
+    title="MJX-Warp",
 )
-ENGINES["jax"] = Engine(_make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA), title="MJX-JAX")
-ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu", title="MuJoCo C (CPU)")
+ENGINES["jax"] = Engine(
+    _make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA), title="MJX-JAX"
+)
+ENGINES["native"] = Engine(
+    _make_native, 64, lambda backend: backend == "cpu", title="MuJoCo C (CPU)"
+)
 
 
 def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
-    """Returns the engine of a name; `auto` is `warp` on an NVIDIA GPU, `native` on a CPU and `jax` elsewhere.
+    """Returns the engine of a name; `auto` is `warp` on an NVIDIA GPU, `native` on a CPU and `jax`
+    elsewhere.
 
     Args:
       name: `auto` or a key of `ENGINES`.
@@ -81,7 +100,10 @@ def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
     if name == "auto":
         name = next(key for key, engine in ENGINES.items() if engine.automatic(backend))
     if name not in ENGINES:
-        raise CongraspError(f"There is no physics engine '{name}'.", f"Choose from: {', '.join(('auto', *ENGINES))}.")
+        raise CongraspError(
+            f"There is no physics engine '{name}'.",
+            f"Choose from: {', '.join(('auto', *ENGINES))}.",
+        )
     if missing := ENGINES[name].missing(backend):
         raise missing
     return name

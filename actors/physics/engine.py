@@ -1,7 +1,7 @@
 """Interface of physics engines: a batch of environments with one hand and one object each.
 
-`warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native` steps MuJoCo C on
-threads and mutates its state. Both use the same three calls.
+`warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native`
+steps MuJoCo C on threads and mutates its state. Both use the same three calls.
 """
 
 import types
@@ -45,7 +45,9 @@ class ResetState(NamedTuple):
 
 
 class PhysicsState(NamedTuple):
-    """State of the environments after a control step; see `common.task.types.SceneState` for shapes and frames."""
+    """State of the environments after a control step; see `common.task.types.SceneState` for shapes
+    and frames.
+    """
 
     q: Array
     u: Array
@@ -59,16 +61,20 @@ class PhysicsState(NamedTuple):
     contact_position: Array
     contact_found: Array
     diverged: Array
-    """(B,) bool: the environment diverged in this step (`has_diverged`) and was reset to its start."""
+    """(B,) bool: the environment diverged in this step (`has_diverged`) and was reset to its
+    start.
+    """
     occupancy: Array
-    """(3,) contacts and constraint rows in the step's fullest substep, as shares of the engine's capacity: the excess
-    over 1 was dropped from the simulation. Zero for an engine that allocates as needed. Third, share of physics steps
-    whose solver reached its limit of iterations: of all on `warp`, of each control step's last on `native`; zero on
-    `jax`, which does not report it."""
+    """(3,) contacts and constraint rows in the step's fullest substep, as shares of the engine's
+    capacity: the excess over 1 was dropped from the simulation. Zero for an engine that allocates
+    as needed. Third, share of physics steps whose solver reached its limit of iterations: of all on
+    `warp`, of each control step's last on `native`; zero on `jax`, which does not report it."""
 
 
 class Physics(Protocol):
-    """A batch of environments. `state` is a pytree for compiled engines and an opaque handle for `native`."""
+    """A batch of environments. `state` is a pytree for compiled engines and an opaque handle for
+    `native`.
+    """
 
     name: str
     compiled: bool
@@ -80,18 +86,23 @@ class Physics(Protocol):
     def reset(self, state: Any, mask: Array, reset_state: ResetState) -> Any:
         """Restarts environments where mask (B,) is true from `reset_state`; the others continue."""
 
-    def step(self, state: Any, target: Array, table: Array, force: Array | None = None) -> tuple[Any, PhysicsState]:
+    def step(
+        self, state: Any, target: Array, table: Array, force: Array | None = None
+    ) -> tuple[Any, PhysicsState]:
         """Simulates one control step.
 
         Args:
           state: the environments.
           target: (B, 6 + M) targets of the wrist's joints and of the fingers' motors.
           table: (B,) bool, True where the table is present.
-          force: (B, 3) force on the object's centre of mass throughout the step, world frame, N; none by default.
+          force: (B, 3) force on the object's centre of mass throughout the step, world frame, N;
+          none by default.
         """
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
-        """Replaces the objects by as many others for environments that restart later; current episodes continue."""
+        """Replaces the objects by as many others for environments that restart later; current
+        episodes continue.
+        """
 
     def read(self, state: Any) -> PhysicsState:
         """Returns the current state of the environments, without contacts after a reset."""
@@ -101,7 +112,9 @@ class Physics(Protocol):
 
 
 def where_environments(mask: Array, new: Any, old: Any) -> Any:
-    """Selects arrays (B, ...) of `new` in the masked environments (B,), those of `old` elsewhere, for any pytree."""
+    """Selects arrays (B, ...) of `new` in the masked environments (B,), those of `old` elsewhere,
+    for any pytree.
+    """
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
@@ -130,7 +143,13 @@ def has_diverged(xp: types.ModuleType, qpos: Array, qvel: Array) -> Array:
 
 
 def physics_state(
-    xp: Any, where: Addresses, qpos: Array, qvel: Array, sensordata: Array, diverged: Array, occupancy: Array
+    xp: Any,
+    where: Addresses,
+    qpos: Array,
+    qvel: Array,
+    sensordata: Array,
+    diverged: Array,
+    occupancy: Array,
 ) -> PhysicsState:
     """Physics state of raw arrays (B, nq), (B, nv), (B, L * C * 13).
 
@@ -138,8 +157,8 @@ def physics_state(
       xp: numpy or jax.numpy.
       where: indices of the compiled scene.
       qpos: generalised positions.
-      qvel: generalised velocities; the free joint's angular part is converted from the object frame to the world frame.
-      sensordata: contact sensors of all links, strongest contacts first.
+      qvel: generalised velocities; the free joint's angular part is converted from the object frame
+      to the world frame. sensordata: contact sensors of all links, strongest contacts first.
       diverged: (B,) bool, returned unchanged.
       occupancy: (3,), returned unchanged.
     """
@@ -147,8 +166,13 @@ def physics_state(
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)
     found = contacts[..., 0] > 0
     local, normal, tangent = contacts[..., 1:4], contacts[..., 7:10], contacts[..., 10:13]
-    # MuJoCo gives the force of the first body (the link) on the second (the object), in the contact frame.
-    on_object = normal * local[..., 0:1] + tangent * local[..., 1:2] + xp.cross(normal, tangent) * local[..., 2:3]
+    # MuJoCo gives the force of the first body (the link) on the second (the object), in the contact
+    # frame.
+    on_object = (
+        normal * local[..., 0:1]
+        + tangent * local[..., 1:2]
+        + xp.cross(normal, tangent) * local[..., 2:3]
+    )
     object_qpos, object_qvel = qpos[:, where.object_qpos], qvel[:, where.object_qvel]
     quaternion = object_qpos[:, 3:] / xp.linalg.norm(object_qpos[:, 3:], axis=-1, keepdims=True)
     angular = object_qvel[:, 3:]

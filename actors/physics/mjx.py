@@ -1,6 +1,7 @@
 """MJX in JAX, which XLA compiles for any device.
 
-The state is a pytree and every call can be traced, so that a whole rollout compiles into one program.
+The state is a pytree and every call can be traced, so that a whole rollout compiles into one
+program.
 """
 
 import functools
@@ -60,7 +61,8 @@ class MjxPhysics:
           objects: the pool indexed by `ResetState.object_index`.
 
         Raises:
-          CongraspError: the hand has collision shapes other than capsules, for which MJX lacks some pairs.
+          CongraspError: the hand has collision shapes other than capsules, for which MJX lacks some
+          pairs.
         """
         if any(link.solids for link in hand.links):
             raise CongraspError(
@@ -72,7 +74,8 @@ class MjxPhysics:
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
-        # MJX has no elliptic cones without friction: links get the hand's sliding friction, a tenth.
+        # MJX has no elliptic cones without friction: links get the hand's sliding friction, a
+        # tenth.
         pool.model.geom_condim[:] = CONTACT.condim
         # MJX has no contact sensor between bodies; contacts are read from the contact list instead.
         pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
@@ -99,13 +102,24 @@ class MjxPhysics:
         return self._place(data, self._objects, reset_state)
 
     def replace_objects(self, state: MjxState, objects: Sequence[GraspObject]) -> MjxState:
-        """Replaces the objects by as many others without meshes, for episodes that start from now on."""
+        """Replaces the objects by as many others without meshes, for episodes that start from now
+        on.
+        """
         return state._replace(pool=self._leaves(objects))
 
     def reset(self, state: MjxState, mask: Array, reset_state: ResetState) -> MjxState:
         """Restarts the masked environments; see `Physics.reset`."""
         fresh = self._place(state.data, state.pool, reset_state)
-        names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
+        names = (
+            "qpos",
+            "qvel",
+            "ctrl",
+            "qacc_warmstart",
+            "mocap_pos",
+            "mocap_quat",
+            "eq_active",
+            "time",
+        )
         started, going = (
             ({name: getattr(batch.data, name) for name in names}, batch.leaves, batch.qpos_start)
             for batch in (fresh, state)
@@ -119,9 +133,13 @@ class MjxPhysics:
         """Simulates one control step; see `Physics.step`."""
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
-        data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
+        data = state.data.replace(
+            ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height)
+        )
         if force is not None:
-            data = data.replace(xfrc_applied=data.xfrc_applied.at[:, where.object_body, :3].set(force))
+            data = data.replace(
+                xfrc_applied=data.xfrc_applied.at[:, where.object_body, :3].set(force)
+            )
 
         model = self._model.replace(**state.leaves)
 
@@ -137,14 +155,18 @@ class MjxPhysics:
         )
         sensors = jnp.where(diverged, 0.0, self._contacts(data))
         state = state._replace(data=data)
-        return state, physics_state(jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(3))
+        return state, physics_state(
+            jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(3)
+        )
 
     def read(self, state: MjxState) -> PhysicsState:
         """Returns the current state of the environments, without contacts; see `Physics.read`."""
         data = state.data
         batch = data.qpos.shape[0]
         none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
-        return physics_state(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3))
+        return physics_state(
+            jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3)
+        )
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""
@@ -152,12 +174,16 @@ class MjxPhysics:
     def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
         """Fields (N, ...) of the model for each object, on the device."""
         return {
-            name: jnp.asarray(value, jnp.float32).reshape(len(objects), *getattr(self._model, name).shape)
+            name: jnp.asarray(value, jnp.float32).reshape(
+                len(objects), *getattr(self._model, name).shape
+            )
             for name, value in self._pool.leaves(objects).items()
         }
 
     def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
-        """Places environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
+        """Places environments at their start, with the fields of their objects from the rows `pool`
+        (N, ...).
+        """
         where, batch = self._where, reset_state.object_index.shape[0]
         leaves = {name: value[reset_state.object_index] for name, value in pool.items()}
         for name, power in MASS_POWERS.items():
@@ -165,12 +191,21 @@ class MjxPhysics:
             rows = where.object_qvel if name.startswith("dof") else np.array([self._object_body])
             factor = reset_state.mass_scale.reshape(-1, *[1] * (leaf.ndim - 1)) ** power
             leaves[name] = leaf.at[:, rows].multiply(factor)
-        tiled = {name: jnp.tile(value, (batch, *([1] * value.ndim))) for name, value in self._shared.items()}
+        tiled = {
+            name: jnp.tile(value, (batch, *([1] * value.ndim)))
+            for name, value in self._shared.items()
+        }
         leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(reset_state.base_position)
-        leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)
-        leaves["geom_friction"] = tiled["geom_friction"].at[:, self._geoms, 0].set(reset_state.friction[:, None])
+        leaves["body_quat"] = (
+            tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)
+        )
+        leaves["geom_friction"] = (
+            tiled["geom_friction"].at[:, self._geoms, 0].set(reset_state.friction[:, None])
+        )
         for name in GAINS:
-            leaves[name] = tiled[name].at[:, where.motors].multiply(reset_state.gain_scale[:, None, None])
+            leaves[name] = (
+                tiled[name].at[:, where.motors].multiply(reset_state.gain_scale[:, None, None])
+            )
         qpos = initial_qpos(where, self._nq, reset_state)
         data = data.replace(
             qpos=qpos,
@@ -182,24 +217,33 @@ class MjxPhysics:
             .at[:, where.anchor_mocap]
             .set(reset_state.object_position),
             mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(reset_state.object_quaternion),
-            eq_active=data.eq_active.at[:, where.weld].set(reset_state.stationary.astype(data.eq_active.dtype)),
+            eq_active=data.eq_active.at[:, where.weld].set(
+                reset_state.stationary.astype(data.eq_active.dtype)
+            ),
         )
         return MjxState(data, leaves, qpos, pool)
 
     def _contacts(self, data: Any) -> Array:
         """Contacts (B, L * C * 13) in the layout of the contact sensors."""
-        strongest = functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body)
+        strongest = functools.partial(
+            _strongest_contacts, self._body_of_geom, self._links, self._object_body
+        )
         return jax.vmap(strongest)(data)
 
 
-def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:
+def _strongest_contacts(
+    body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any
+) -> Array:
     """Values of the contact sensors from MJX-JAX's contact list, for one environment."""
     contact = data._impl.contact
     body = jnp.asarray(body_of_geom)[contact.geom]
     index = np.asarray(contact.efc_address)
     # An elliptic contact of dimension 3 has a row for the normal and one for each tangent.
-    force = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(3)], 0.0)
-    # Normals point from the first geom to the second; the sensors need them from the link to the object.
+    force = jnp.where(
+        (index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(3)], 0.0
+    )
+    # Normals point from the first geom to the second; the sensors need them from the link to the
+    # object.
     sign = jnp.where(body[:, 1] == object_body, 1.0, -1.0)[:, None]
     found = (contact.dist < contact.includemargin).astype(jnp.float32)[:, None]
     local = jnp.concatenate([force[:, :2], force[:, 2:] * sign], -1)

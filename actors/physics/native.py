@@ -1,4 +1,6 @@
-"""MuJoCo C on threads: one compiled scene for each object, one model and data for each environment."""
+"""MuJoCo C on threads: one compiled scene for each object, one model and data for each
+environment.
+"""
 
 import concurrent.futures
 import copy
@@ -29,13 +31,16 @@ class Scene:
 
     def __init__(self, model: mujoco.MjModel):
         """Wraps a model; nothing is copied yet."""
-        # MuJoCo would silently reset a diverged environment to a pose that is not the episode's start.
+        # MuJoCo would silently reset a diverged environment to a pose that is not the episode's
+        # start.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model = model
         self.spare: list[EnvInstance] = []
 
     def take(self) -> "EnvInstance":
-        """Returns an instance in the state after a reset; creates one only if no spare one is left."""
+        """Returns an instance in the state after a reset; creates one only if no spare one is
+        left.
+        """
         if not self.spare:
             return EnvInstance(self.model)
         instance = self.spare.pop()
@@ -44,7 +49,9 @@ class Scene:
 
 
 class EnvInstance:
-    """One environment: a model (base pose, mass, friction and gains differ) and data, with persistent views."""
+    """One environment: a model (base pose, mass, friction and gains differ) and data, with
+    persistent views.
+    """
 
     def __init__(self, model: mujoco.MjModel):
         """Copies the model of a scene."""
@@ -69,11 +76,14 @@ class NativePhysics:
           objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        # MuJoCo would write every warning to a file in the working directory; `diverged` detects their causes.
+        # MuJoCo would write every warning to a file in the working directory; `diverged` detects
+        # their causes.
         mujoco.set_mju_user_warning(lambda text: None)
         self._hand, self._task, self._objects = hand, task, objects
         self.threads = max(1, threads)
-        self._pool = concurrent.futures.ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
+        self._pool = concurrent.futures.ThreadPoolExecutor(
+            self.threads, thread_name_prefix="physics"
+        )
         self._compiled: dict[int, Scene] = {}
         self.scenes: list[Scene] = []  # scene of each environment
         self.instances: list[EnvInstance] = []
@@ -88,7 +98,8 @@ class NativePhysics:
         batch = len(np.asarray(reset_state.object_index))
         if (free := memory()) < batch * _ENVIRONMENT:
             raise CongraspError(
-                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of memory, but "
+                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of "
+                f"memory, but "
                 f"{free / 1e9:.0f} GB are free.",
                 "Pass a smaller --environments, or run the actor on a GPU.",
             )
@@ -113,15 +124,22 @@ class NativePhysics:
     def step(
         self, state: Any, target: Any, table: Any, force: Any | None = None
     ) -> tuple["NativePhysics", PhysicsState]:
-        """Simulates one control step; see `Physics.step`. Resets and flags diverged environments."""
+        """Simulates one control step; see `Physics.step`. Resets and flags diverged
+        environments.
+        """
         target, table = np.asarray(target), np.asarray(table)
         self.place_tables(table)
         if force is not None:
             for instance, push in zip(self.instances, np.asarray(force), strict=True):
                 instance.data.xfrc_applied[self._where.object_body, :3] = push
-        # Threads take environments from one shared iterator, since contacts make some slower than others.
+        # Threads take environments from one shared iterator, since contacts make some slower than
+        # others.
         environments = iter(range(len(self.instances)))
-        list(self._pool.map(self._step_instances, [environments] * self.threads, [target] * self.threads))
+        list(
+            self._pool.map(
+                self._step_instances, [environments] * self.threads, [target] * self.threads
+            )
+        )
         diverged = has_diverged(np, self._qpos, self._qvel)
         for i in np.flatnonzero(diverged):
             self._restore(int(i))
@@ -130,7 +148,9 @@ class NativePhysics:
     def place_tables(self, table: np.ndarray) -> None:
         """Places the tables where `table` (B,) is true, and removes the others."""
         for i in np.flatnonzero(table != self._table):
-            self.instances[i].data.mocap_pos[self._where.table_mocap] = (0.0, 0.0, 0.0) if table[i] else TABLE_AWAY
+            self.instances[i].data.mocap_pos[self._where.table_mocap] = (
+                (0.0, 0.0, 0.0) if table[i] else TABLE_AWAY
+            )
         self._table = table.copy()
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
@@ -150,11 +170,15 @@ class NativePhysics:
     def _scene(self, index: int) -> Scene:
         """Returns the compiled scene of an object, compiling it on first use."""
         if index not in self._compiled:
-            self._compiled[index] = Scene(compile_scene(self._hand, self._task, self._objects[index]))
+            self._compiled[index] = Scene(
+                compile_scene(self._hand, self._task, self._objects[index])
+            )
         return self._compiled[index]
 
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
-        """Places environment i at row i of its reset states, in an instance of its object's scene."""
+        """Places environment i at row i of its reset states, in an instance of its object's
+        scene.
+        """
         where, scene = self._where, self._scene(int(reset_state.object_index[i]))
         self.scenes[i].spare.append(self.instances[i])
         self.scenes[i], instance = scene, scene.take()
@@ -164,11 +188,15 @@ class NativePhysics:
         model.body_quat[where.base_body] = reset_state.base_quaternion[i]
         for name, power in MASS_POWERS.items():
             rows = where.object_qvel if name.startswith("dof") else where.object_body
-            getattr(model, name)[rows] = getattr(scene.model, name)[rows] * reset_state.mass_scale[i] ** power
+            getattr(model, name)[rows] = (
+                getattr(scene.model, name)[rows] * reset_state.mass_scale[i] ** power
+            )
         geoms = model.geom_bodyid == where.object_body
         model.geom_friction[geoms, 0] = reset_state.friction[i]
         for name in GAINS:
-            getattr(model, name)[where.motors] = getattr(scene.model, name)[where.motors] * reset_state.gain_scale[i]
+            getattr(model, name)[where.motors] = (
+                getattr(scene.model, name)[where.motors] * reset_state.gain_scale[i]
+            )
         data.qpos[where.finger_qpos] = reset_state.q[i]
         data.qvel[where.wrist_qvel] = reset_state.u_velocity[i]
         data.qpos[where.object_qpos] = np.concatenate(
@@ -195,12 +223,18 @@ class NativePhysics:
     def _copy_out(self, i: int) -> None:
         """Copies an instance's state into row i of the batch's arrays."""
         instance = self.instances[i]
-        self._qpos[i], self._qvel[i], self._sensors[i] = instance.qpos, instance.qvel, instance.sensordata
+        self._qpos[i], self._qvel[i], self._sensors[i] = (
+            instance.qpos,
+            instance.qvel,
+            instance.sensordata,
+        )
 
     def _step_instances(self, environments: Iterator[int], target: np.ndarray) -> None:
         """Steps environments from a shared iterator until it is exhausted; runs in each thread."""
         substeps = self._task.substeps
-        with np.errstate(over="ignore"):  # a diverged environment's values may be too large for float32
+        with np.errstate(
+            over="ignore"
+        ):  # a diverged environment's values may be too large for float32
             for i in environments:
                 instance = self.instances[i]
                 instance.ctrl[:] = target[i]

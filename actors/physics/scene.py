@@ -1,4 +1,6 @@
-"""MuJoCo model of one scene: hand, object, table, the anchor of a stationary object, contact sensors."""
+"""MuJoCo model of one scene: hand, object, table, the anchor of a stationary object, contact
+sensors.
+"""
 
 import dataclasses
 import functools
@@ -19,10 +21,20 @@ TABLE_AWAY = (0.0, 0.0, -1000.0)
 """Position of a removed table: a kilometre down, out of reach."""
 GAINS = ("actuator_gainprm", "actuator_biasprm")
 """Fields of a model that hold only a position servo's gains and zeros."""
-MASS_POWERS = {"body_mass": 1, "body_inertia": 1, "body_subtreemass": 1, "body_invweight0": -1, "dof_invweight0": -1}
-"""Fields of a model that scale with a power of a body's mass, in the rows of the body or of its free joint."""
+MASS_POWERS = {
+    "body_mass": 1,
+    "body_inertia": 1,
+    "body_subtreemass": 1,
+    "body_invweight0": -1,
+    "dof_invweight0": -1,
+}
+"""Fields of a model that scale with a power of a body's mass, in the rows of the body or of its
+free joint.
+"""
 SENSOR_WIDTH = 13
-"""Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
+"""Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent
+(3).
+"""
 _CONTACT_FIELDS = (
     mujoco.mjtConDataField.mjCONDATA_FOUND,
     mujoco.mjtConDataField.mjCONDATA_FORCE,
@@ -35,7 +47,9 @@ _STRONGEST = 2  # reduce="maxforce"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Addresses:
-    """Addresses in a compiled scene that the task reads and writes; scenes with equal ones share compiled programs."""
+    """Addresses in a compiled scene that the task reads and writes; scenes with equal ones share
+    compiled programs.
+    """
 
     wrist_qpos: np.ndarray
     finger_qpos: np.ndarray
@@ -49,12 +63,17 @@ class Addresses:
     anchor_mocap: int
     weld: int
     motors: np.ndarray
-    """Actuators of the fingers; servo torque: gainprm[0] * target + biasprm[1] * angle + biasprm[2] * speed."""
+    """Actuators of the fingers; servo torque: gainprm[0] * target + biasprm[1] * angle + biasprm[2]
+    * speed.
+    """
 
     @functools.cached_property
     def _key(self) -> tuple[tuple[int, ...], ...]:
         """All addresses, in order."""
-        return tuple(tuple(np.ravel(getattr(self, field.name)).tolist()) for field in dataclasses.fields(self))
+        return tuple(
+            tuple(np.ravel(getattr(self, field.name)).tolist())
+            for field in dataclasses.fields(self)
+        )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Addresses) and self._key == other._key
@@ -69,15 +88,16 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.compiler.degree = False
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Held objects creep out of every grasp within seconds with pyramidal friction cones. With elliptic ones they do
-    # too unless friction is much stiffer than normal forces and the solver converges: with an impratio of 100 eight
-    # iterations are too few (docs/notes/training.md).
+    # Held objects creep out of every grasp within seconds with pyramidal friction cones. With
+    # elliptic ones they do too unless friction is much stiffer than normal forces and the solver
+    # converges: with an impratio of 100 eight iterations are too few (docs/notes/training.md).
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = task.impratio
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = 24
     spec.option.ls_iterations = 40
-    # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever reached.
+    # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever
+    # reached.
     spec.option.ccd_tolerance = 1e-5
     spec.option.ccd_iterations = 16
     add_hand(
@@ -90,7 +110,8 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,  # MJX-JAX supports collisions of a cylinder with a plane, but not with a box
+        # MJX-JAX supports collisions of a cylinder with a plane, but not with a box
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(0.6, 0.6, 0.05),
         contype=0,
         conaffinity=OBJECT_CONTYPE | (HAND_CONTYPE if task.hand_table_collision else 0),
@@ -108,7 +129,9 @@ def object_contact(task: TaskConfig) -> ContactSettings:
 
 
 def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Adds the weld of the stationary phase and the contact sensors to a spec that contains the object."""
+    """Adds the weld of the stationary phase and the contact sensors to a spec that contains the
+    object.
+    """
     spec.add_equality(
         name="hold",
         type=mujoco.mjtEq.mjEQ_WELD,
@@ -135,7 +158,9 @@ def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
 def compile_scene(hand: Hand, task: TaskConfig, obj: GraspObject) -> mujoco.MjModel:
     """Compiles the scene with one object, for `native`."""
     spec = scene_spec(hand, task)
-    add_object(spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
+    add_object(
+        spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task)
+    )
     finish_spec(spec, hand)
     return spec.compile()
 

@@ -1,8 +1,10 @@
-"""One model for a whole pool of objects: fields that differ between objects become arrays batched over environments.
+"""One model for a whole pool of objects: fields that differ between objects become arrays batched
+over environments.
 
-Primitive pieces of all objects share a fixed number of geom slots, whose sizes and poses are swapped; an unused slot
-shrinks to 0.4 mm inside the object. Mesh pieces of a `Pool` cannot be swapped: each mesh object has separate geoms, and
-those of other objects get a margin that no contact can reach.
+Primitive pieces of all objects share a fixed number of geom slots, whose sizes and poses are
+swapped; an unused slot shrinks to 0.4 mm inside the object. Mesh pieces of a `Pool` cannot be
+swapped: each mesh object has separate geoms, and those of other objects get a margin that no
+contact can reach.
 """
 
 import dataclasses
@@ -11,7 +13,13 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, object_contact, scene_spec
+from congrasp.actors.physics.scene import (
+    HAND_CONTYPE,
+    OBJECT_CONTYPE,
+    finish_spec,
+    object_contact,
+    scene_spec,
+)
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import GEOM_TYPES, add_object
@@ -57,7 +65,9 @@ class Pool:
             meshes = [piece for piece in obj.pieces if piece.kind == "mesh"]
             pieces += meshes
             self._owners += [n] * len(meshes)
-        self.model, geoms = _model(hand, task, dataclasses.replace(objects[0], pieces=tuple(pieces)))
+        self.model, geoms = _model(
+            hand, task, dataclasses.replace(objects[0], pieces=tuple(pieces))
+        )
         self._slots, self._meshes = geoms[:slots], geoms[slots:]
 
     def leaves(self, objects: Sequence[GraspObject]) -> dict[str, np.ndarray]:
@@ -79,14 +89,17 @@ class Pool:
     def _leaves(
         self, base: dict[str, np.ndarray], data: mujoco.MjData, obj: GraspObject, index: int
     ) -> dict[str, np.ndarray]:
-        """Returns the leaves of one object: written into the model, completed by MuJoCo, and copied out."""
+        """Returns the leaves of one object: written into the model, completed by MuJoCo, and copied
+        out.
+        """
         model = self.model
         for name, value in base.items():
             getattr(model, name)[:] = value
         meshes = sum(piece.kind == "mesh" for piece in obj.pieces)
         if meshes != self._owners.count(index):
             raise CongraspError(
-                f"The meshes of the object '{obj.name}' are not in the model.", "Build another engine for its pool."
+                f"The meshes of the object '{obj.name}' are not in the model.",
+                "Build another engine for its pool.",
             )
         for geom, owner in zip(self._meshes, self._owners, strict=True):
             if owner != index:
@@ -97,9 +110,13 @@ class Pool:
 
 
 def _model(hand: Hand, task: TaskConfig, shared: GraspObject) -> tuple[mujoco.MjModel, np.ndarray]:
-    """Compiles the model of a scene with an object whose fields others replace; and the geoms (S,) of its pieces."""
+    """Compiles the model of a scene with an object whose fields others replace; and the geoms (S,)
+    of its pieces.
+    """
     spec = scene_spec(hand, task)
-    body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
+    body = add_object(
+        spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task)
+    )
     body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
     finish_spec(spec, hand)
     model: mujoco.MjModel = spec.compile()
@@ -108,7 +125,11 @@ def _model(hand: Hand, task: TaskConfig, shared: GraspObject) -> tuple[mujoco.Mj
 
 def empty_slots() -> list[Piece]:
     """Primitive slots of an environment without an object."""
-    return [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
+    return [
+        Piece(kind, _shrunk(kind))  # type: ignore[arg-type]
+        for kind, count in PRIMITIVE_SLOTS.items()
+        for _ in range(count)
+    ]
 
 
 def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) -> None:
@@ -122,13 +143,17 @@ def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) 
     Raises:
       CongraspError: there are more pieces of a kind than slots.
     """
-    free = {kind: [g for g in slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
+    free = {
+        kind: [g for g in slots if model.geom_type[g] == GEOM_TYPES[kind]]
+        for kind in PRIMITIVE_SLOTS
+    }
     for piece in obj.pieces:
         if piece.kind == "mesh":
             continue
         if not free[piece.kind]:
             raise CongraspError(
-                f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} pieces.",
+                f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} "
+                f"pieces.",
                 "Use fewer pieces, or import it as a mesh.",
             )
         geom = free[piece.kind].pop(0)
@@ -140,7 +165,8 @@ def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) 
 
 
 def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> None:
-    """Writes mass and inertia into the body `object`, and the quantities that MuJoCo derives from them.
+    """Writes mass and inertia into the body `object`, and the quantities that MuJoCo derives from
+    them.
 
     Args:
       model: the model, changed in place.
@@ -157,7 +183,9 @@ def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> N
 
 def _shrunk(kind: str) -> tuple[float, float, float]:
     """Size of an unused slot."""
-    return (_UNUSED, _UNUSED, 0.0) if kind in ("cylinder", "capsule") else (_UNUSED, _UNUSED, _UNUSED)
+    return (
+        (_UNUSED, _UNUSED, 0.0) if kind in ("cylinder", "capsule") else (_UNUSED, _UNUSED, _UNUSED)
+    )
 
 
 def _half_extent(piece: Piece) -> tuple[float, float, float]:
@@ -197,22 +225,28 @@ class Catalogue:
         """
         primitives = empty_slots()
         meshes = [Piece("mesh", (0.0, 0.0, 0.0), vertices=_PLACEHOLDER)] * mesh_slots
-        self.model, self.geoms = _model(hand, task, dataclasses.replace(example, pieces=(*primitives, *meshes)))
+        self.model, self.geoms = _model(
+            hand, task, dataclasses.replace(example, pieces=(*primitives, *meshes))
+        )
         """(S,) geoms of the object: primitive slots, then mesh slots."""
-        self._primitives, self._meshes = self.geoms[: len(primitives)], self.geoms[len(primitives) :]
+        self._primitives, self._meshes = (
+            self.geoms[: len(primitives)],
+            self.geoms[len(primitives) :],
+        )
         self._body = self.model.body("object").id
         self._dofs = self.model.jnt_dofadr[self.model.body_jntadr[self._body]] + np.arange(6)
 
     def rows(self, objects: Sequence[GraspObject]) -> tuple[dict[str, np.ndarray], mujoco.MjModel]:
-        """Converts objects to rows of the fields that differ between them, and a model that holds their meshes.
+        """Converts objects to rows of the fields that differ between them, and a model that holds
+        their meshes.
 
         Args:
           objects: N objects of primitive and mesh pieces in any mixture.
 
         Returns:
-          Fields by their names in the model, and the model. Geom fields are (N, S, ...), with `geom_dataid` -1 in
-          unused mesh slots; body fields are (N, ...), but `body_subtreemass` is (N, 2) for world and object;
-          `dof_invweight0` is (N, 6). Mesh fields are in the model.
+          Fields by their names in the model, and the model. Geom fields are (N, S, ...), with
+          `geom_dataid` -1 in unused mesh slots; body fields are (N, ...), but `body_subtreemass` is
+          (N, 2) for world and object; `dof_invweight0` is (N, 6). Mesh fields are in the model.
 
         Raises:
           CongraspError: an object has more pieces than slots.
@@ -221,13 +255,17 @@ class Catalogue:
             count = sum(piece.kind == "mesh" for piece in obj.pieces)
             if count > len(self._meshes):
                 raise CongraspError(
-                    f"The object '{obj.name}' has {count} mesh pieces, but the environments have only "
+                    f"The object '{obj.name}' has {count} mesh pieces, but the environments have "
+                    f"only "
                     f"{len(self._meshes)} slots.",
                     "Import it with fewer pieces.",
                 )
         meshes = _compile_meshes(objects)
         model, data = self.model, mujoco.MjData(self.model)
-        empty = {name: getattr(model, name).copy() for name in (*_SLOT_FIELDS, *_BODY_FIELDS, "dof_invweight0")}
+        empty = {
+            name: getattr(model, name).copy()
+            for name in (*_SLOT_FIELDS, *_BODY_FIELDS, "dof_invweight0")
+        }
         rows, first = [], 0
         for obj in objects:
             model.geom_dataid[self._meshes] = -1
@@ -240,10 +278,14 @@ class Catalogue:
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}, meshes
 
     def _fill_meshes(self, meshes: mujoco.MjModel, obj: GraspObject, first: int) -> int:
-        """Writes an object's mesh pieces, from mesh `first` on, into mesh slots; returns the next mesh."""
+        """Writes an object's mesh pieces, from mesh `first` on, into mesh slots; returns the next
+        mesh.
+        """
         count = sum(piece.kind == "mesh" for piece in obj.pieces)
         for name in _SLOT_FIELDS:
-            getattr(self.model, name)[self._meshes[:count]] = getattr(meshes, name)[first : first + count]
+            getattr(self.model, name)[self._meshes[:count]] = getattr(meshes, name)[
+                first : first + count
+            ]
         return first + count
 
     def _row(self) -> dict[str, np.ndarray]:
@@ -259,7 +301,11 @@ class Catalogue:
 def _compile_meshes(objects: Sequence[GraspObject]) -> mujoco.MjModel:
     """Compiles a model with a geom and a mesh for each mesh piece of the objects, in order."""
     spec = mujoco.MjSpec()
-    for i, piece in enumerate(piece for obj in objects for piece in obj.pieces if piece.kind == "mesh"):
+    for i, piece in enumerate(
+        piece for obj in objects for piece in obj.pieces if piece.kind == "mesh"
+    ):
         spec.add_mesh(name=str(i), uservert=np.asarray(piece.vertices, np.float32).ravel())
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=str(i), pos=piece.pos, quat=piece.quat)
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=str(i), pos=piece.pos, quat=piece.quat
+        )
     return spec.compile()

@@ -1,11 +1,13 @@
-"""MuJoCo Warp, called once per control step: NVIDIA kernels with different objects and meshes in each environment.
+"""MuJoCo Warp, called once per control step: NVIDIA kernels with different objects and meshes in
+each environment.
 
-The kernels are those shipped with mujoco-mjx (`mujoco.mjx.third_party.mujoco_warp`); they also run on a CPU, for tests.
-The state is a small pytree and every call can be traced, so that a whole rollout compiles into one program.
+The kernels are those shipped with mujoco-mjx (`mujoco.mjx.third_party.mujoco_warp`); they also run
+on a CPU, for tests. The state is a small pytree and every call can be traced, so that a whole
+rollout compiles into one program.
 
-`control_step` is the interface to JAX: a pure function of small arrays. Model and data stay in buffers allocated once
-per batch, so that their addresses never change and one CUDA graph of a control step serves every program that calls it,
-wherever JAX places its arrays.
+`control_step` is the interface to JAX: a pure function of small arrays. Model and data stay in
+buffers allocated once per batch, so that their addresses never change and one CUDA graph of a
+control step serves every program that calls it, wherever JAX places its arrays.
 """
 
 import concurrent.futures
@@ -42,7 +44,15 @@ from congrasp.actors.physics.engine import (
 )
 from congrasp.actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, Addresses, addresses
 from congrasp.actors.physics.slots import Catalogue
-from congrasp.actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
+from congrasp.actors.physics.warp_kernels import (
+    DATA_LEAVES,
+    MODEL_LEAVES,
+    OBJECT_FIELDS,
+    Leaves,
+    Objects,
+    count,
+    place,
+)
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
@@ -57,18 +67,30 @@ CONSTRAINTS_PER_ENVIRONMENT = 320
 """Capacity of constraint rows for each environment."""
 
 
-_PATIENCE, _WORD = 300.0, 2.0  # seconds until a process builds what another one builds, and until it says so
+# Seconds until a process builds what another one builds, and until it says so
+_PATIENCE, _WORD = (
+    300.0,
+    2.0,
+)
 _BLOCK = 256  # Warp's block size of a launch without one; on a CPU all are 1
 _log = logging.getLogger(__name__)
 _building = threading.Lock()
-"""Held while one of the `WarpBuffers` lists and builds its kernels; the next then finds those they share."""
+"""Held while one of the `WarpBuffers` lists and builds its kernels; the next then finds those they
+share.
+"""
 
 
 class WarpBuffers:
     """Buffers of a batch of environments on one device."""
 
     def __init__(
-        self, model: mujoco.MjModel, where: Addresses, geoms: np.ndarray, substeps: int, batch: int, device: wp.Device
+        self,
+        model: mujoco.MjModel,
+        where: Addresses,
+        geoms: np.ndarray,
+        substeps: int,
+        batch: int,
+        device: wp.Device,
     ):
         """Allocates the buffers.
 
@@ -82,14 +104,23 @@ class WarpBuffers:
         """
         self._substeps, self._device = substeps, device
         self._graph: wp.Graph | None = None
-        capacities = [CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT, substeps * batch]
+        capacities = [
+            CONTACTS_PER_ENVIRONMENT * batch,
+            CONSTRAINTS_PER_ENVIRONMENT,
+            substeps * batch,
+        ]
         self.limits = np.array(capacities, np.float32)
-        """(3,) capacities of contacts and constraint rows, and physics steps of all environments in a control step."""
+        """(3,) capacities of contacts and constraint rows, and physics steps of all environments in
+        a control step.
+        """
         with wp.ScopedDevice(device):
             # A single row would mark the field as shared, and meshes could then never be absent.
             self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
             self._data = mujoco_warp.make_data(
-                model, batch, naconmax=CONTACTS_PER_ENVIRONMENT * batch, njmax=CONSTRAINTS_PER_ENVIRONMENT
+                model,
+                batch,
+                naconmax=CONTACTS_PER_ENVIRONMENT * batch,
+                njmax=CONSTRAINTS_PER_ENVIRONMENT,
             )
             self._occupancy = wp.zeros(3, dtype=int)
             self._leaves = leaves = Leaves()
@@ -100,21 +131,35 @@ class WarpBuffers:
             leaves.geoms = wp.array(geoms, dtype=int)
             leaves.motors = wp.array(where.motors, dtype=int)
             leaves.gains = wp.array(
-                np.stack([model.actuator_gainprm[where.motors, 0], *model.actuator_biasprm[where.motors, 1:3].T], -1),
+                np.stack(
+                    [
+                        model.actuator_gainprm[where.motors, 0],
+                        *model.actuator_biasprm[where.motors, 1:3].T,
+                    ],
+                    -1,
+                ),
                 dtype=wp.vec3,
             )
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
-        leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
+        leaves.base_body, leaves.table, leaves.anchor = (
+            where.base_body,
+            where.table_mocap,
+            where.anchor_mocap,
+        )
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
         # The kernels print every overflow; thousands of environments would flood the log.
         self._model.opt.warn_overflow = 0
         self._sensing = self._model.opt.disableflags
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
-        self._kernels = concurrent.futures.ThreadPoolExecutor(1, "kernels").submit(self._load_kernels)
+        self._kernels = concurrent.futures.ThreadPoolExecutor(1, "kernels").submit(
+            self._load_kernels
+        )
         wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
-        """Sets the sources of the environments' fields: rows, and the fields of the model with their meshes."""
+        """Sets the sources of the environments' fields: rows, and the fields of the model with
+        their meshes.
+        """
         self._objects, self._graph = objects, None
         for name, value in meshes.items():
             setattr(self._model, name, value)
@@ -129,7 +174,9 @@ class WarpBuffers:
         sensordata: Any,
         occupancy: Any,
     ) -> None:
-        """Steps all environments on the current stream; modifies the first three arrays and writes the last two."""
+        """Steps all environments on the current stream; modifies the first three arrays and writes
+        the last two.
+        """
         self._kernels.result()
         data = self._data
         state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
@@ -142,7 +189,9 @@ class WarpBuffers:
             wp.copy(given, mine)
 
     def repeat(self, steps: int) -> None:
-        """Repeats control steps from the last state with Warp only, and waits for them; for benchmarks."""
+        """Repeats control steps from the last state with Warp only, and waits for them; for
+        benchmarks.
+        """
         with wp.ScopedDevice(self._device):
             for _ in range(steps):
                 self._launch()
@@ -156,20 +205,37 @@ class WarpBuffers:
         with _building:
             with stage("list of the kernels"):
                 variants = self._variants()
-            with stage("kernels"), _one_builder(variants), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
-                list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
+            with (
+                stage("kernels"),
+                _one_builder(variants),
+                concurrent.futures.ThreadPoolExecutor(cores()) as threads,
+            ):
+                list(
+                    threads.map(
+                        lambda variant: wp.force_load(self._device, [variant[0]], variant[1]),
+                        variants,
+                    )
+                )
 
     def _variants(self) -> list[tuple[wp.Module, int]]:
-        """Modules with the kernels of a control step, and their block sizes, the largest modules first.
+        """Modules with the kernels of a control step, and their block sizes, the largest modules
+        first.
 
-        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and not made. It also
-        queries the occupancy of its largest kernels, each of which Warp would build for the answer.
+        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and
+        not made. It also queries the occupancy of its largest kernels, each of which Warp would
+        build for the answer.
         """
         queried, launched = list[tuple[wp.Module, int]](), [(place.module, _BLOCK)]
-        me, options, conditional = threading.get_ident(), self._model.opt, self._model.opt.graph_conditional
+        me, options, conditional = (
+            threading.get_ident(),
+            self._model.opt,
+            self._model.opt.graph_conditional,
+        )
         *launches, query = replaced = wp.launch, wp.launch_tiled, wp.get_suggested_block_size
 
-        def listed(launch: Callable[..., None], kernel: wp.Kernel, *given: Any, **named: Any) -> None:
+        def listed(
+            launch: Callable[..., None], kernel: wp.Kernel, *given: Any, **named: Any
+        ) -> None:
             if threading.get_ident() == me:
                 launched.append((kernel.module, named.get("block_dim") or _BLOCK))
             else:
@@ -181,7 +247,9 @@ class WarpBuffers:
             queried.append((kernel.module, kernel.module.options["block_dim"]))
             return 1, 1
 
-        options.graph_conditional = False  # a loop until the solver's kernels have converged would not end
+        options.graph_conditional = (
+            False  # a loop until the solver's kernels have converged would not end
+        )
         wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
         wp.get_suggested_block_size = suggested
         try:
@@ -191,7 +259,9 @@ class WarpBuffers:
             wp.launch, wp.launch_tiled, wp.get_suggested_block_size = replaced
             options.graph_conditional, options.disableflags = conditional, self._sensing
         gpu = self._device.is_cuda
-        return list(dict.fromkeys((module, size if gpu else 1) for module, size in (*queried, *launched)))
+        return list(
+            dict.fromkeys((module, size if gpu else 1) for module, size in (*queried, *launched))
+        )
 
     def _launch(self) -> None:
         """Launches the kernels of one control step."""
@@ -210,13 +280,21 @@ class WarpBuffers:
         for left in reversed(range(self._substeps)):
             model.opt.disableflags = self._blind if left else self._sensing
             mujoco_warp.step(model, data)
-            counts = [data.ncollision, data.nacon, data.nefc, data.solver_niter, model.opt.iterations, self._occupancy]
+            counts = [
+                data.ncollision,
+                data.nacon,
+                data.nefc,
+                data.solver_niter,
+                model.opt.iterations,
+                self._occupancy,
+            ]
             wp.launch(count, data.nworld, counts, device=self._device)
 
 
 @contextlib.contextmanager
 def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
-    """Context that one process of this machine enters first: the others then read from Warp's cache what it built.
+    """Context that one process of this machine enters first: the others then read from Warp's cache
+    what it built.
 
     They wait for `_PATIENCE` seconds at most, and then build, too.
     """
@@ -224,7 +302,9 @@ def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a folder without locks
             name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
-            file = stack.enter_context(pathlib.Path(str(wp.config.kernel_cache_dir), name).open("a+"))
+            file = stack.enter_context(
+                pathlib.Path(str(wp.config.kernel_cache_dir), name).open("a+")
+            )
             kind, begun, told = fcntl.LOCK_EX, time.monotonic(), False
             while (waited := time.monotonic() - begun) < _PATIENCE:
                 try:
@@ -234,7 +314,10 @@ def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
                     kind = fcntl.LOCK_SH  # together, once the first is done
                 if waited > _WORD and not told:
                     told = True
-                    _log.info("Waiting for the kernels that another process builds, at most %d s.", _PATIENCE)
+                    _log.info(
+                        "Waiting for the kernels that another process builds, at most %d s.",
+                        _PATIENCE,
+                    )
                 time.sleep(0.1)
         yield
 
@@ -250,11 +333,15 @@ def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
 
 def meshes_on(device: wp.Device, model: mujoco.MjModel) -> dict[str, Any]:
     """Transfers the mesh fields of a model to a device, by name."""
-    values: dict[str, Any] = {name: getattr(model, name) for name in ("nmesh", "npolygonmax", "nmeshdegmax")}
+    values: dict[str, Any] = {
+        name: getattr(model, name) for name in ("nmesh", "npolygonmax", "nmeshdegmax")
+    }
     for field in dataclasses.fields(mujoco_warp.Model):
         if field.name.startswith("mesh_"):
             kind: Any = field.type
-            values[field.name] = wp.array(getattr(model, field.name), dtype=kind.dtype, device=device)
+            values[field.name] = wp.array(
+                getattr(model, field.name), dtype=kind.dtype, device=device
+            )
     return values
 
 
@@ -263,13 +350,15 @@ _handles = itertools.count()
 
 
 def register(buffers: WarpBuffers) -> int:
-    """Registers the buffers; `control_step` finds them by the returned handle while they are referenced."""
+    """Registers the buffers; `control_step` finds them by the returned handle while they are
+    referenced.
+    """
     handle = next(_handles)
     _buffers[handle] = buffers
     return handle
 
 
-def _control_step(
+def _control_step(  # noqa: PLR0913
     handle: int,
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
@@ -289,7 +378,9 @@ def _control_step(
     sensordata: wp.array2d[float],
     occupancy: wp.array[int],
 ) -> None:
-    """Target of the JAX call: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
+    """Target of the JAX call: finds the buffers by their handle and steps them; arrays as in
+    `WarpPhysics.step`.
+    """
     placed = [table, force, row, mass_scale, friction, gain_scale, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
     _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
@@ -298,7 +389,8 @@ def _control_step(
 control_step = jax_callable(
     _control_step,
     num_outputs=5,
-    # `WarpBuffers` captures a separate graph: Warp's would use JAX's buffers, and be recaptured wherever those move.
+    # `WarpBuffers` captures a separate graph: Warp's would use JAX's buffers, and be recaptured
+    # wherever those move.
     graph_mode=JaxCallableGraphMode.NONE,
     vmap_method=None,
     in_out_argnames=["qpos", "qvel", "qacc_warmstart"],
@@ -327,23 +419,30 @@ _LEAST_SLOTS = 8  # mesh pieces: capacity for objects other than those of the fi
 class WarpPhysics:
     """A batch of environments in MuJoCo Warp.
 
-    The compiled calls refer to objects by row number only. A step therefore costs the same for any number of objects,
-    primitives and meshes mixed, and `replace_objects` compiles nothing: neither the number of objects nor the size of
-    their meshes is part of a program. No object may have more pieces of a kind than there are slots (`PRIMITIVE_SLOTS`,
-    `mesh_slots`).
+    The compiled calls refer to objects by row number only. A step therefore costs the same for any
+    number of objects, primitives and meshes mixed, and `replace_objects` compiles nothing: neither
+    the number of objects nor the size of their meshes is part of a program. No object may have more
+    pieces of a kind than there are slots (`PRIMITIVE_SLOTS`, `mesh_slots`).
     """
 
     name = "warp"
     compiled = True
 
-    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], mesh_slots: int | None = None):
+    def __init__(
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        objects: Sequence[GraspObject],
+        mesh_slots: int | None = None,
+    ):
         """Transfers the objects to the device.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool indexed by `ResetState.object_index`.
-          mesh_slots: most mesh pieces of an object, 0 for primitives only; by default as many as in this pool, at
+          mesh_slots: most mesh pieces of an object, 0 for primitives only; by default as many as in
+          this pool, at
             least 8.
 
         Raises:
@@ -361,7 +460,9 @@ class WarpPhysics:
         self._where = addresses(model, hand)
         self._sensors = len(hand.links) * CONTACTS_PER_LINK * SENSOR_WIDTH
         device = jax.local_devices()[0]
-        self._device = wp.get_device("cpu" if device.platform == "cpu" else f"cuda:{device.local_hardware_id}")
+        self._device = wp.get_device(
+            "cpu" if device.platform == "cpu" else f"cuda:{device.local_hardware_id}"
+        )
         self._buffers: dict[int, tuple[int, WarpBuffers]] = {}
         self._load(objects)
 
@@ -409,13 +510,16 @@ class WarpPhysics:
         state = where_environments(diverged, self._fresh(reset_state), moved)
         sensors = jnp.where(diverged[:, None], 0.0, sensors)
         occupancy = counts / buffers.limits
-        return state, physics_state(jnp, self._where, state.qpos, state.qvel, sensors, diverged, occupancy)
+        return state, physics_state(
+            jnp, self._where, state.qpos, state.qvel, sensors, diverged, occupancy
+        )
 
     def replace_objects(self, state: WarpState, objects: Sequence[GraspObject]) -> WarpState:
         """Replaces the objects for environments that restart from now on; must not be traced.
 
-        Objects of continuing episodes are kept after the new ones until the next call. Waits for the step that produced
-        `state`; no other may be in progress, and no other state is valid afterwards.
+        Objects of continuing episodes are kept after the new ones until the next call. Waits for
+        the step that produced `state`; no other may be in progress, and no other state is valid
+        afterwards.
 
         Args:
           state: current state of the environments.
@@ -435,7 +539,9 @@ class WarpPhysics:
         """Returns the current state of the environments, without contacts; see `Physics.read`."""
         batch = state.qpos.shape[0]
         none = jnp.zeros((batch, self._sensors))
-        return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3))
+        return physics_state(
+            jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3)
+        )
 
     def repeat(self, batch: int, steps: int) -> None:
         """Repeats control steps of a batch from its last state and targets; no state observes them.
@@ -463,8 +569,13 @@ class WarpPhysics:
             buffers.fill(*self._loaded)
 
     def _fresh(self, reset_state: ResetState) -> WarpState:
-        """Returns the state of environments that start now, with the types that the compiled calls expect."""
-        index, stationary = jnp.asarray(reset_state.object_index, jnp.int32), jnp.asarray(reset_state.stationary, bool)
+        """Returns the state of environments that start now, with the types that the compiled calls
+        expect.
+        """
+        index, stationary = (
+            jnp.asarray(reset_state.object_index, jnp.int32),
+            jnp.asarray(reset_state.stationary, bool),
+        )
         reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
         reset_state = reset_state._replace(object_index=index, stationary=stationary)
         model = self._catalogue.model

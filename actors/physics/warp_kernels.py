@@ -1,4 +1,6 @@
-"""Additional kernels for MuJoCo Warp: they fill the environments and measure the occupancy of their buffers."""
+"""Additional kernels for MuJoCo Warp: they fill the environments and measure the occupancy of their
+buffers.
+"""
 
 # mypy: ignore-errors
 # (Kernels are a language with Python's syntax, checked by Warp's compiler.)
@@ -27,7 +29,9 @@ class Objects:
 
 @wp.struct
 class Leaves:
-    """Fields of model and data that differ between environments (B, ...), and addresses of the object in them."""
+    """Fields of model and data that differ between environments (B, ...), and addresses of the
+    object in them.
+    """
 
     geom_size: wp.array2d[wp.vec3]
     geom_pos: wp.array2d[wp.vec3]
@@ -64,7 +68,9 @@ class Leaves:
 
 OBJECT_FIELDS = {name: field.type.dtype for name, field in Objects.vars.items()}
 """Fields of `Objects` and their element types."""
-MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_", "actuator_"))]
+MODEL_LEAVES = [
+    name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_", "actuator_"))
+]
 DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_", "xfrc_"))]
 
 
@@ -84,7 +90,7 @@ def scale_gains(leaves: Leaves, env: int, scale: float) -> None:
 
 
 @wp.kernel
-def place(
+def place(  # noqa: PLR0913
     table: wp.array[bool],
     force: wp.array[wp.vec3],
     row: wp.array[int],
@@ -100,7 +106,9 @@ def place(
     leaves: Leaves,
     occupancy: wp.array[int],
 ) -> None:
-    """Fills an environment's leaves from its object's row; one thread for each environment and slot."""
+    """Fills an environment's leaves from its object's row; one thread for each environment and
+    slot.
+    """
     env, slot = wp.tid()
     r = row[env]
     geom = leaves.geoms[slot]
@@ -130,7 +138,9 @@ def place(
     leaves.body_quat[env, leaves.base_body] = base_quaternion[env]
     leaves.mocap_pos[env, leaves.anchor] = anchor_position[env]
     leaves.mocap_quat[env, leaves.anchor] = anchor_quaternion[env]
-    leaves.mocap_pos[env, leaves.table] = wp.vec3(0.0, 0.0, wp.where(table[env], 0.0, leaves.table_away))
+    leaves.mocap_pos[env, leaves.table] = wp.vec3(
+        0.0, 0.0, wp.where(table[env], 0.0, leaves.table_away)
+    )
     leaves.eq_active[env, leaves.weld] = stationary[env]
     leaves.xfrc_applied[env, body] = wp.spatial_vector(force[env], wp.vec3(0.0, 0.0, 0.0))
     if env == 0:
@@ -148,7 +158,8 @@ def count(
     iterations: int,
     occupancy: wp.array[int],
 ) -> None:
-    """Records the most contacts of all environments and the most constraint rows of any, including dropped ones.
+    """Records the most contacts of all environments and the most constraint rows of any, including
+    dropped ones.
 
     Also counts environments whose solver reached its limit of iterations.
     """

@@ -30,8 +30,12 @@ def own_hands() -> dict[str, pathlib.Path]:
 
 
 def hands_folder() -> pathlib.Path:
-    """Folder of the user's custom hands: `CONGRASP_HANDS`, or congrasp/hands in the user's configuration."""
-    return pathlib.Path(os.environ.get(VARIABLE) or user_folder("XDG_CONFIG_HOME", ".config") / "congrasp" / "hands")
+    """Folder of the user's custom hands: `CONGRASP_HANDS`, or congrasp/hands in the user's
+    configuration.
+    """
+    return pathlib.Path(
+        os.environ.get(VARIABLE) or user_folder("XDG_CONFIG_HOME", ".config") / "congrasp" / "hands"
+    )
 
 
 def check_reference(reference: object) -> str:
@@ -47,9 +51,11 @@ def check_reference(reference: object) -> str:
 
 
 def known_hand(reference: object) -> Hand:
-    """Returns the hand named by a message or a recording: one of the package, or one whose text is included.
+    """Returns the hand named by a message or a recording: one of the package, or one whose text is
+    included.
 
-    Input from others opens no file of this machine, so that a peer can neither probe for files nor make a reader wait.
+    Input from others opens no file of this machine, so that a peer can neither probe for files nor
+    make a reader wait.
 
     Raises:
       CongraspError: it is neither, or the text does not describe a hand.
@@ -65,16 +71,19 @@ def known_hand(reference: object) -> Hand:
 def _unknown(reference: object) -> CongraspError:
     """Error for a hand that a message cannot name."""
     return CongraspError(
-        f"{ascii(reference)[:60]} is not a hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
+        f"{ascii(reference)[:60]} is not a hand that a message can name.",
+        f"It is one of: {', '.join(sorted(HANDS))}.",
     )
 
 
 @functools.lru_cache(maxsize=64)
 def get_hand(reference: str) -> Hand:
-    """Returns the hand of a reference, the same object for the same reference; see `known_hand` for untrusted input.
+    """Returns the hand of a reference, the same object for the same reference; see `known_hand` for
+    untrusted input.
 
     Args:
-      reference: the name of a hand of the package (`human:left` for its mirror image) or of one in `hands_folder`, the
+      reference: the name of a hand of the package (`human:left` for its mirror image) or of one in
+      `hands_folder`, the
         path of a hand file, or all of its text (`Hand.reference`).
 
     Raises:
@@ -96,5 +105,6 @@ def get_hand(reference: str) -> Hand:
         what = f"{reference} is a robot description, not a hand file."
         raise CongraspError(what, f"Pass the file that 'congrasp hands import {reference}' writes.")
     raise CongraspError(
-        f"There is no hand '{reference}'.", f"Choose one of: {', '.join(sorted({*HANDS, *own}))}; or name a hand file."
+        f"There is no hand '{reference}'.",
+        f"Choose one of: {', '.join(sorted({*HANDS, *own}))}; or name a hand file.",
     )

@@ -1,8 +1,10 @@
-"""Closures: a one-parameter family of finger poses from the widest pose through the open one to the fist.
+"""Closures: a one-parameter family of finger poses from the widest pose through the open one to the
+fist.
 
-A closure c in [-1, 1] is q_open + c (q_closed - q_open) if c is positive, else q_open - c (q_wide - q_open). The gap of
-a pose is the free space between the skins of the thumb's and the nearest other fingertip along the cross-finger axis.
-The outline of a hand is its extent around its centre in a few of these poses.
+A closure c in [-1, 1] is q_open + c (q_closed - q_open) if c is positive, else q_open - c (q_wide -
+q_open). The gap of a pose is the free space between the skins of the thumb's and the nearest other
+fingertip along the cross-finger axis. The outline of a hand is its extent around its centre in a
+few of these poses.
 """
 
 import functools
@@ -24,20 +26,32 @@ CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
 MARGIN = 0.03
 """Metres by which the gap of a preshaped hand exceeds the object's width."""
 WIDEST = 0.14
-"""Gap in metres, for objects of the human hand's size, beyond which no hand needs to open: 12 cm, the widest object
-that gets headings, plus a centimetre on either side."""
-_OFFSET, _TURN = 0.5, 2e-6  # weights of an offset (m^2) and of a motor's rotation (rad^2), in the unit of the gap (m^2)
+"""Gap in metres, for objects of the human hand's size, beyond which no hand needs to open: 12 cm,
+the widest object that gets headings, plus a centimetre on either side."""
+# Weights of an offset (m^2) and of a motor's rotation (rad^2), in the unit of the gap (m^2)
+_OFFSET, _TURN = (
+    0.5,
+    2e-6,
+)
 
 
 def closure_pose(hand: Hand, closure: Array) -> Array:
     """Finger angles (..., F) at closures (..., 1), or at (..., F) closures, one for each joint."""
     c = jnp.asarray(closure)
-    q_wide, q_open, q_closed = (jnp.asarray(q) for q in (wide_angles(hand), hand.q_open, hand.q_closed))
-    return q_open + jnp.maximum(c, 0.0) * (q_closed - q_open) + jnp.maximum(-c, 0.0) * (q_wide - q_open)
+    q_wide, q_open, q_closed = (
+        jnp.asarray(q) for q in (wide_angles(hand), hand.q_open, hand.q_closed)
+    )
+    return (
+        q_open
+        + jnp.maximum(c, 0.0) * (q_closed - q_open)
+        + jnp.maximum(-c, 0.0) * (q_wide - q_open)
+    )
 
 
 def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
-    """Finger angles (B, F) whose gap is `margin` wider than objects (B,), or as wide as the hand opens; m."""
+    """Finger angles (B, F) whose gap is `margin` wider than objects (B,), or as wide as the hand
+    opens; m.
+    """
     gaps = table_of_gaps(hand)
     return closure_pose(hand, jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])[..., None])
 
@@ -45,7 +59,9 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    gaps = np.asarray(kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32)), np.float64)
+    gaps = np.asarray(
+        kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32)), np.float64
+    )
     return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
 
 
@@ -63,11 +79,13 @@ def widest_gap(hand: Hand) -> float:
 
 
 def widest_pose(hand: Hand) -> dict[str, float]:
-    """Finger angles of the pose nearest to the open one that has all gaps of `WIDEST`, or the most that limits allow.
+    """Finger angles of the pose nearest to the open one that has all gaps of `WIDEST`, or the most
+    that limits allow.
 
-    It faces the object as the open pose does: the fingertips keep their offsets from the thumb's along the heading axis
-    and along the axis orthogonal to it and the cross-finger axis. L-BFGS-B, started at the open pose, minimises over
-    the motors the squared missing gaps and changed offsets, summed over the other fingers.
+    It faces the object as the open pose does: the fingertips keep their offsets from the thumb's
+    along the heading axis and along the axis orthogonal to it and the cross-finger axis. L-BFGS-B,
+    started at the open pose, minimises over the motors the squared missing gaps and changed
+    offsets, summed over the other fingers.
     """
     lower, upper = motor_limits(hand)
     start = np.asarray(motor_positions(hand, hand.q_open), float)
@@ -75,21 +93,35 @@ def widest_pose(hand: Hand) -> dict[str, float]:
 
     def cost(motors: np.ndarray) -> list[np.ndarray]:
         # The default tolerances of L-BFGS-B assume costs around one.
-        return [np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))]
+        return [
+            np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))
+        ]
 
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)).x
+    found = minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)
+    ).x
     q = np.asarray(joint_positions(hand, jnp.asarray(found, jnp.float32)))
     followers = {coupling.joint for coupling in hand.couplings}
-    return {j.name: round(float(x), 3) for j, x in zip(hand.joints, q, strict=True) if j.name not in followers}
+    return {
+        j.name: round(float(x), 3)
+        for j, x in zip(hand.joints, q, strict=True)
+        if j.name not in followers
+    }
 
 
 def _cost(hand: Hand, motors: Array) -> Array:
     """Cost () in m^2 that `widest_pose` minimises."""
     started = motor_positions(hand, jnp.asarray(hand.q_open))
-    tips, open_tips = (_tips(hand, q) for q in (joint_positions(hand, motors), jnp.asarray(hand.q_open)))
+    tips, open_tips = (
+        _tips(hand, q) for q in (joint_positions(hand, motors), jnp.asarray(hand.q_open))
+    )
     missing = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
     moved = (tips[1:] - tips[0]) - (open_tips[1:] - open_tips[0])
-    return jnp.sum(missing**2) + _OFFSET * jnp.sum(moved[:, ::2] ** 2) + _TURN * jnp.sum((motors - started) ** 2)
+    return (
+        jnp.sum(missing**2)
+        + _OFFSET * jnp.sum(moved[:, ::2] ** 2)
+        + _TURN * jnp.sum((motors - started) ** 2)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -123,7 +155,9 @@ class Outline(NamedTuple):
     radii: np.ndarray
     """(E,) m."""
     openings: np.ndarray
-    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w (`common.hands.closure`)."""
+    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w
+    (`common.hands.closure`).
+    """
 
 
 CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
@@ -153,7 +187,11 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _posed(hand: Hand, closures: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends (S, E, 3) of the hand's capsules at closures (S,), and its centres (S, 3), in the wrist frame."""
+    """Ends (S, E, 3) of the hand's capsules at closures (S,), and its centres (S, 3), in the wrist
+    frame.
+    """
     transforms = kinematics.link_transforms(hand, closure_pose(hand, closures[:, None]))
     ends = kinematics.capsules(hand, transforms)
-    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))
+    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(
+        hand, kinematics.keypoints(hand, transforms)
+    )

@@ -1,8 +1,9 @@
 """Surface of a human hand as an implicit function, and the links that its points follow.
 
-Each finger is a chain of round cones about its links' capsules, the palm a smooth union of its capsules with a wrist
-and the ball of the thumb. A finger blends with the palm, but not with another finger, so that closed fingers stay
-apart. Everything is in the wrist frame with every joint at zero, in metres.
+Each finger is a chain of round cones about its links' capsules, the palm a smooth union of its
+capsules with a wrist and the ball of the thumb. A finger blends with the palm, but not with another
+finger, so that closed fingers stay apart. Everything is in the wrist frame with every joint at
+zero, in metres.
 """
 
 from collections.abc import Sequence
@@ -69,19 +70,26 @@ def skeleton_of(hand: Hand) -> Skeleton:
 
 
 _CELL = 0.0039  # side of a cell of the grid that the surface is cut from, m
-_PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = 0.014, 0.008, 0.020  # width of the blend between parts, m
+# Width of the blend between parts, m
+_PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = (
+    0.014,
+    0.008,
+    0.020,
+)
+# Distance by which the wrist extends backwards, m; its width relative to the start of the palm
 _WRIST, _WIDTH = (
     0.040,
     1.9,
-)  # distance by which the wrist extends backwards, m; its width relative to the start of the palm
+)
 _CUT = 0.012  # rounding of the wrist's end, m
 _BALL = ((0.10, 0.75, 0.0120, 0.0105), (0.45, 0.55, 0.0090, 0.0080))
-"""The ball of the thumb and the fold between thumb and index finger: where they begin and end, as shares of the length
-of the nearest metacarpal and of the thumb's, and radii there (m)."""
-_SPREAD = 0.0035  # difference of the distances to two links over which their weights change by a factor e, m
-_SPREADING = (
-    9.0  # rotation for each metre between knuckles by which fingers are spread while their surface is made, rad/m
-)
+"""The ball of the thumb and the fold between thumb and index finger: where they begin and end, as
+shares of the length of the nearest metacarpal and of the thumb's, and radii there (m)."""
+# Difference of the distances to two links over which their weights change by a factor e, m
+_SPREAD = 0.0035
+# Rotation for each metre between knuckles by which fingers are spread while their surface is
+# made, rad/m
+_SPREADING = 9.0
 _FOLD = 0.004  # m; a point whose distances to two fingers differ by less belongs to the palm
 _INFLUENCES, _LEAST = 4, 0.01  # most links that move a point, and the smallest weight kept
 _ROUNDS = 4  # iterations of smoothing of weights over neighbours
@@ -97,7 +105,9 @@ class Cone(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """V points of a closed surface with unit normals, F triangles that wind outwards, and weights of L links."""
+    """V points of a closed surface with unit normals, F triangles that wind outwards, and weights
+    of L links.
+    """
 
     points: np.ndarray
     """(V, 3) m."""
@@ -113,14 +123,21 @@ def flesh(skeleton: Skeleton) -> Surface:
     """Returns the surface of a human hand whose links' capsules are phalanges and metacarpals."""
     palm, together = _palm(skeleton), _fingers(skeleton)
     turns = _spread(together)
-    fingers = [[_turned(cone, turn) for cone in finger] for finger, turn in zip(together, turns, strict=True)]
+    fingers = [
+        [_turned(cone, turn) for cone in finger]
+        for finger, turn in zip(together, turns, strict=True)
+    ]
     low, high = _bounds([*palm, *(cone for finger in fingers for cone in finger)])
     axes = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    cells, faces = surface_net(_distance(grid.reshape(-1, 3), palm, fingers).reshape(grid.shape[:3]))
+    cells, faces = surface_net(
+        _distance(grid.reshape(-1, 3), palm, fingers).reshape(grid.shape[:3])
+    )
     points = low + _CELL * cells
     for _ in range(3):  # from the centre of a cell to the surface
-        points = points - _distance(points, palm, fingers)[:, None] * _gradient(points, palm, fingers)
+        points = points - _distance(points, palm, fingers)[:, None] * _gradient(
+            points, palm, fingers
+        )
     normals = _gradient(points, palm, fingers)
     weights = _weights(len(skeleton.names), points, faces, palm, fingers)
     for finger, (anchor, turn) in zip(fingers, turns, strict=True):  # undoes the spread
@@ -131,9 +148,13 @@ def flesh(skeleton: Skeleton) -> Surface:
 
 
 def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Point (3,) and rotation (3, 3) that separate each finger from its neighbours by at least a cell of the grid."""
+    """Point (3,) and rotation (3, 3) that separate each finger from its neighbours by at least a
+    cell of the grid.
+    """
     others = fingers[1:]
-    roots, tips = (np.array(ends) for ends in zip(*((f[0].start, f[-1].end) for f in others), strict=True))
+    roots, tips = (
+        np.array(ends) for ends in zip(*((f[0].start, f[-1].end) for f in others), strict=True)
+    )
     across = np.linalg.svd(roots - roots.mean(0))[2][0]
     up = np.cross(across, (tips - roots).mean(0))
     turns = [(fingers[0][0].start, np.eye(3))]
@@ -159,7 +180,9 @@ def _fingers(skeleton: Skeleton) -> list[list[Cone]]:
         radii = skeleton.radii[first]
         joints = [radii[0], *((radii[1:] + radii[:-1]) / 2), radii[-1]]
         cones = zip(skeleton.capsules[first], joints[:-1], joints[1:], chain, strict=True)
-        fingers.append([Cone(start, end, (float(a), float(b)), (link,)) for (start, end), a, b, link in cones])
+        fingers.append(
+            [Cone(start, end, (float(a), float(b)), (link,)) for (start, end), a, b, link in cones]
+        )
     return fingers
 
 
@@ -172,7 +195,9 @@ def _palm(skeleton: Skeleton) -> list[Cone]:
     palm = []
     for (start, end), radius, wide, last in zip(metacarpals, radii, centres, widest, strict=True):
         palm.append(Cone(start, end, (radius, radius), (0,)))
-        palm.append(Cone(wide - 0.2 * _WRIST * back, wide + _WRIST * back, (1.1 * radius, last), (0,)))
+        palm.append(
+            Cone(wide - 0.2 * _WRIST * back, wide + _WRIST * back, (1.1 * radius, last), (0,))
+        )
     start, end = min(metacarpals, key=lambda ends: float(np.linalg.norm(ends.mean(0) - thumb[1])))
     for near, far, first, last in _BALL:
         along = start + near * (end - start), thumb[0] + far * (thumb[1] - thumb[0])
@@ -181,12 +206,18 @@ def _palm(skeleton: Skeleton) -> list[Cone]:
 
 
 def wrist_circles(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (n, 3) and radii (n,) of circles that a wrist's end is about, and the unit direction (3,) to its back."""
+    """Centres (n, 3) and radii (n,) of circles that a wrist's end is about, and the unit direction
+    (3,) to its back.
+    """
     mine = skeleton.capsule_link == 0
     starts = skeleton.capsules[mine, 0]
     root = starts.mean(0)
     knuckles = [_of_link(skeleton, chain[0])[0] for chain in skeleton.chains()[1:]]
-    return root + _WIDTH * (starts - root), 1.3 * skeleton.radii[mine], _unit(root - np.mean(knuckles, 0))
+    return (
+        root + _WIDTH * (starts - root),
+        1.3 * skeleton.radii[mine],
+        _unit(root - np.mean(knuckles, 0)),
+    )
 
 
 def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:
@@ -196,7 +227,9 @@ def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:
 
 def _bounds(cones: Sequence[Cone]) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box around cones, with a margin for blending."""
-    reach = np.array([max(cone.radii) for cone in cones for _ in range(2)])[:, None] + 2 * _CELL + 0.004
+    reach = (
+        np.array([max(cone.radii) for cone in cones for _ in range(2)])[:, None] + 2 * _CELL + 0.004
+    )
     ends = np.array([end for cone in cones for end in (cone.start, cone.end)])
     return (ends - reach).min(0), (ends + reach).max(0)
 
@@ -206,21 +239,28 @@ def _to(points: np.ndarray, cone: Cone) -> np.ndarray:
     along = cone.end - cone.start
     share = np.clip((points - cone.start) @ along / (along @ along), 0, 1)
     first, last = cone.radii
-    return np.linalg.norm(points - cone.start - share[:, None] * along, axis=-1) - (first + share * (last - first))
+    return np.linalg.norm(points - cone.start - share[:, None] * along, axis=-1) - (
+        first + share * (last - first)
+    )
 
 
 def _blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Smaller of two distances, rounded where they differ by less than a width (polynomial smooth minimum)."""
+    """Smaller of two distances, rounded where they differ by less than a width (polynomial smooth
+    minimum).
+    """
     share = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
     return b + share * (a - b) - width * share * (1 - share)
 
 
-def _distance(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]) -> np.ndarray:
+def _distance(
+    points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]
+) -> np.ndarray:
     """Approximate signed distances (n,) of points (n, 3) to the hand."""
     body = _to(points, palm[0])
     for cone in palm[1:]:
         body = _blend(body, _to(points, cone), _PALM_BLEND)
-    beyond = (points - palm[1].end) @ _unit(palm[1].end - palm[1].start)  # palm[1] belongs to the wrist
+    # Palm[1] belongs to the wrist
+    beyond = (points - palm[1].end) @ _unit(palm[1].end - palm[1].start)
     body = -_blend(-body, -beyond, _CUT)  # the wrist ends flat
     found = body
     for i, finger in enumerate(fingers):
@@ -234,7 +274,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _gradient(points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]) -> np.ndarray:
+def _gradient(
+    points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]
+) -> np.ndarray:
     """Unit gradients (n, 3) of the distances."""
     step = 2e-4
     moved = (points[:, None] + step * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
@@ -250,11 +292,14 @@ def surface_net(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
       values: negative inside; positive at the border of the grid.
 
     Returns:
-      Points (V, 3) in units of cells, one in each cell that the surface crosses, at the mean of its crossings; and
-      triangles (F, 3) with outward normals.
+      Points (V, 3) in units of cells, one in each cell that the surface crosses, at the mean of its
+      crossings; and triangles (F, 3) with outward normals.
     """
     inside = values < 0
-    sums, counts = np.zeros((*np.subtract(values.shape, 1), 3)), np.zeros(np.subtract(values.shape, 1), int)
+    sums, counts = (
+        np.zeros((*np.subtract(values.shape, 1), 3)),
+        np.zeros(np.subtract(values.shape, 1), int),
+    )
     quads = []
     number = np.arange(counts.size).reshape(counts.shape)
     for axis in range(3):
@@ -280,13 +325,21 @@ def surface_net(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weights(
-    links: int, points: np.ndarray, faces: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]
+    links: int,
+    points: np.ndarray,
+    faces: np.ndarray,
+    palm: Sequence[Cone],
+    fingers: Sequence[Sequence[Cone]],
 ) -> np.ndarray:
-    """Weights (V, L) by the distances to the links' cones, smoothed; among fingers only the nearest counts."""
+    """Weights (V, L) by the distances to the links' cones, smoothed; among fingers only the nearest
+    counts.
+    """
     far = np.full((len(points), links), np.inf)
     palm = [*palm, fingers[0][0]]  # the thumb's metacarpal belongs to the palm
     fingers = [fingers[0][1:], *fingers[1:]]
-    distances = np.stack([np.min([_to(points, cone) for cone in finger], 0) for finger in fingers], 1)
+    distances = np.stack(
+        [np.min([_to(points, cone) for cone in finger], 0) for finger in fingers], 1
+    )
     nearest, (first, second) = distances.argmin(1), np.sort(distances, 1).T[:2]
     for cone in palm:
         for link in cone.links:
@@ -302,8 +355,12 @@ def _weights(
     weights[:, 0] = 1 - weights[:, 1:].sum(1)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.concatenate([edges, edges[:, ::-1]]).T
-    around = sparse.csr_array((np.ones(pairs.shape[1]), (pairs[0], pairs[1])), (len(points), len(points)))
-    others = [(nearest != i, [cone.links[0] for cone in finger]) for i, finger in enumerate(fingers)]
+    around = sparse.csr_array(
+        (np.ones(pairs.shape[1]), (pairs[0], pairs[1])), (len(points), len(points))
+    )
+    others = [
+        (nearest != i, [cone.links[0] for cone in finger]) for i, finger in enumerate(fingers)
+    ]
     for _ in range(_ROUNDS):
         weights = 0.5 * weights + 0.5 * (around @ weights) / around.sum(1)[:, None]
         for beyond, theirs in others:

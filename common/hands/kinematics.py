@@ -1,7 +1,7 @@
 """Forward kinematics by the product of exponentials, the grasp frame and the hand centre.
 
-Everything is in the wrist frame. A link's frame at zero has the wrist frame's orientation and its origin at
-`common.hands.spec.link_origin`.
+Everything is in the wrist frame. A link's frame at zero has the wrist frame's orientation and its
+origin at `common.hands.spec.link_origin`.
 """
 
 import concurrent.futures
@@ -21,7 +21,9 @@ T = TypeVar("T")
 
 
 class _Chain(NamedTuple):
-    """Joints grouped by depth: `levels[d]` holds joint indices whose parents (-1: the palm) are one level up."""
+    """Joints grouped by depth: `levels[d]` holds joint indices whose parents (-1: the palm) are one
+    level up.
+    """
 
     levels: tuple[tuple[int, ...], ...]
     parents: tuple[int, ...]
@@ -29,7 +31,9 @@ class _Chain(NamedTuple):
 
 
 class GraspFrame(NamedTuple):
-    """Local grasp coordinates of the hand in the wrist frame, from the open pose (paper, section Hand Modeling)."""
+    """Local grasp coordinates of the hand in the wrist frame, from the open pose (paper, section
+    Hand Modeling).
+    """
 
     heading: np.ndarray
     """(3,) v, unit: forward from the middle of the opening, orthogonal to w."""
@@ -55,12 +59,15 @@ def _chain(hand: Hand) -> _Chain:
             depth.append(depth[tail] + 1 if tail >= 0 else 0)
             tail = len(parents) - 1
         last.append(tail)
-    levels = tuple(tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1))
+    levels = tuple(
+        tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1)
+    )
     return _Chain(levels, tuple(parents), tuple(last))
 
 
 def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
-    """Motion of every link from the zero pose: x = rotation @ x0 + translation for points x0 of the zero pose.
+    """Motion of every link from the zero pose: x = rotation @ x0 + translation for points x0 of the
+    zero pose.
 
     Args:
       hand: the hand.
@@ -95,12 +102,16 @@ def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     """Link origins and fingertips (..., P, 3), from `link_transforms`."""
     rotation, translation = transforms
     carrier = hand.keypoint_links
-    points = rotations.apply(rotation[..., carrier, :, :], jnp.array(hand.keypoints)[:, None])[..., 0, :]
+    points = rotations.apply(rotation[..., carrier, :, :], jnp.array(hand.keypoints)[:, None])[
+        ..., 0, :
+    ]
     return points + translation[..., carrier, :]
 
 
 def capsules(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """End points (..., C, 2, 3) of the hand's capsules, from `link_transforms`; see `Hand.capsule_radii`."""
+    """End points (..., C, 2, 3) of the hand's capsules, from `link_transforms`; see
+    `Hand.capsule_radii`.
+    """
     rotation, translation = transforms
     ends = jnp.asarray(hand.capsules)
     turned = rotations.apply(rotation[..., hand.capsule_links, :, :], ends)
@@ -111,7 +122,10 @@ def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
     """Origins (..., L, 3) and orientations (..., L, 4) of the links' frames."""
     rotation, translation = link_transforms(hand, q)
     origins = jnp.array([link_origin(link) for link in hand.links])
-    return (rotations.apply(rotation, origins[:, None])[..., 0, :] + translation, rotations.from_matrix(rotation))
+    return (
+        rotations.apply(rotation, origins[:, None])[..., 0, :] + translation,
+        rotations.from_matrix(rotation),
+    )
 
 
 def hand_center(hand: Hand, points: Array) -> Array:
@@ -132,14 +146,20 @@ def _points(hand: Hand, q: Array) -> Array:
 
 
 def untraced(function: Callable[..., T], *arguments: Any) -> T:
-    """The result of a function; inside a trace, it has numbers, and is not compiled operation by operation."""
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:  # in another thread nothing is being traced
+    """The result of a function; inside a trace, it has numbers, and is not compiled operation by
+    operation.
+    """
+    with concurrent.futures.ThreadPoolExecutor(
+        1
+    ) as thread:  # in another thread nothing is being traced
         return thread.submit(function, *arguments).result()
 
 
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
-    """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
+    """The grasp frame of the open hand; v is the direction from the wrist to the centre, made
+    orthogonal to w.
+    """
     points = np.asarray(untraced(_points, hand, np.array(hand.q_open, np.float32)))
     tips = points[len(hand.links) :]
     center = 0.5 * (tips[0] + tips[1:].mean(0))

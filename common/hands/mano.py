@@ -1,8 +1,8 @@
 """The MANO right hand: 20 anatomical joints on the skeleton of the user's copy of `MANO_RIGHT.pkl`.
 
-MANO may not be redistributed, so no part of it is in this package: this hand always needs the file (from
-mano.is.tue.mpg.de, after registration). Wrist frame: that of MANO, with the wrist joint as origin; fingers towards -x,
-back of the hand +y, thumb side +z.
+MANO may not be redistributed, so no part of it is in this package: this hand always needs the file
+(from mano.is.tue.mpg.de, after registration). Wrist frame: that of MANO, with the wrist joint as
+origin; fingers towards -x, back of the hand +y, thumb side +z.
 """
 
 import dataclasses
@@ -46,7 +46,12 @@ _MASSES = {
     "little": (0.0043, 0.0028, 0.0016),
 }
 _LIMITS = {"mcp_abduction": (-20, 20), "mcp_flexion": (-20, 90), "pip": (0, 105), "dip": (-5, 85)}
-_THUMB_LIMITS = {"cmc_abduction": (-15, 50), "cmc_flexion": (-20, 50), "mp_flexion": (-10, 75), "ip_flexion": (-15, 85)}
+_THUMB_LIMITS = {
+    "cmc_abduction": (-15, 50),
+    "cmc_flexion": (-20, 50),
+    "mp_flexion": (-10, 75),
+    "ip_flexion": (-15, 85),
+}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,19 +70,25 @@ class ManoModel:
     """(45, 45) principal components of the finger joints' axis-angles, one per row."""
 
     def skeleton(self, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Returns joints (16, 3), the wrist and then three for each of `MANO_FINGERS`, and the five fingertips (5, 3).
+        """Returns joints (16, 3), the wrist and then three for each of `MANO_FINGERS`, and the five
+        fingertips (5, 3).
 
         Args:
           betas: (up to 10,) shape parameters; None is the mean shape.
         """
         vertices = self.vertices
         if betas is not None:
-            vertices = vertices + self.shape_directions[..., : len(betas)] @ np.asarray(betas, float)
-        return self.regressor @ vertices, vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]]
+            vertices = vertices + self.shape_directions[..., : len(betas)] @ np.asarray(
+                betas, float
+            )
+        return self.regressor @ vertices, vertices[
+            [TIP_VERTICES[finger] for finger in MANO_FINGERS]
+        ]
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
-    """Reads a MANO file: the pickle of mano.is.tue.mpg.de, one with other kinds of its arrays, or an NPZ file of them.
+    """Reads a MANO file: the pickle of mano.is.tue.mpg.de, one with other kinds of its arrays, or
+    an NPZ file of them.
 
     Raises:
       CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
@@ -90,7 +101,12 @@ def read_mano(path: pathlib.Path) -> ManoModel:
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)
-        if array is None or array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
+        if (
+            array is None
+            or array.dtype.kind not in "iuf"
+            or array.shape != shape
+            or not np.isfinite(array).all()
+        ):
             raise CongraspError(f"{path} has no array '{name}' {shape} of finite numbers.", _REMEDY)
         arrays.append(array.astype(float))
     model = ManoModel(*arrays)
@@ -101,10 +117,12 @@ def read_mano(path: pathlib.Path) -> ManoModel:
 
 
 def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
-    """Anatomical axes (15, 3, 3) of the finger joints at zero: rows are twist, spread and bend, unit and orthogonal.
+    """Anatomical axes (15, 3, 3) of the finger joints at zero: rows are twist, spread and bend,
+    unit and orthogonal.
 
-    The twist points from the child to the joint, along the bone that the joint moves. The bend is orthogonal to it and
-    to the back of the hand, and flexes with positive angles; positive spread is towards the thumb.
+    The twist points from the child to the joint, along the bone that the joint moves. The bend is
+    orthogonal to it and to the back of the hand, and flexes with positive angles; positive spread
+    is towards the thumb.
 
     Args:
       joints: (16, 3) from `ManoModel.skeleton`.
@@ -141,12 +159,20 @@ def mano_hand(model: ManoModel) -> Hand:
                 lower=float(np.radians(limits[name][0])),
                 upper=float(np.radians(limits[name][1])),
             )
-            for name, bone, axis in zip(limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True)
+            for name, bone, axis in zip(
+                limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True
+            )
         ]
-        names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+        names = (
+            ("metacarpal", "proximal", "distal")
+            if finger == "thumb"
+            else ("proximal", "middle", "distal")
+        )
         weights = (2.0, 2.0, 6.0) if finger == "thumb" else (1.0, 1.0, 3.0)
         groups = [(moved[0], moved[1]), (moved[2],), (moved[3],)]
-        links += chain([f"{finger}_{name}" for name in names], groups, points, radii, _MASSES[finger], weights)
+        links += chain(
+            [f"{finger}_{name}" for name in names], groups, points, radii, _MASSES[finger], weights
+        )
         if finger != "thumb":
             palm.append(Capsule(vector(0.2 * anchors[i, 0]), points[0], 0.0100))
     return Hand(
@@ -171,7 +197,8 @@ def mano_hand(model: ManoModel) -> Hand:
 
 
 def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
-    """Returns the user's MANO model from `path` or the environment variable `CONGRASP_MANO`; None if neither is set.
+    """Returns the user's MANO model from `path` or the environment variable `CONGRASP_MANO`; None
+    if neither is set.
 
     Raises:
       CongraspError: see `read_mano`.
@@ -189,7 +216,8 @@ def own_mano_hand() -> Hand:
     model = own_mano_model()
     if model is None:
         raise CongraspError(
-            "The hand 'mano' needs your copy of MANO_RIGHT.pkl, which this package may not contain.",
+            "The hand 'mano' needs your copy of MANO_RIGHT.pkl, which this package may not "
+            "contain.",
             f"Get it from mano.is.tue.mpg.de and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
         )
     return mano_hand(model)
@@ -197,7 +225,11 @@ def own_mano_hand() -> Hand:
 
 def _each(**angles: float) -> dict[str, float]:
     """Returns the same angles for the joints of the four fingers."""
-    return {f"{finger}_{name}": x for finger in ("index", "middle", "ring", "little") for name, x in angles.items()}
+    return {
+        f"{finger}_{name}": x
+        for finger in ("index", "middle", "ring", "little")
+        for name, x in angles.items()
+    }
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Visual meshes of a hand: one for each link, stored next to the hand's file.
 
-Physics and policies use the capsules only. The meshes are for pictures, exports and measurements of penetration.
+Physics and policies use the capsules only. The meshes are for pictures, exports and measurements of
+penetration.
 """
 
 import io
@@ -21,7 +22,9 @@ MAX_FACES = 3000
 MAX_BYTES = 16 << 20
 """Largest total size of all meshes in bytes."""
 MAX_DISTANCE = 2.0
-"""Greatest distance of a mesh's coordinates from the wrist's origin, m; a larger one means a file in another unit."""
+"""Greatest distance of a mesh's coordinates from the wrist's origin, m; a larger one means a file
+in another unit.
+"""
 PARTS = ("vertices", "faces")
 _REMEDY = "Run 'congrasp hands import' again, or delete the file."
 
@@ -47,25 +50,37 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
     found = {}
     for name in dict.fromkeys(key.rpartition("/")[0] for key in arrays):
         vertices, faces = (arrays.get(f"{name}/{part}", np.zeros(0)) for part in PARTS)
-        fits = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3 and faces.size
-        fits = fits and vertices.dtype.kind == "f" and faces.dtype.kind == "i" and np.isfinite(vertices).all()
+        fits = (
+            vertices.ndim == faces.ndim == 2
+            and vertices.shape[1] == faces.shape[1] == 3
+            and faces.size
+        )
+        fits = (
+            fits
+            and vertices.dtype.kind == "f"
+            and faces.dtype.kind == "i"
+            and np.isfinite(vertices).all()
+        )
         if not fits or faces.min() < 0 or faces.max() >= len(vertices) or len(faces) > MAX_FACES:
             raise CongraspError(f"{file} holds no mesh of '{name[:60]}'.", _REMEDY)
         if (farthest := np.abs(vertices).max()) > MAX_DISTANCE:
             raise CongraspError(
-                f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist, more than {MAX_DISTANCE:g} m.",
+                f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist, more than "
+                f"{MAX_DISTANCE:g} m.",
                 f"Check the file's unit. {_REMEDY}",
             )
         found[name] = vertices, faces
     if odd := sorted({*found} - {link.name for link in hand.links}):
         raise CongraspError(
-            f"{file} does not belong to the hand '{hand.name}', which has no link '{odd[0][:60]}'.", _REMEDY
+            f"{file} does not belong to the hand '{hand.name}', which has no link '{odd[0][:60]}'.",
+            _REMEDY,
         )
     return found
 
 
 def own_meshes(hand: Hand) -> Meshes:
-    """Loads the meshes of a custom hand; returns none for any other hand, and for one changed since its import.
+    """Loads the meshes of a custom hand; returns none for any other hand, and for one changed since
+    its import.
 
     Raises:
       CongraspError: see `load_meshes`.
@@ -85,7 +100,9 @@ def save_meshes(path: pathlib.Path, meshes: Meshes) -> None:
     if not meshes:
         beside(path).unlink(missing_ok=True)
         return
-    parts = [(name, *part) for name, mesh in meshes.items() for part in zip(PARTS, mesh, strict=True)]
+    parts = [
+        (name, *part) for name, mesh in meshes.items() for part in zip(PARTS, mesh, strict=True)
+    ]
     arrays: dict[str, Any] = {f"{name}/{part}": array for name, part, array in parts}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)

@@ -27,13 +27,14 @@ def add_hand(
 ) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
-    The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link; their origin is the
-    initial wrist pose, so that all six start at zero. The actuators are those of the wrist's joints, then the motors.
-    Gravity on the hand is compensated, because the wrist is a virtual mount.
+    The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link;
+    their origin is the initial wrist pose, so that all six start at zero. The actuators are those
+    of the wrist's joints, then the motors. Gravity on the hand is compensated, because the wrist is
+    a virtual mount.
 
-    With `self_collision`, links collide without friction, except neighbours and `overlapping` pairs. All contacts of
-    the hand have the time constant `contact_time` in seconds. Contacts of fingertips have the torsional friction
-    `torsional_friction` in metres.
+    With `self_collision`, links collide without friction, except neighbours and `overlapping`
+    pairs. All contacts of the hand have the time constant `contact_time` in seconds. Contacts of
+    fingertips have the torsional friction `torsional_friction` in metres.
     """
     base = spec.worldbody.add_body(name="hand_base")
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -58,7 +59,14 @@ def add_hand(
                 damping=joint.damping,
                 armature=joint.armature,
             )
-        _add_shapes(body, link, origin, self_collision, contact_time, torsional_friction if link.tip else 0.0)
+        _add_shapes(
+            body,
+            link,
+            origin,
+            self_collision,
+            contact_time,
+            torsional_friction if link.tip else 0.0,
+        )
     _add_transmission(spec, hand)
     if self_collision:
         for first, second in overlapping(hand):
@@ -87,7 +95,9 @@ def posed(hand: Hand, q: np.ndarray) -> mujoco.MjData:
 
 
 def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame, at finger angles (F,) rad."""
+    """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame, at finger
+    angles (F,) rad.
+    """
     data = posed(hand, q)
     bodies = [data.body(link.name).id for link in hand.links]
     return data.xpos[bodies], data.xquat[bodies]
@@ -97,7 +107,8 @@ def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
     """Pairs of links whose shapes overlap in the open pose or at zero; their contacts are excluded.
 
-    They represent housings that nest at the knuckles. Pairs that touch only in a fist are not included.
+    They represent housings that nest at the knuckles. Pairs that touch only in a fist are not
+    included.
     """
     spec = mujoco.MjSpec()
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -169,16 +180,27 @@ def _add_position_actuator(
 ) -> None:
     """Adds a position servo for the joint or tendon of this name, with this force limit."""
     actuator = spec.add_actuator(
-        name=name, target=name, trntype=kind, forcerange=(-limit, limit), forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE
+        name=name,
+        target=name,
+        trntype=kind,
+        forcerange=(-limit, limit),
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
     )
     actuator.set_to_position(kp, kv=kv)
 
 
 def _add_shapes(
-    body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float, torsion: float
+    body: mujoco.MjsBody,
+    link: Link,
+    origin: np.ndarray,
+    self_collision: bool,
+    contact_time: float,
+    torsion: float,
 ) -> None:
     """Adds a link's solids, or its capsules if it has none; they share its mass by volume."""
-    found = [_solid(solid, origin) for solid in link.solids] or [_capsule(x, origin) for x in link.capsules]
+    found = [_solid(solid, origin) for solid in link.solids] or [
+        _capsule(x, origin) for x in link.capsules
+    ]
     volumes = np.array([volume for _, volume in found])
     for i, ((fields, _), share) in enumerate(zip(found, volumes / volumes.sum(), strict=True)):
         body.add_geom(
@@ -187,10 +209,17 @@ def _add_shapes(
             mass=link.mass * share,
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
-            condim=4 if torsion else 1,  # the greater of the two decides: 1 between links, 3 against the object
+            condim=4
+            if torsion
+            else 1,  # the greater of the two decides: 1 between links, 3 against the object
             solref=(contact_time, 1.0),
             solmix=1000.0,  # against 1 of other geoms, so that it decides
-            friction=(0.1, torsion, 0.0),  # MuJoCo uses the greater of two: the object's sliding friction decides
+            # MuJoCo uses the greater of two: the object's sliding friction decides
+            friction=(
+                0.1,
+                torsion,
+                0.0,
+            ),
         )
 
 
@@ -198,7 +227,11 @@ def _capsule(capsule: Capsule, origin: np.ndarray) -> tuple[dict[str, Any], floa
     """Returns the geom of a capsule in a frame at `origin` (3,), and its volume over pi in m^3."""
     ends = np.concatenate([np.subtract(capsule.start, origin), np.subtract(capsule.end, origin)])
     length = np.linalg.norm(np.subtract(capsule.end, capsule.start)) + 4 / 3 * capsule.radius
-    fields = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "fromto": ends, "size": (capsule.radius, 0.0, 0.0)}
+    fields = {
+        "type": mujoco.mjtGeom.mjGEOM_CAPSULE,
+        "fromto": ends,
+        "size": (capsule.radius, 0.0, 0.0),
+    }
     return fields, float(length * capsule.radius**2)
 
 

@@ -1,8 +1,9 @@
 """Motors and the joints they move, for underactuated hands: coupled and tendon-driven ones.
 
-A policy commands motors; the task observes joints. The position of a motor is the sum of its joints' angles times their
-coefficients. Contact decides how the joints of a tendon share a motion; where targets need one angle for each, they are
-assumed to move together from limit to limit. For a hand with a motor for every joint all of this is the identity.
+A policy commands motors; the task observes joints. The position of a motor is the sum of its
+joints' angles times their coefficients. Contact decides how the joints of a tendon share a motion;
+where targets need one angle for each, they are assumed to move together from limit to limit. For a
+hand with a motor for every joint all of this is the identity.
 
 Arrays are NumPy's or JAX's.
 """
@@ -31,7 +32,9 @@ class _Transmission(NamedTuple):
     rest: np.ndarray
     """(F,) angle of a joint where its motor is at zero."""
     limits: np.ndarray
-    """(2, M) lowest and highest position of each motor with all of its joints within their limits."""
+    """(2, M) lowest and highest position of each motor with all of its joints within their
+    limits.
+    """
 
 
 @functools.lru_cache(maxsize=64)
@@ -39,14 +42,23 @@ def transmission(hand: Hand) -> _Transmission:
     """The hand's motors and joints, as arrays."""
     index = {joint.name: j for j, joint in enumerate(hand.joints)}
     most = max(len(motor.joints) for motor in hand.motors)
-    pulled, coefficients = np.zeros((len(hand.motors), most), int), np.zeros((len(hand.motors), most))
+    pulled, coefficients = (
+        np.zeros((len(hand.motors), most), int),
+        np.zeros((len(hand.motors), most)),
+    )
     owner, ratio, rest = np.zeros(len(index), int), np.ones(len(index)), np.zeros(len(index))
     for m, motor in enumerate(hand.motors):
-        joints, c = np.array([index[name] for name in motor.joints]), np.array([*motor.joints.values()])
+        joints, c = (
+            np.array([index[name] for name in motor.joints]),
+            np.array([*motor.joints.values()]),
+        )
         pulled[m, : len(c)], coefficients[m, : len(c)] = joints, c
         owner[joints] = m
         if len(c) > 1:
-            lower, upper = (np.array([getattr(hand.joints[j], side) for j in joints]) for side in ("lower", "upper"))
+            lower, upper = (
+                np.array([getattr(hand.joints[j], side) for j in joints])
+                for side in ("lower", "upper")
+            )
             start, end = np.where(c > 0, (lower, upper), (upper, lower))
             ratio[joints] = (end - start) / (c @ (end - start))
             rest[joints] = start - ratio[joints] * (c @ start)
@@ -76,7 +88,9 @@ def motor_positions(hand: Hand, q: Array) -> Array:
 
 
 def joint_positions(hand: Hand, motors: Array) -> Array:
-    """Joint angles (..., F) for positions (..., M) of the motors, rad; joints of a tendon move together."""
+    """Joint angles (..., F) for positions (..., M) of the motors, rad; joints of a tendon move
+    together.
+    """
     if len(hand.motors) == len(hand.joints):
         return motors
     own = transmission(hand)
@@ -93,10 +107,18 @@ def coupled(hand: Hand, q: Array) -> Array:
     if not hand.couplings:
         return q
     names = [joint.name for joint in hand.joints]
-    leader, ratio, offset = np.arange(len(names)), np.ones(len(names), np.float32), np.zeros(len(names), np.float32)
+    leader, ratio, offset = (
+        np.arange(len(names)),
+        np.ones(len(names), np.float32),
+        np.zeros(len(names), np.float32),
+    )
     for coupling in hand.couplings:
         j = names.index(coupling.joint)
-        leader[j], ratio[j], offset[j] = names.index(coupling.leader), coupling.ratio, coupling.offset
+        leader[j], ratio[j], offset[j] = (
+            names.index(coupling.leader),
+            coupling.ratio,
+            coupling.offset,
+        )
     return ratio * q[..., leader] + offset
 
 
@@ -109,20 +131,22 @@ _SCALES = 0.3, 3.0
 def fitting_scale(opening: float) -> float:
     """Returns the factor on object lengths for a hand with this opening (m), to one decimal.
 
-    s = (opening / human opening)^0.6. The exponent is that of the paper's two factors: an opening 1.75 times the human
-    hand's gives Allegro's 1.4, one of 1.16 times Sharpa's 1.1. It is below one because the mass of an object grows with
-    the cube of its lengths.
+    s = (opening / human opening)^0.6. The exponent is that of the paper's two factors: an opening
+    1.75 times the human hand's gives Allegro's 1.4, one of 1.16 times Sharpa's 1.1. It is below one
+    because the mass of an object grows with the cube of its lengths.
     """
     return round(float(np.clip((opening / HUMAN_OPENING) ** _EXPONENT, *_SCALES)), 1)
 
 
 @functools.cache
 def tip_forces(hand: Hand) -> np.ndarray:
-    """Greatest forces (G,) in N with which the fingertips can press, thumb first, with straight fingers.
+    """Greatest forces (G,) in N with which the fingertips can press, thumb first, with straight
+    fingers.
 
-    The force of a finger is the minimum over its motors of torque limit / |dx/dm|, where |dx/dm| is the displacement of
-    the tip per radian of the motor, including all joints that it moves. For a motor of one joint it is the distance of
-    the joint's axis from the tip. The tip can bear this force in any direction.
+    The force of a finger is the minimum over its motors of torque limit / |dx/dm|, where |dx/dm| is
+    the displacement of the tip per radian of the motor, including all joints that it moves. For a
+    motor of one joint it is the distance of the joint's axis from the tip. The tip can bear this
+    force in any direction.
     """
     return np.array([_force(hand, hand.links[i]) for i in hand.tip_links])
 
@@ -138,4 +162,7 @@ def _force(hand: Hand, link: Link) -> float:
         j = index[joint.name]
         way = own.ratio[j] * np.cross(joint.axis, np.subtract(link.tip, joint.anchor))
         ways[int(own.motor[j])] = ways.get(int(own.motor[j]), np.zeros(3)) + way
-    return min(hand.motors[m].torque_limit / max(float(np.linalg.norm(way)), 1e-6) for m, way in ways.items())
+    return min(
+        hand.motors[m].torque_limit / max(float(np.linalg.norm(way)), 1e-6)
+        for m, way in ways.items()
+    )

@@ -1,6 +1,7 @@
 """Surface of any hand: flesh for human hands; the file's meshes or bevelled housings for robots.
 
-A surface is computed once, with every joint at zero, and moved with the links by linear blend skinning.
+A surface is computed once, with every joint at zero, and moved with the links by linear blend
+skinning.
 """
 
 import functools
@@ -17,17 +18,26 @@ from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.spec import Hand, Link, link_origin, right_name
 
 _AROUND = 28  # points of a ring
-_NAIL = ((0.2, 0.0005), (0.55, 0.0005), (0.9, 0.0004), (1.0, 0.0001), (0.9, -0.0012), (0.2, -0.0012))
+_NAIL = (
+    (0.2, 0.0005),
+    (0.55, 0.0005),
+    (0.9, 0.0004),
+    (1.0, 0.0001),
+    (0.9, -0.0012),
+    (0.2, -0.0012),
+)
 """Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
 _NAIL_WIDTH, _NAIL_LENGTH, _NAIL_BACK = 0.90, 0.85, 0.30
-"""Half width of a nail, rad about the finger; its half length, and its distance behind the centre of the fingertip, in
-radii of the tip."""
+"""Half width of a nail, rad about the finger; its half length, and its distance behind the centre
+of the fingertip, in radii of the tip."""
 _SQUARE = 0.65  # exponent of the nail's outline; 1 is an ellipse
 _SLEEVE = (
     *((0.026, -0.004), (0.0245, 0.0008), (0.0245, 0.0030), (0.0265, 0.0042), (0.034, 0.0044)),
     *((0.036, 0.0034), (0.060, 0.0042), (0.082, 0.0056), (0.086, 0.0040)),
 )
-"""Rings of the sleeve: distance behind the start of the wrist, and radius in excess of the wrist's, m."""
+"""Rings of the sleeve: distance behind the start of the wrist, and radius in excess of the wrist's,
+m.
+"""
 
 
 def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
@@ -43,13 +53,16 @@ def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
         back = -np.cross(skeleton.axes[bends[-1]], along)
         back = back / np.linalg.norm(back)
         angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-        outline = [np.sign(wave) * np.abs(wave) ** _SQUARE for wave in (np.cos(angle), np.sin(angle))]
+        outline = [
+            np.sign(wave) * np.abs(wave) ** _SQUARE for wave in (np.cos(angle), np.sin(angle))
+        ]
         rings = []
         for share, height in _NAIL:
             turn = _NAIL_WIDTH * share * outline[0]
             place = radius * (_NAIL_LENGTH * share * outline[1] - _NAIL_BACK)
             radial = np.cos(turn)[:, None] * back + np.sin(turn)[:, None] * np.cross(along, back)
-            down = np.clip(place / radius, 0, np.pi / 2)[:, None]  # over the ball at the finger's end
+            # Over the ball at the finger's end
+            down = np.clip(place / radius, 0, np.pi / 2)[:, None]
             out = np.cos(down) * radial + np.sin(down) * along
             rings.append(end + np.minimum(place, 0)[:, None] * along + (radius + height) * out)
         nail = _shell(np.array(rings), chain[-1], len(skeleton.names))
@@ -66,8 +79,12 @@ def sleeve(skeleton: Skeleton) -> Surface:
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
     out = np.stack([np.cos(angle), np.sin(angle)], -1) @ axes
-    farthest = (centres @ out.T + radii[:, None]).argmax(0)  # the circle that the outline touches in each direction
-    rings = [centres[farthest] + (radii[farthest] + wider)[:, None] * out + behind * back for behind, wider in _SLEEVE]
+    # The circle that the outline touches in each direction
+    farthest = (centres @ out.T + radii[:, None]).argmax(0)
+    rings = [
+        centres[farthest] + (radii[farthest] + wider)[:, None] * out + behind * back
+        for behind, wider in _SLEEVE
+    ]
     return _shell(np.array(rings), 0, len(skeleton.names))
 
 
@@ -98,11 +115,17 @@ MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
 _LARGEST = 0.5  # m
 _SECTIONS = 20  # sides of a housing
 _BEVEL = 0.45  # bevel of a housing's ends, in radii
-_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # radius and half length of a joint's drum, in radii of its link
+# Radius and half length of a joint's drum, in radii of its link
+_DRUM_RADIUS, _DRUM_LENGTH = (
+    0.72,
+    1.04,
+)
 
 
 class Skin(NamedTuple):
-    """V points and F triangles around L links, in the wrist frame with every joint at zero, metres."""
+    """V points and F triangles around L links, in the wrist frame with every joint at zero,
+    metres.
+    """
 
     points: np.ndarray
     """(V, 3) float32."""
@@ -120,10 +143,16 @@ class Skin(NamedTuple):
     def parts(self) -> dict[str, np.ndarray]:
         """Faces (n, 3) of each material that there is."""
         of_face = self.material[self.faces[:, 0]]
-        return {name: self.faces[of_face == i] for i, name in enumerate(MATERIALS) if (of_face == i).any()}
+        return {
+            name: self.faces[of_face == i]
+            for i, name in enumerate(MATERIALS)
+            if (of_face == i).any()
+        }
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
-        """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0 if unused."""
+        """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0
+        if unused.
+        """
         links = np.argsort(-self.weights, 1, kind="stable")[:, :4]
         if links.shape[1] < 4:
             links = np.pad(links, ((0, 0), (0, 4 - links.shape[1])))
@@ -132,11 +161,15 @@ class Skin(NamedTuple):
         return np.where(weights > 0, links, 0), weights
 
     def posed(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (V, 3) and unit normals (V, 3) for link frames at (L, 3) with rotations (L, 3, 3)."""
+        """Points (V, 3) and unit normals (V, 3) for link frames at (L, 3) with rotations (L, 3,
+        3).
+        """
         matrices = np.concatenate(
             [rotation, (position - np.einsum("lij,lj->li", rotation, self.origins))[..., None]], -1
         )
-        mixed = (self.weights @ matrices.reshape(len(matrices), 12).astype(np.float32)).reshape(-1, 3, 4)
+        mixed = (self.weights @ matrices.reshape(len(matrices), 12).astype(np.float32)).reshape(
+            -1, 3, 4
+        )
         points = np.einsum("vij,vj->vi", mixed[..., :3], self.points) + mixed[..., 3]
         normals = np.einsum("vij,vj->vi", mixed[..., :3], self.normals)
         return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -144,25 +177,39 @@ class Skin(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def skin_of(hand: Hand) -> Skin:
-    """Returns the surface of a hand, from its file's meshes if it is a custom one; they are loaded once per process."""
+    """Returns the surface of a hand, from its file's meshes if it is a custom one; they are loaded
+    once per process.
+    """
     meshes = own_meshes(hand)
     return skin_of_meshes(hand, meshes) if meshes else skin_on(skeleton_of(hand))
 
 
 def skin_on(skeleton: Skeleton) -> Skin:
-    """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the right hand's."""
+    """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the
+    right hand's.
+    """
     right, left = right_name(skeleton.hand)
     if left:
         own: dict[str, Any] = _mirrored(skeleton, ("origins", "capsules", "anchors"))
         skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
-        return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
+        return skin._replace(
+            faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins"))
+        )
     if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):
         soft = flesh(skeleton)
-        kinds = ("flesh", soft), ("sleeve", sleeve(skeleton)), *(("nail", nail) for nail in nails(skeleton, soft))
-        material = np.concatenate([np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds])
+        kinds = (
+            ("flesh", soft),
+            ("sleeve", sleeve(skeleton)),
+            *(("nail", nail) for nail in nails(skeleton, soft)),
+        )
+        material = np.concatenate(
+            [np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds]
+        )
         firsts = np.cumsum([0, *(len(part.points) for _, part in kinds)])
         faces = [part.faces + first for (_, part), first in zip(kinds, firsts, strict=False)]
-        points, normals, weights = (np.concatenate([part[k] for _, part in kinds]) for k in (0, 1, 3))
+        points, normals, weights = (
+            np.concatenate([part[k] for _, part in kinds]) for k in (0, 1, 3)
+        )
         surface = Surface(points, normals, np.concatenate(faces), weights)
     else:
         surface, joint = _housings(skeleton)
@@ -183,9 +230,13 @@ def _mirrored(shape: Skeleton | Skin, names: tuple[str, ...]) -> dict[str, np.nd
 
 
 def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
-    """Returns a surface of the links' meshes, each rigid, and the capsules of links without a mesh."""
+    """Returns a surface of the links' meshes, each rigid, and the capsules of links without a
+    mesh.
+    """
     parts = [
-        trimesh.Trimesh(*meshes[link.name], process=False) if link.name in meshes else _rounded(link)
+        trimesh.Trimesh(*meshes[link.name], process=False)
+        if link.name in meshes
+        else _rounded(link)
         for link in hand.links
     ]
     counts = [len(part.vertices) for part in parts]
@@ -195,7 +246,9 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
         normals=normals,
-        faces=np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
+        faces=np.concatenate(
+            [part.faces + start for part, start in zip(parts, starts, strict=True)]
+        ).astype(np.int32),
         weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
         origins=np.array([link_origin(link) for link in hand.links]),
         material=np.full(sum(counts), MATERIALS.index("link")),
@@ -217,29 +270,40 @@ def _rounded(link: Link) -> trimesh.Trimesh:
 
 
 def _anatomical(skeleton: Skeleton) -> bool:
-    """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's size."""
+    """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's
+    size.
+    """
     chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
     return (
         len(chains) > 2
         and skeleton.names[chains[0][0]].startswith("thumb")
         and all(len(chain) > 1 for chain in chains)
         and with_capsule == set(range(len(skeleton.names)))
-        and float(np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max() + skeleton.radii.max()) < _LARGEST
+        and float(np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max() + skeleton.radii.max())
+        < _LARGEST
     )
 
 
 def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
-    """Returns a bevelled housing around every capsule, a drum at every joint, and a mask (V,) of the joints' points."""
+    """Returns a bevelled housing around every capsule, a drum at every joint, and a mask (V,) of
+    the joints' points.
+    """
     parts, links, joints = [], [], []
-    for (start, end), radius, link in zip(skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True):
+    for (start, end), radius, link in zip(
+        skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True
+    ):
         parts.append(_bevelled(start, end, radius, radius))
         links.append(link)
         joints.append(False)
-    for anchor, axis, link in zip(skeleton.anchors, skeleton.axes, skeleton.joint_link, strict=True):
+    for anchor, axis, link in zip(
+        skeleton.anchors, skeleton.axes, skeleton.joint_link, strict=True
+    ):
         mine = skeleton.radii[skeleton.capsule_link == link]
         if len(mine):
             half = _DRUM_LENGTH * mine[0] * axis - 0.2 * mine[0] * axis
-            parts.append(_bevelled(anchor - half, anchor + half, _DRUM_RADIUS * mine[0], 0.2 * mine[0]))
+            parts.append(
+                _bevelled(anchor - half, anchor + half, _DRUM_RADIUS * mine[0], 0.2 * mine[0])
+            )
             links.append(skeleton.parents[link])
             joints.append(True)
     counts = [len(points) for points, _, _ in parts]
@@ -250,8 +314,12 @@ def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
     return Surface(points, normals, faces, weights), np.repeat(joints, counts)
 
 
-def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> tuple[np.ndarray, ...]:
-    """Points, normals and faces of a cylinder with bevelled ends that extends beyond both points (3,)."""
+def _bevelled(
+    start: np.ndarray, end: np.ndarray, radius: float, reach: float
+) -> tuple[np.ndarray, ...]:
+    """Points, normals and faces of a cylinder with bevelled ends that extends beyond both points
+    (3,).
+    """
     length, bevel = float(np.linalg.norm(end - start)), _BEVEL * min(radius, reach)
     outline = [
         (0.0, -reach),
@@ -269,7 +337,9 @@ def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -
         turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)[:3, :3]
     angles = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
     around = np.stack([np.cos(angles), np.sin(angles)], -1)
-    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # separate points for each strip give sharp edges
+    for (r0, z0), (r1, z1) in itertools.pairwise(
+        outline
+    ):  # separate points for each strip give sharp edges
         out = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r0 - r1)
         first = _SECTIONS * len(points)
         for r, z in ((r0, z0), (r1, z1)):
@@ -281,4 +351,8 @@ def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -
             faces.append(np.column_stack([here, after, after + _SECTIONS]))
         if r1 > 0:
             faces.append(np.column_stack([here, after + _SECTIONS, here + _SECTIONS]))
-    return start + np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T, np.concatenate(faces)
+    return (
+        start + np.concatenate(points) @ turn.T,
+        np.concatenate(normals) @ turn.T,
+        np.concatenate(faces),
+    )

@@ -1,7 +1,8 @@
 """Specification of a hand as data: lengths in metres, angles in radians, masses in kilograms.
 
-All points and axes are given in the wrist frame with every joint at zero, so that forward kinematics is a product of
-exponentials (`common.hands.kinematics`) and the MJCF (`common.hands.mjcf`) follows from the same numbers.
+All points and axes are given in the wrist frame with every joint at zero, so that forward
+kinematics is a product of exponentials (`common.hands.kinematics`) and the MJCF
+(`common.hands.mjcf`) follows from the same numbers.
 """
 
 import dataclasses
@@ -45,7 +46,8 @@ class Coupling:
 
 @dataclasses.dataclass(frozen=True)
 class Motor:
-    """A position servo that pulls joints: its position is sum(c q), and each joint gets c times its torque.
+    """A position servo that pulls joints: its position is sum(c q), and each joint gets c times its
+    torque.
 
     Gains are in N.m/rad, N.m.s/rad and N.m of the motor.
     """
@@ -62,7 +64,8 @@ class Motor:
 class Joint:
     """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m.
 
-    The gains are those of its motor. They are zero for a joint that follows another or is pulled by a tendon.
+    The gains are those of its motor. They are zero for a joint that follows another or is pulled by
+    a tendon.
     """
 
     name: str
@@ -100,7 +103,9 @@ class Solid:
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid body. The first link of a hand is its palm, whose frame is the wrist frame; it has no joints."""
+    """A rigid body. The first link of a hand is its palm, whose frame is the wrist frame; it has no
+    joints.
+    """
 
     name: str
     parent: str
@@ -131,7 +136,8 @@ class WristGains:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hand:
-    """A dexterous hand with `F` finger joints, `M` motors, `L` links and `P` keypoints (link origins, then fingertips).
+    """A dexterous hand with `F` finger joints, `M` motors, `L` links and `P` keypoints (link
+    origins, then fingertips).
 
     Hands are compared by identity, so that they can be static arguments of compiled functions.
     """
@@ -146,7 +152,9 @@ class Hand:
     """Finger angles of a fist, for pictures and for closing around an object."""
     wrist: WristGains
     wide_pose: dict[str, float] | None = None
-    """Finger angles of the widest pose that still faces an object (`common.hands.closure`); computed if absent."""
+    """Finger angles of the widest pose that still faces an object (`common.hands.closure`);
+    computed if absent.
+    """
     object_scale: float = 1.0
     """Factor on object sizes in the paper's comparison of hands."""
     couplings: tuple[Coupling, ...] = ()
@@ -158,7 +166,9 @@ class Hand:
 
     @property
     def reference(self) -> str:
-        """Reference for `common.hands.get_hand` on any machine: the hand's name, or the text of its file."""
+        """Reference for `common.hands.get_hand` on any machine: the hand's name, or the text of its
+        file.
+        """
         return self.text or self.name
 
     @functools.cached_property
@@ -173,9 +183,16 @@ class Hand:
 
     @functools.cached_property
     def motors(self) -> tuple[Motor, ...]:
-        """The M motors in the order of the first joints that they pull; see `common.hands.motors`."""
-        tendons = {next(joint.name for joint in self.joints if joint.name in x.joints): x for x in self.tendons}
-        driven = {name for tendon in self.tendons for name in tendon.joints} | {x.joint for x in self.couplings}
+        """The M motors in the order of the first joints that they pull; see
+        `common.hands.motors`.
+        """
+        tendons = {
+            next(joint.name for joint in self.joints if joint.name in x.joints): x
+            for x in self.tendons
+        }
+        driven = {name for tendon in self.tendons for name in tendon.joints} | {
+            x.joint for x in self.couplings
+        }
         return tuple(
             tendons.get(j.name) or Motor(j.name, {j.name: 1.0}, j.kp, j.kv, j.torque_limit)
             for j in self.joints
@@ -223,7 +240,9 @@ class Hand:
     def link_fingers(self) -> np.ndarray:
         """(L,) index of each link's finger, -1 for the palm and for links without a tip."""
         roots = [next(iter(chain_of(self, link.name)), "") for link in self.links]
-        return np.array([self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots])
+        return np.array(
+            [self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots]
+        )
 
     @functools.cached_property
     def contact_weights(self) -> np.ndarray:
@@ -249,14 +268,18 @@ class Hand:
 
     @functools.cached_property
     def keypoint_weights(self) -> np.ndarray:
-        """(P,) weights of the keypoints in the distance reward: fingertips count four times; their mean is one."""
+        """(P,) weights of the keypoints in the distance reward: fingertips count four times; their
+        mean is one.
+        """
         weights = np.concatenate([np.ones(len(self.links)), 4 * np.ones(len(self.tip_links))])
         return (weights / weights.mean()).astype(np.float32)
 
     @functools.cached_property
     def capsules(self) -> np.ndarray:
         """(C, 2, 3) end points of the capsules of all links, in the wrist frame at zero."""
-        return np.array([(c.start, c.end) for link in self.links for c in link.capsules], np.float32)
+        return np.array(
+            [(c.start, c.end) for link in self.links for c in link.capsules], np.float32
+        )
 
     @functools.cached_property
     def capsule_radii(self) -> np.ndarray:
@@ -270,9 +293,13 @@ class Hand:
 
     @functools.cached_property
     def wrist_inertia(self) -> np.ndarray:
-        """(2,) inertia moved by the virtual wrist's servos: kg along a slide, kg.m^2 about a hinge."""
+        """(2,) inertia moved by the virtual wrist's servos: kg along a slide, kg.m^2 about a
+        hinge.
+        """
         mass = sum(link.mass for link in self.links)
-        return np.array([mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature])
+        return np.array(
+            [mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature]
+        )
 
     @functools.cached_property
     def wrist_servos(self) -> np.ndarray:
@@ -287,17 +314,23 @@ class Hand:
     def posed(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints; coupled joints are set by their leaders."""
         follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}
-        return np.array([(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32)
+        return np.array(
+            [(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32
+        )
 
 
 def link_origin(link: Link) -> Vector:
-    """Origin of a link's frame in the wrist frame at zero: the anchor of its first joint, or the wrist."""
+    """Origin of a link's frame in the wrist frame at zero: the anchor of its first joint, or the
+    wrist.
+    """
     return link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0)
 
 
 def capsule_ends(link: Link) -> np.ndarray:
     """(C, 2, 3) end points of the link's capsules, in its frame, m."""
-    return np.array([(capsule.start, capsule.end) for capsule in link.capsules]).reshape(-1, 2, 3) - link_origin(link)
+    return np.array([(capsule.start, capsule.end) for capsule in link.capsules]).reshape(
+        -1, 2, 3
+    ) - link_origin(link)
 
 
 def chain(
@@ -309,7 +342,8 @@ def chain(
     weights: Sequence[float],
     parent: str = "palm",
 ) -> tuple[Link, ...]:
-    """Builds a finger: a chain of links, each a capsule between two of the points, with the tip on the last.
+    """Builds a finger: a chain of links, each a capsule between two of the points, with the tip on
+    the last.
 
     Args:
       names: n names, the first next to the palm.
@@ -320,9 +354,26 @@ def chain(
       weights: n contact weights.
       parent: parent of the first link.
     """
-    rows = zip(names, (parent, *names), joints, itertools.pairwise(points), radii, masses, weights, strict=False)
+    rows = zip(
+        names,
+        (parent, *names),
+        joints,
+        itertools.pairwise(points),
+        radii,
+        masses,
+        weights,
+        strict=False,
+    )
     return tuple(
-        Link(name, above, moved, (Capsule(start, end, radius),), mass, weight, end if name == names[-1] else None)
+        Link(
+            name,
+            above,
+            moved,
+            (Capsule(start, end, radius),),
+            mass,
+            weight,
+            end if name == names[-1] else None,
+        )
         for name, above, moved, (start, end), radius, mass, weight in rows
     )
 
@@ -338,9 +389,11 @@ def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
 
 
 def wrist_gains(mass: float) -> WristGains:
-    """Gains of the virtual wrist for a hand of this mass (kg), on an arm that adds an inertia of 0.65 kg.
+    """Gains of the virtual wrist for a hand of this mass (kg), on an arm that adds an inertia of
+    0.65 kg.
 
-    The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) for any mass.
+    The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) for any
+    mass.
     """
     moved, heavier = mass + _ARM, (mass + 0.2) / 0.55
     return WristGains(
@@ -356,7 +409,9 @@ def wrist_gains(mass: float) -> WristGains:
 
 
 def right_name(name: str) -> tuple[str, bool]:
-    """Name of the right hand whose mirror image a hand is, or its own name; and True if it is a left hand."""
+    """Name of the right hand whose mirror image a hand is, or its own name; and True if it is a
+    left hand.
+    """
     for ending in (SIDE, LEFT):
         if name.endswith(ending):
             return name.removesuffix(ending), True
@@ -382,7 +437,9 @@ def _link(link: Link) -> Link:
 
 def _joint(joint: Joint) -> Joint:
     """A mirrored joint, whose angles mean the same."""
-    return dataclasses.replace(joint, axis=vector(mirror.axial(joint.axis)), anchor=_point(joint.anchor))
+    return dataclasses.replace(
+        joint, axis=vector(mirror.axial(joint.axis)), anchor=_point(joint.anchor)
+    )
 
 
 def _solid(solid: Solid) -> Solid:

@@ -1,4 +1,6 @@
-"""Atomic file writes, by which a reader finds the old content or the new one; caches of results between runs."""
+"""Atomic file writes, by which a reader finds the old content or the new one; caches of results
+between runs.
+"""
 
 import contextlib
 import functools
@@ -18,7 +20,8 @@ _log = logging.getLogger(__name__)
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
-    """Replaces a file's content atomically: writes a temporary file, flushes it to disk and renames it.
+    """Replaces a file's content atomically: writes a temporary file, flushes it to disk and renames
+    it.
 
     Raises:
       CongraspError: the file cannot be written; earlier content is intact.
@@ -44,26 +47,41 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
 def check_free(path: pathlib.Path, *, force: bool = False) -> None:
     """Raises a CongraspError if a command would overwrite a file without --force."""
     if path.exists() and not force:
-        raise CongraspError(f"{path} exists already.", "Pass another path with --out, or --force to replace it.")
+        raise CongraspError(
+            f"{path} exists already.", "Pass another path with --out, or --force to replace it."
+        )
 
 
 def check_output(option: str, path: pathlib.Path, *, is_folder: bool) -> None:
-    """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other one of these."""
+    """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other
+    one of these.
+    """
     if path.exists() and path.is_dir() != is_folder:
-        found, remedy = ("file", "Pass a folder; it need not exist.") if is_folder else ("folder", "Pass a file in it.")
+        found, remedy = (
+            ("file", "Pass a folder; it need not exist.")
+            if is_folder
+            else ("folder", "Pass a file in it.")
+        )
         raise CongraspError(f"{option} is the {found} {path}.", remedy)
     places = [path] * is_folder + list(path.absolute().parents)
     parent = next(place for place in places if os.path.lexists(place))
     if not parent.is_dir():
-        raise CongraspError(f"{option} is {path}, but {parent} is a file or a link to nothing.", "Pass another path.")
+        raise CongraspError(
+            f"{option} is {path}, but {parent} is a file or a link to nothing.",
+            "Pass another path.",
+        )
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise CongraspError(f"{option} is {path}, but {parent} cannot be written.", "Pass a path in another folder.")
+        raise CongraspError(
+            f"{option} is {path}, but {parent} cannot be written.", "Pass a path in another folder."
+        )
 
 
 def user_folder(variable: str, default: str) -> pathlib.Path:
-    """Returns a folder of the user, named by a variable of the XDG specification, or else the default in the home.
+    """Returns a folder of the user, named by a variable of the XDG specification, or else the
+    default in the home.
 
-    Without a home, as for a user id without an entry, it is a folder that does not exist and cannot be created.
+    Without a home, as for a user id without an entry, it is a folder that does not exist and cannot
+    be created.
     """
     try:
         return pathlib.Path(os.environ.get(variable) or pathlib.Path.home() / default)
@@ -72,7 +90,8 @@ def user_folder(variable: str, default: str) -> pathlib.Path:
 
 
 def cache_folder(name: str) -> pathlib.Path:
-    """Returns the user's cache folder for one subject; `XDG_CACHE_HOME` overrides the parent folder.
+    """Returns the user's cache folder for one subject; `XDG_CACHE_HOME` overrides the parent
+    folder.
 
     It may be read-only or absent: the first call then logs that, and writers must ignore it.
     """
@@ -83,12 +102,18 @@ def cache_folder(name: str) -> pathlib.Path:
 
 @functools.cache
 def can_cache(folder: pathlib.Path, setting: str) -> bool:
-    """True if files can be written to a cache; otherwise the first call logs why, and the setting that moves it."""
+    """True if files can be written to a cache; otherwise the first call logs why, and the setting
+    that moves it.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         check_output("the cache", folder, is_folder=True)
     except (OSError, CongraspError):
-        _log.warning("Nothing can be cached in %s, so that it is computed again each time. Set %s.", folder, setting)
+        _log.warning(
+            "Nothing can be cached in %s, so that it is computed again each time. Set %s.",
+            folder,
+            setting,
+        )
         return False
     return True
 
@@ -104,10 +129,14 @@ def sync_directory(path: pathlib.Path) -> None:
 
 @functools.cache
 def source_digest(*packages: ModuleType) -> str:
-    """Returns sixteen hex digits of all source and data in these packages; a change invalidates cache entries."""
+    """Returns sixteen hex digits of all source and data in these packages; a change invalidates
+    cache entries.
+    """
     digest = hashlib.sha256()
     for folder in (folder for package in packages for folder in package.__path__):
-        for file in sorted(file for kind in ("*.py", "*.json") for file in pathlib.Path(folder).rglob(kind)):
+        for file in sorted(
+            file for kind in ("*.py", "*.json") for file in pathlib.Path(folder).rglob(kind)
+        ):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -1,4 +1,5 @@
-"""Validation of external input: names used as files, files of bounded size, and arrays against their descriptions.
+"""Validation of external input: names used as files, files of bounded size, and arrays against
+their descriptions.
 
 The declared size of an array in an NPZ file is checked before memory is allocated.
 """
@@ -30,7 +31,15 @@ MAX_ARRAYS = 1000
 _KINDS = "biufUS"
 _JITTER = 0.1  # of a clock's median step, by which it may fall
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
+_UNREADABLE = (
+    ValueError,
+    LookupError,
+    RuntimeError,
+    OverflowError,
+    SyntaxError,
+    TypeError,
+    MemoryError,
+)
 
 
 def file_name(text: object, what: str) -> str:
@@ -41,7 +50,8 @@ def file_name(text: object, what: str) -> str:
       what: the thing it names, for the error.
 
     Raises:
-      CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special character.
+      CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special
+      character.
     """
     if isinstance(text, str) and text and (text[0].isalnum() or text[0] == "_"):
         fits = len(text) <= LONGEST_NAME and len(text.encode(errors="replace")) <= _LONGEST_BYTES
@@ -54,10 +64,11 @@ def file_name(text: object, what: str) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Returns a text as a `file_name`: letters of any script stay, other characters become underscores.
+    """Returns a text as a `file_name`: letters of any script stay, other characters become
+    underscores.
 
-    A name that is too long is cut, and ends with eight hex digits of the whole. A text without letters becomes
-    "object".
+    A name that is too long is cut, and ends with eight hex digits of the whole. A text without
+    letters becomes "object".
     """
     text = unicodedata.normalize("NFC", text)
     safe = "".join(c if _is_letter(c) or c in "._-" else "_" for c in text)
@@ -65,12 +76,17 @@ def safe_name(text: str) -> str:
         safe = safe[1:]
     if len(safe) > LONGEST_NAME or len(safe.encode()) > _LONGEST_BYTES:
         digits = hashlib.sha256(text.encode(errors="replace")).hexdigest()[:8]
-        safe = safe[: LONGEST_NAME - 20].encode()[: _LONGEST_BYTES - 20].decode(errors="ignore") + f"-{digits}"
+        safe = (
+            safe[: LONGEST_NAME - 20].encode()[: _LONGEST_BYTES - 20].decode(errors="ignore")
+            + f"-{digits}"
+        )
     return safe or "object"
 
 
 def numbers_in(text: str) -> np.ndarray:
-    """(N,) the numbers of a user's text, separated by spaces or commas; none if a word is no finite number."""
+    """(N,) the numbers of a user's text, separated by spaces or commas; none if a word is no finite
+    number.
+    """
     try:
         found = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
@@ -79,14 +95,18 @@ def numbers_in(text: str) -> np.ndarray:
 
 
 def runs_back(times: np.ndarray) -> np.ndarray:
-    """(T,) bool: where a clock (T,), in any unit, is earlier than before, by more than a tenth of its median step."""
+    """(T,) bool: where a clock (T,), in any unit, is earlier than before, by more than a tenth of
+    its median step.
+    """
     if len(times) < 2:
         return np.zeros(len(times), bool)
     return np.maximum.accumulate(times) - times > _JITTER * np.median(np.abs(np.diff(times)))
 
 
 def distinct_names(names: Iterable[str], key: Callable[[str], str] = str.casefold) -> list[str]:
-    """Returns the names, with a number at each whose `key` repeats one's (in upper or lower case), such as mug-2."""
+    """Returns the names, with a number at each whose `key` repeats one's (in upper or lower case),
+    such as mug-2.
+    """
     names = list(names)
     taken, given = {key(name) for name in names}, list[str]()
     used = set[str]()
@@ -137,7 +157,9 @@ def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:
 
 
 def read_json(path: pathlib.Path, largest: int, remedy: str = "") -> Any:
-    """Parses a JSON file; raises like `read_file`, and a CongraspError if it is not JSON or nested too deep."""
+    """Parses a JSON file; raises like `read_file`, and a CongraspError if it is not JSON or nested
+    too deep.
+    """
     return parse_json(read_file(path, largest, remedy), str(path), remedy)
 
 
@@ -166,7 +188,8 @@ def read_npz(
       kind: expected kind of file, for the error message.
       largest: limit of the arrays' total size, bytes.
       most: limit of the number of arrays.
-      pickled: returns arrays of objects as the bytes of their pickle; otherwise they are errors. Nothing is unpickled.
+      pickled: returns arrays of objects as the bytes of their pickle; otherwise they are errors.
+      Nothing is unpickled.
 
     Raises:
       CongraspError: the file is not an NPZ file, is damaged, or exceeds a limit.
@@ -187,7 +210,9 @@ def read_npz(
 
 
 def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> None:
-    """Raises a ValueError if the members are not those of an NPZ file, are too many, or inflate to too many bytes."""
+    """Raises a ValueError if the members are not those of an NPZ file, are too many, or inflate to
+    too many bytes.
+    """
     if len(members) > most:
         raise ValueError(f"it has more than {most} arrays")
     if sum(member.file_size for member in members) > largest:
@@ -203,16 +228,26 @@ def _array(data: bytes, name: str, pickled: bool) -> Any:
     """Parses one array in NumPy's format."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, fortran, dtype = header(stream)
     rest = memoryview(data)[stream.tell() :]
     if dtype.hasobject and pickled:
         return bytes(rest)
     if dtype.kind not in _KINDS:
         raise ValueError(f"'{name[:60]}' has the type {str(dtype)[:40]}")
-    if math.prod(shape) * dtype.itemsize != len(rest) or (not dtype.itemsize and math.prod(shape) > 1):
+    if math.prod(shape) * dtype.itemsize != len(rest) or (
+        not dtype.itemsize and math.prod(shape) > 1
+    ):
         raise ValueError(f"'{name[:60]}' has {len(rest)} bytes, which is not {dtype} times {shape}")
-    return np.frombuffer(rest, dtype, count=math.prod(shape)).reshape(shape, order="F" if fortran else "C").copy("K")
+    return (
+        np.frombuffer(rest, dtype, count=math.prod(shape))
+        .reshape(shape, order="F" if fortran else "C")
+        .copy("K")
+    )
 
 
 def check_arrays(
@@ -227,7 +262,8 @@ def check_arrays(
 
     Args:
       arrays: arrays by name.
-      meanings: descriptions of the required arrays: a shape of letters and numbers, then words, such as `(T, 3) m,
+      meanings: descriptions of the required arrays: a shape of letters and numbers, then words,
+      such as `(T, 3) m,
         world`. The word "text" after the shape, or "bool" anywhere, marks an array without numbers.
       indices: names of integer arrays.
       largest: exclusive bound of the absolute values.
@@ -237,8 +273,8 @@ def check_arrays(
       Sizes by letter.
 
     Raises:
-      ValueError: an array is empty, has the wrong shape or type, or holds numbers that are not finite or too large.
-      KeyError: an array is missing.
+      ValueError: an array is empty, has the wrong shape or type, or holds numbers that are not
+      finite or too large. KeyError: an array is missing.
     """
     known = dict(sizes or {})
     for name, meaning in meanings.items():
@@ -251,10 +287,22 @@ def check_arrays(
                 known.setdefault(letter, int(letter) if letter.isdigit() else size)
         wanted = [known.get(letter) for letter in letters]
         if wanted != list(array.shape):
-            raise ValueError(f"{name} has shape {array.shape}, but ({words}) requires {tuple(wanted)}")
-        kinds = "U" if ") text" in meaning else "b" if "bool" in meaning else "iu" if name in indices else "biuf"
+            raise ValueError(
+                f"{name} has shape {array.shape}, but ({words}) requires {tuple(wanted)}"
+            )
+        kinds = (
+            "U"
+            if ") text" in meaning
+            else "b"
+            if "bool" in meaning
+            else "iu"
+            if name in indices
+            else "biuf"
+        )
         if array.dtype.kind not in kinds:
             raise ValueError(f"{name} has the type {array.dtype}")
-        if kinds == "biuf" and not (np.isfinite(array).all() and np.abs(array.astype(float)).max() < largest):
+        if kinds == "biuf" and not (
+            np.isfinite(array).all() and np.abs(array.astype(float)).max() < largest
+        ):
             raise ValueError(f"{name} holds numbers that are not finite or too large")
     return known

@@ -1,8 +1,9 @@
 """Append-only journals of JSON lines, for comparing afterwards what several processes did.
 
-Every line is one write to the operating system, so that it survives the death of its process. It ends with two
-checksums (CRC-32): that of the previous line, as the field `after`, and that of its own preceding text, as the field
-`crc32`. Lines that were cut or changed are skipped when reading, and counted, as are places where lines are missing.
+Every line is one write to the operating system, so that it survives the death of its process. It
+ends with two checksums (CRC-32): that of the previous line, as the field `after`, and that of its
+own preceding text, as the field `crc32`. Lines that were cut or changed are skipped when reading,
+and counted, as are places where lines are missing.
 """
 
 import json
@@ -19,7 +20,9 @@ from congrasp.common.io.inputs import open_file
 AUDIT = "audit"
 """Folder of the journals in a run directory."""
 MAX_NUMBER = 1 << 53
-"""Exclusive bound of the integers in a journal, since JSON readers do not represent larger ones exactly."""
+"""Exclusive bound of the integers in a journal, since JSON readers do not represent larger ones
+exactly.
+"""
 _CHECK = ', "crc32": "{}"}}\n'
 _CHECK_BYTES = len(_CHECK.format("00000000"))
 _END = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
@@ -34,7 +37,8 @@ class Journal:
 
         Args:
           path: the file; its folder is created if needed.
-          warn: called with one line when lines cannot be written; the process continues without them.
+          warn: called with one line when lines cannot be written; the process continues without
+          them.
 
         Raises:
           CongraspError: the file cannot be opened.
@@ -48,7 +52,9 @@ class Journal:
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
-        """Appends a line; lines that the disk refuses are counted in the next written one, as `lost`."""
+        """Appends a line; lines that the disk refuses are counted in the next written one, as
+        `lost`.
+        """
         with self._lock:
             lost = {"lost": self._lost} if self._lost else {}
             text, check = _line({**entry, **lost, "after": self._after})
@@ -59,7 +65,10 @@ class Journal:
             except OSError as error:
                 self._cut, reason = True, error.strerror or str(error)
             if reason and not self._refused:
-                self._warn(f"{self._path} could not be written ({reason}); what happens meanwhile is not in it.")
+                self._warn(
+                    f"{self._path} could not be written ({reason}); what happens meanwhile is not "
+                    f"in it."
+                )
             self._after = self._after if reason else check
             self._refused = bool(reason)
             self._lost = self._lost + 1 if reason else 0
@@ -90,7 +99,9 @@ class JournalLines(NamedTuple):
         return [entry for entry in self.entries if entry is not None]
 
 
-def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] = lambda entry: True) -> JournalLines:
+def read_journal(
+    path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] = lambda entry: True
+) -> JournalLines:
     """Reads a journal of arbitrary content.
 
     Args:
@@ -124,7 +135,9 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
             lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
             entries.append(entry)
     cut = cut and run > 0
-    return JournalLines(entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked)
+    return JournalLines(
+        entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked
+    )
 
 
 def number(value: Any) -> int:
@@ -140,7 +153,8 @@ def has_fields(entry: dict[str, Any], **types: type) -> bool:
 def is_rows(value: Any, *types: type) -> bool:
     """True if a value is a list of rows whose columns have these types."""
     return isinstance(value, list) and all(
-        isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types)) for row in value
+        isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types))
+        for row in value
     )
 
 
@@ -150,8 +164,8 @@ def is_value(value: Any, kind: type) -> bool:
 
 
 def _end_of(path: pathlib.Path) -> tuple[bool, str]:
-    """True if a journal ends within a line (its writer was killed in it, or the disk took a part of it), and the
-    checksum of its last line; empty if there is none."""
+    """True if a journal ends within a line (its writer was killed in it, or the disk took a part of
+    it), and the checksum of its last line; empty if there is none."""
     if not path.exists():
         return False, ""
     with open_file(path) as file:
@@ -170,11 +184,17 @@ def _line(entry: dict[str, Any]) -> tuple[bytes, str]:
 
 
 def _parse(line: bytes) -> tuple[dict[str, Any] | None, str]:
-    """Entry of a line, None if it is invalid or its checksum differs, and the checksum of the line's text."""
+    """Entry of a line, None if it is invalid or its checksum differs, and the checksum of the
+    line's text.
+    """
     check = f"{zlib.crc32(line[:-_CHECK_BYTES]):08x}"
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):
         return None, check
-    whole = isinstance(entry, dict) and entry.pop("crc32", None) and line.endswith(_CHECK.format(check).encode())
+    whole = (
+        isinstance(entry, dict)
+        and entry.pop("crc32", None)
+        and line.endswith(_CHECK.format(check).encode())
+    )
     return (entry if whole else None), check

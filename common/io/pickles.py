@@ -1,7 +1,8 @@
 """Reads arrays from pickles, unpickled with an allow-list by a child process under limits.
 
-The child (`common/io/unpickle.py`) knows the names that arrays of NumPy, SciPy, chumpy and PyTorch need, and refuses
-all others. It has limited memory, processor time and output, and returns an NPZ file.
+The child (`common/io/unpickle.py`) knows the names that arrays of NumPy, SciPy, chumpy and PyTorch
+need, and refuses all others. It has limited memory, processor time and output, and returns an NPZ
+file.
 """
 
 import os
@@ -32,15 +33,17 @@ _REMEDY = "Only pickles of plain values and arrays are read; download the file a
 _CONVERT = (
     "If you trust the file, convert it where its packages are installed, and name the NPZ file: "
     "python -c \"import numpy, pickle; d = pickle.load(open('{}', 'rb'), encoding='latin1'); "
-    "numpy.savez('{}', **{{k: v.toarray() if hasattr(v, 'toarray') else numpy.array(v) for k, v in d.items()}})\""
+    "numpy.savez('{}', **{{k: v.toarray() if hasattr(v, 'toarray') else numpy.array(v) for k, v in "
+    'd.items()}})"'
 )
 
 
 def read_pickle(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of a pickle by name.
 
-    Names of nested dictionaries are joined by "/"; a value outside any dictionary has the name "". Numbers, texts and
-    lists of them are arrays, too, and None is an empty array. Other values are left out.
+    Names of nested dictionaries are joined by "/"; a value outside any dictionary has the name "".
+    Numbers, texts and lists of them are arrays, too, and None is an empty array. Other values are
+    left out.
 
     Args:
       path: the file.
@@ -68,7 +71,9 @@ def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndar
                 archive.writestr(str(len(names)), data)
                 names.append(name)
                 if (size := size + len(data)) > MAX_BYTES:
-                    raise CongraspError(f"{name} and the related files exceed {MAX_BYTES >> 20} MB.", _REMEDY)
+                    raise CongraspError(
+                        f"{name} and the related files exceed {MAX_BYTES >> 20} MB.", _REMEDY
+                    )
         if not names:
             return []
         _unpickle(source, answer, names)
@@ -83,11 +88,14 @@ def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of an NPZ file by name; those of pickles inside are named as in `read_pickle`.
 
     Raises:
-      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.inputs`, or holds anything but plain values
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.inputs`, or holds
+      anything but plain values
         and arrays.
     """
     arrays = read_npz(path, "Download the file again.", pickled=True)
-    pickles = {name: arrays.pop(name) for name, value in list(arrays.items()) if isinstance(value, bytes)}
+    pickles = {
+        name: arrays.pop(name) for name, value in list(arrays.items()) if isinstance(value, bytes)
+    }
     found = read_pickles((f"{path}, '{name[:60]}'", data) for name, data in pickles.items())
     for name, inside in zip(pickles, found, strict=True):
         arrays |= {f"{name}/{key}".removesuffix("/"): array for key, array in inside.items()}
@@ -109,13 +117,17 @@ def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> N
         )
     except subprocess.TimeoutExpired:
         raise CongraspError(
-            f"{names[0]} was not read within {DEADLINE:.0f} s.", "Stop other programs and try again."
+            f"{names[0]} was not read within {DEADLINE:.0f} s.",
+            "Stop other programs and try again.",
         ) from None
     if child.returncode:
-        number, _, reason = child.stdout.decode(errors="replace").strip("\n").rpartition("\n")[2].partition(" ")
+        number, _, reason = (
+            child.stdout.decode(errors="replace").strip("\n").rpartition("\n")[2].partition(" ")
+        )
         reason = reason or f"needs more than {SECONDS} s or {MEMORY >> 30} GB, or is damaged"
         name = names[int(number or 0)]
         foreign = reason.startswith(("names", "has an array"))
         raise CongraspError(
-            f"{name} {reason}.", _CONVERT.format(name, pathlib.Path(name).stem + ".npz") if foreign else _REMEDY
+            f"{name} {reason}.",
+            _CONVERT.format(name, pathlib.Path(name).stem + ".npz") if foreign else _REMEDY,
         )

@@ -1,12 +1,14 @@
-"""Child process of `common.io.pickles`: unpickles with an allow-list, under limits, and answers with arrays.
+"""Child process of `common.io.pickles`: unpickles with an allow-list, under limits, and answers
+with arrays.
 
     python unpickle.py PICKLES ANSWER MEMORY SECONDS BYTES
 
-PICKLES is a ZIP archive whose members are pickles, ANSWER the NPZ file to write. Each pickle's number is printed before
-it is read, followed by the reason if it is refused. Only NumPy is imported, so that the process starts fast.
+PICKLES is a ZIP archive whose members are pickles, ANSWER the NPZ file to write. Each pickle's
+number is printed before it is read, followed by the reason if it is refused. Only NumPy is
+imported, so that the process starts fast.
 
-Every class that a pickle may name is a stand-in. NumPy's own `dtype.__setstate__` takes its flags from the file, which
-turns bytes into pointers.
+Every class that a pickle may name is a stand-in. NumPy's own `dtype.__setstate__` takes its flags
+from the file, which turns bytes into pointers.
 """
 
 import contextlib
@@ -79,7 +81,9 @@ def _encode(text: str, _: str) -> bytes:
 def _numbers(data: Any, kind: Any, shape: Any, order: str) -> np.ndarray:
     """Array of a buffer, which Python 2 wrote as text."""
     buffer = data.encode("latin-1") if isinstance(data, str) else data
-    return np.frombuffer(buffer, _dtype(kind)).reshape(tuple(shape), order="F" if order == "F" else "C")
+    return np.frombuffer(buffer, _dtype(kind)).reshape(
+        tuple(shape), order="F" if order == "F" else "C"
+    )
 
 
 def _scalar(kind: Any, data: Any) -> Any:
@@ -93,10 +97,12 @@ def _rebuilt(kind: Any, *_: Any) -> Any:
 
 
 def _storage(data: bytes) -> np.ndarray:
-    """Numbers of a PyTorch storage in the format before version 1.6, which pickled tensors still use.
+    """Numbers of a PyTorch storage in the format before version 1.6, which pickled tensors still
+    use.
 
-    Five pickles follow one another (a magic number, a version, facts about the machine, a reference to the storage and
-    the keys of all storages), then the number of elements as an integer of eight bytes, and the elements.
+    Five pickles follow one another (a magic number, a version, facts about the machine, a reference
+    to the storage and the keys of all storages), then the number of elements as an integer of eight
+    bytes, and the elements.
     """
     stream = io.BytesIO(data)
     magic, _, machine, dtype, keys = (_StorageUnpickler(stream).load() for _ in range(5))
@@ -106,7 +112,9 @@ def _storage(data: bytes) -> np.ndarray:
     return np.frombuffer(stream.read(), dtype, count)
 
 
-def _tensor(flat: Any, start: int, shape: tuple[int, ...], steps: tuple[int, ...], *_: Any) -> np.ndarray:
+def _tensor(
+    flat: Any, start: int, shape: tuple[int, ...], steps: tuple[int, ...], *_: Any
+) -> np.ndarray:
     """PyTorch's tensor, a view of its storage; NumPy refuses one that reaches beyond it."""
     size = flat.itemsize
     return np.ndarray(shape, flat.dtype, flat, start * size, [step * size for step in steps])
@@ -114,7 +122,11 @@ def _tensor(flat: Any, start: int, shape: tuple[int, ...], steps: tuple[int, ...
 
 _NUMPY = {"_reconstruct": _Array, "scalar": _scalar}
 _ALLOWED: dict[str, Any] = {
-    **{f"numpy.{core}.multiarray.{name}": made for core in ("core", "_core") for name, made in _NUMPY.items()},
+    **{
+        f"numpy.{core}.multiarray.{name}": made
+        for core in ("core", "_core")
+        for name, made in _NUMPY.items()
+    },
     **{f"numpy.{core}.numeric._frombuffer": _numbers for core in ("core", "_core")},
     **{"numpy.ndarray": _Part, "numpy.dtype": _Dtype, "_codecs.encode": _encode},
     **{
@@ -125,7 +137,11 @@ _ALLOWED: dict[str, Any] = {
     },
     **{"chumpy.ch.Ch": _Variable, "chumpy.reordering.Select": _Selection},
     **{f"{module}._reconstructor": _rebuilt for module in ("copy_reg", "copyreg")},
-    **{f"{module}.{kind.__name__}": kind for module in ("__builtin__", "builtins") for kind in (set, object)},
+    **{
+        f"{module}.{kind.__name__}": kind
+        for module in ("__builtin__", "builtins")
+        for kind in (set, object)
+    },
     **{"torch._utils._rebuild_tensor_v2": _tensor, "torch.storage._load_from_bytes": _storage},
     **{"torch.DoubleStorage": "<f8", "torch.FloatStorage": "<f4", "torch.HalfStorage": "<f2"},
     **{"torch.LongStorage": "<i8", "torch.IntStorage": "<i4", "torch.ShortStorage": "<i2"},
@@ -169,7 +185,12 @@ def _resolved(part: Any) -> Any:
         case _Sparse():
             state, values = part.state, _resolved(part.state["data"])
             if isinstance(part, _SPARSE["coo"]):
-                places = tuple(map(_resolved, state["coords"] if "coords" in state else (state["row"], state["col"])))
+                places = tuple(
+                    map(
+                        _resolved,
+                        state["coords"] if "coords" in state else (state["row"], state["col"]),
+                    )
+                )
             else:
                 inner, starts = _resolved(state["indices"]), _resolved(state["indptr"])
                 places = inner, np.repeat(np.arange(len(starts) - 1), np.diff(starts))
@@ -190,7 +211,9 @@ def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for key, item in value.items():
             if isinstance(key, str | bytes):
-                yield from _arrays(f"{name}/{key if isinstance(key, str) else key.decode('latin-1')}", item)
+                yield from _arrays(
+                    f"{name}/{key if isinstance(key, str) else key.decode('latin-1')}", item
+                )
         return
     if value is None:
         yield name, np.empty(0)

@@ -1,10 +1,11 @@
 """Signed distance from an object's surface, on grids that compiled functions sample.
 
-The surface is that of the primitives; for an object with mesh pieces it is the visual mesh, not the convex pieces of
-the physics. Grids hold the distance exactly for primitives outside of them (the least over the pieces; inside of
-several pieces at once the distance is understated), and for meshes up to the sampling that finds the nearest triangle.
-Between grid points values are interpolated linearly. Measured against exact queries 2 to 22 mm outside of the surface,
-where the axes of fingers are: mean error 0.01 to 0.05 mm, 99th percentile 0.05 to 0.4 mm, near edges up to 0.8 mm
+The surface is that of the primitives; for an object with mesh pieces it is the visual mesh, not the
+convex pieces of the physics. Grids hold the distance exactly for primitives outside of them (the
+least over the pieces; inside of several pieces at once the distance is understated), and for meshes
+up to the sampling that finds the nearest triangle. Between grid points values are interpolated
+linearly. Measured against exact queries 2 to 22 mm outside of the surface, where the axes of
+fingers are: mean error 0.01 to 0.05 mm, 99th percentile 0.05 to 0.4 mm, near edges up to 0.8 mm
 (`tests/common/test_surface.py`).
 """
 
@@ -31,7 +32,9 @@ from congrasp.common.wire.codec import Message
 CELLS = 1 << 17
 """Most grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""
 MARGIN = 0.024
-"""Margin of the grid around the object, m: more than the radius of the thickest capsule of a hand."""
+"""Margin of the grid around the object, m: more than the radius of the thickest capsule of a
+hand.
+"""
 _MOST = 1 << 28  # limit of the grid points of all objects
 _SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # spacing of samples on a mesh, m; fewest and most
 _MOST_FILES = 4096  # cached grids of meshes
@@ -39,10 +42,14 @@ _NEWTON = 12  # iterations of the search for the nearest point of an ellipsoid
 
 
 class DistanceField(NamedTuple):
-    """Grids of N objects with M grid points each, of which the first are used; in the objects' frames."""
+    """Grids of N objects with M grid points each, of which the first are used; in the objects'
+    frames.
+    """
 
     values: Array
-    """(N, M) float16: signed distance in metres, negative inside; the last axis of the grid runs fastest."""
+    """(N, M) float16: signed distance in metres, negative inside; the last axis of the grid runs
+    fastest.
+    """
     origin: Array
     """(N, 3) the first grid point, m."""
     cell: Array
@@ -51,7 +58,8 @@ class DistanceField(NamedTuple):
     """(N, 3) int: grid points along each axis."""
 
     def at(self, index: Array, points: Array) -> Array:
-        """Signed distances (B, P) in m; outside a grid, the border's value plus the distance from it (an upper bound).
+        """Signed distances (B, P) in m; outside a grid, the border's value plus the distance from
+        it (an upper bound).
 
         Args:
           index: (B,) int, indices of the objects.
@@ -62,22 +70,28 @@ class DistanceField(NamedTuple):
         inside = jnp.clip(place, 0.0, shape - 1.0)
         low = jnp.minimum(inside.astype(jnp.int32), shape - 2)
         share = inside - low
-        strides = jnp.stack([shape[..., 1] * shape[..., 2], shape[..., 2], jnp.ones_like(shape[..., 0])], -1)
+        strides = jnp.stack(
+            [shape[..., 1] * shape[..., 2], shape[..., 2], jnp.ones_like(shape[..., 0])], -1
+        )
         first = index[:, None] * self.values.shape[-1] + jnp.sum(low * strides, -1)
         flat = self.values.reshape(-1)
         total = jnp.zeros(points.shape[:-1])
         for corner in np.ndindex(2, 2, 2):
             weight = jnp.prod(jnp.where(np.array(corner) == 1, share, 1.0 - share), -1)
-            found = flat.at[first + jnp.sum(np.array(corner) * strides, -1)].get(mode="promise_in_bounds")
+            found = flat.at[first + jnp.sum(np.array(corner) * strides, -1)].get(
+                mode="promise_in_bounds"
+            )
             total += weight * found.astype(jnp.float32)
         return total + jnp.linalg.norm(place - inside, axis=-1) * self.cell[index][:, None]
 
 
 def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
-    """Computes the grids of objects on JAX's device; those of meshes are cached in the user's cache folder.
+    """Computes the grids of objects on JAX's device; those of meshes are cached in the user's cache
+    folder.
 
     Args:
-      objects: N objects; beyond 2,048 grids become coarser, so that they need at most half a gigabyte.
+      objects: N objects; beyond 2,048 grids become coarser, so that they need at most half a
+      gigabyte.
     """
     cells = min(CELLS, _MOST // len(objects))
     lattices = [_lattice(obj, cells) for obj in objects]
@@ -101,7 +115,9 @@ class _Slots(NamedTuple):
 
 
 def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
-    """Groups pieces by kind, padded to a fixed number of slots, so that one program serves all objects."""
+    """Groups pieces by kind, padded to a fixed number of slots, so that one program serves all
+    objects.
+    """
     found = {}
     for kind, count in PRIMITIVE_SLOTS.items():
         own = [piece for piece in pieces if piece.kind == kind]
@@ -117,7 +133,8 @@ def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
 
 @jax.jit
 def _least(pieces: dict[str, _Slots], points: Array) -> Array:
-    """Exact signed distance (n,) in m of points (n, 3) of the object frame from the nearest piece in use.
+    """Exact signed distance (n,) in m of points (n, 3) of the object frame from the nearest piece
+    in use.
 
     Inside several pieces at once it is understated.
     """
@@ -125,9 +142,13 @@ def _least(pieces: dict[str, _Slots], points: Array) -> Array:
     least = jnp.full(len(points), jnp.inf)
     for kind, slots in pieces.items():
 
-        def nearer(least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]) -> Array:
+        def nearer(
+            least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]
+        ) -> Array:
             # In the piece's frame; all shapes are symmetric.
-            return jnp.minimum(least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size))
+            return jnp.minimum(
+                least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size)
+            )
 
         for i in range(len(slots.used)):
             slot = _Slots(*(field[i] for field in slots))
@@ -136,13 +157,19 @@ def _least(pieces: dict[str, _Slots], points: Array) -> Array:
 
 
 def _box(x: Array, half: Array) -> Array:
-    """Signed distance (n,) from a box of half extents (k,), of points (n, k) with non-negative coordinates."""
+    """Signed distance (n,) from a box of half extents (k,), of points (n, k) with non-negative
+    coordinates.
+    """
     beyond = x - half
-    return jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1) + jnp.minimum(jnp.max(beyond, -1), 0.0)
+    return jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1) + jnp.minimum(
+        jnp.max(beyond, -1), 0.0
+    )
 
 
 def _cylinder(x: Array, size: Array) -> Array:
-    """Signed distance (n,) from a cylinder of this radius and half length along z: a box in two dimensions."""
+    """Signed distance (n,) from a cylinder of this radius and half length along z: a box in two
+    dimensions.
+    """
     return _box(jnp.stack([jnp.hypot(x[:, 0], x[:, 1]), x[:, 2]], -1), size[:2])
 
 
@@ -154,11 +181,15 @@ def _capsule(x: Array, size: Array) -> Array:
 def _ellipsoid(x: Array, radii: Array) -> Array:
     """Signed distance (n,) from an ellipsoid.
 
-    The nearest point is r^2 x / (r^2 + t), with t the largest root of sum (r x / (r^2 + t))^2 = 1 (Eberly, "Distance
-    from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The left side is decreasing and convex, so
-    Newton's method from below the root never overshoots.
+    The nearest point is r^2 x / (r^2 + t), with t the largest root of sum (r x / (r^2 + t))^2 = 1
+    (Eberly, "Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The
+    left side is decreasing and convex, so Newton's method from below the root never overshoots.
     """
-    squares, x = radii**2, jnp.maximum(x, 1e-3 * radii)  # in a plane of symmetry the root would be a pole
+    # In a plane of symmetry the root would be a pole
+    squares, x = (
+        radii**2,
+        jnp.maximum(x, 1e-3 * radii),
+    )
 
     def newton(_: int, t: Array) -> Array:
         share = (radii * x / (squares + t)) ** 2
@@ -170,15 +201,23 @@ def _ellipsoid(x: Array, radii: Array) -> Array:
 
 
 @functools.partial(jax.jit, static_argnames="cells")
-def _primitive_values(pieces: dict[str, _Slots], origin: Array, cell: Array, shape: Array, cells: int) -> Array:
-    """Distances (cells,) float16 from primitive pieces at grid points; entries beyond the last point are undefined."""
+def _primitive_values(
+    pieces: dict[str, _Slots], origin: Array, cell: Array, shape: Array, cells: int
+) -> Array:
+    """Distances (cells,) float16 from primitive pieces at grid points; entries beyond the last
+    point are undefined.
+    """
     number = jnp.arange(cells)
-    place = jnp.stack([number // (shape[1] * shape[2]), number // shape[2] % shape[1], number % shape[2]], -1)
+    place = jnp.stack(
+        [number // (shape[1] * shape[2]), number // shape[2] % shape[1], number % shape[2]], -1
+    )
     return _least(pieces, origin + cell * place).astype(jnp.float16)
 
 
 def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarray]:
-    """First point (3,), spacing and shape (3,) of a grid of at most `cells` points around an object."""
+    """First point (3,), spacing and shape (3,) of a grid of at most `cells` points around an
+    object.
+    """
     low, high = obj.visual_vertices.min(0) - MARGIN, obj.visual_vertices.max(0) + MARGIN
     cell = float(np.prod(high - low) / cells) ** (1 / 3)
     while np.prod(shape := np.ceil((high - low) / cell).astype(np.int32) + 1) > cells:
@@ -186,10 +225,21 @@ def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarra
     return low.astype(np.float32), cell, shape
 
 
-def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray, cells: int) -> np.ndarray:
-    """Distances (cells,) float16 from a visual mesh at the grid points, padded with zeros; cached if possible."""
-    parts = [obj.visual_vertices.astype(np.float32), obj.visual_faces.astype(np.int32), origin, shape]
-    key = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:32]
+def _mesh_values(
+    obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray, cells: int
+) -> np.ndarray:
+    """Distances (cells,) float16 from a visual mesh at the grid points, padded with zeros; cached
+    if possible.
+    """
+    parts = [
+        obj.visual_vertices.astype(np.float32),
+        obj.visual_faces.astype(np.int32),
+        origin,
+        shape,
+    ]
+    key = hashlib.sha256(
+        b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    ).hexdigest()[:32]
     file = cache_folder("distances") / f"{key}.safetensors"
     kept = message.arrays.get("distance") if (message := read_kept(file)) else None
     if kept is not None and kept.shape == (cells,) and np.isfinite(kept).all():
@@ -200,12 +250,15 @@ def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.nd
     return found
 
 
-def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
+def _mesh_distance(
+    obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray
+) -> np.ndarray:
     """Signed distances (n,) from an object's visual mesh at the points of a grid.
 
-    The magnitude is the distance from the triangle of the nearest of many samples. A point is inside if the grid's
-    border cannot reach it without passing within half a cell's diagonal of the surface. The orientation of faces and
-    small holes therefore do not matter, and walls thinner than two cells have no inside.
+    The magnitude is the distance from the triangle of the nearest of many samples. A point is
+    inside if the grid's border cannot reach it without passing within half a cell's diagonal of the
+    surface. The orientation of faces and small holes therefore do not matter, and walls thinner
+    than two cells have no inside.
     """
     points = origin + cell * np.indices(shape.tolist()).reshape(3, -1).T
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
@@ -213,7 +266,10 @@ def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.
     count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
     # Triangles too small to be sampled contribute their centres.
-    samples, face = np.concatenate([samples, triangles.mean(1)]), np.concatenate([face, np.arange(len(triangles))])
+    samples, face = (
+        np.concatenate([samples, triangles.mean(1)]),
+        np.concatenate([face, np.arange(len(triangles))]),
+    )
     distance, nearest = cKDTree(samples).query(points, workers=cores())
     on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)
     distance = np.minimum(distance, np.linalg.norm(points - on_triangle, axis=-1))
@@ -221,6 +277,8 @@ def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.
     regions, _ = ndimage.label(free)
     inside = free & (regions != regions[0, 0, 0])
     if free.any():  # near the surface the sign is that of the nearest point farther away from it
-        nearest_free = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
+        nearest_free = ndimage.distance_transform_edt(
+            ~free, return_distances=False, return_indices=True
+        )
         inside = inside[tuple(nearest_free)]
     return np.where(inside.ravel(), -distance, distance)

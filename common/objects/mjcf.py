@@ -12,9 +12,9 @@ from congrasp.common.objects.spec import GraspObject
 class ContactSettings:
     """Contact parameters of hand, object and table.
 
-    Contacts have three dimensions, without torsional or rolling friction, except those of fingertips
-    (`common.hands.mjcf`). The damping of the object's free joint stops a rolling ball: it acts the same way in every
-    engine and costs nothing.
+    Contacts have three dimensions, without torsional or rolling friction, except those of
+    fingertips (`common.hands.mjcf`). The damping of the object's free joint stops a rolling ball:
+    it acts the same way in every engine and costs nothing.
     """
 
     friction: tuple[float, float, float] = (1.0, 0.0, 0.0)
@@ -50,11 +50,12 @@ def add_object(
     conaffinity: int = 1,
     contact: ContactSettings = CONTACT,
 ) -> mujoco.MjsBody:
-    """Adds the object's body, with a free joint, its inertia and its collision geoms, to a model under construction.
+    """Adds the object's body, with a free joint, its inertia and its collision geoms, to a model
+    under construction.
 
-    The body's frame is the object frame, whose origin is the centre of mass. The joint is named `<name>`, the geoms and
-    their meshes (made from vertices, without files) `<name>_<i>` in the order of `obj.pieces`. The free joint's six
-    damping values can be changed in the compiled model.
+    The body's frame is the object frame, whose origin is the centre of mass. The joint is named
+    `<name>`, the geoms and their meshes (made from vertices, without files) `<name>_<i>` in the
+    order of `obj.pieces`. The free joint's six damping values can be changed in the compiled model.
 
     Args:
       spec: the model.

@@ -12,7 +12,9 @@ from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.config import TaskConfig
 
 HELD_OUT_SEED = 1_000_000
-"""Seeds from here upward are never used for training; those below `FIGURES_SEED` are for development."""
+"""Seeds from here upward are never used for training; those below `FIGURES_SEED` are for
+development.
+"""
 FIGURES_SEED = 2_000_000
 """Seeds from here upward are for published figures only: nothing is tuned on their objects."""
 
@@ -32,12 +34,14 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
         objects = [catalogue.get(name) for name in catalogue.list()]
         if not objects:
             raise CongraspError(
-                f"The folder {config.folder} holds no object.", "Fill it with 'congrasp objects import'."
+                f"The folder {config.folder} holds no object.",
+                "Fill it with 'congrasp objects import'.",
             )
         return objects
     if config.count < 1:
         raise CongraspError(
-            f"The pool is empty: objects.count is {config.count}.", "Set --objects.count to at least 1."
+            f"The pool is empty: objects.count is {config.count}.",
+            "Set --objects.count to at least 1.",
         )
     return procedural.generate_many(config.count, first_seed(config, shift), config.families)
 
@@ -47,14 +51,22 @@ def object_scale(hand: Hand, task: TaskConfig) -> float:
     return task.object_scale or hand.object_scale
 
 
-def scale_objects(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
+def scale_objects(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]
+) -> list[GraspObject]:
     """Returns the objects in the size in which this hand grasps them."""
-    return [obj.scaled(object_scale(hand, task), constant_mass=task.constant_mass) for obj in objects]
+    return [
+        obj.scaled(object_scale(hand, task), constant_mass=task.constant_mass) for obj in objects
+    ]
 
 
 def first_seed(config: ObjectsConfig, shift: int) -> int:
-    """First seed of actor number `shift`: ranges of actors are disjoint while all fit below the held-out seeds."""
+    """First seed of actor number `shift`: ranges of actors are disjoint while all fit below the
+    held-out seeds.
+    """
     if config.seed >= HELD_OUT_SEED:
         return config.seed
     number, offset = divmod(config.seed, config.count)
-    return offset + (number + shift) % max(1, (HELD_OUT_SEED - offset) // config.count) * config.count
+    return (
+        offset + (number + shift) % max(1, (HELD_OUT_SEED - offset) // config.count) * config.count
+    )

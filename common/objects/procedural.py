@@ -23,12 +23,15 @@ GROUPS = {
     "all": (*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES),
     "scans": tuple(SCANS),
 }
-"""Names of groups of families; shapes of scans are a separate group, so that pools of `all` do not change."""
+"""Names of groups of families; shapes of scans are a separate group, so that pools of `all` do not
+change.
+"""
 MASS_RANGE = (0.02, 0.6)
 """Kilograms."""
 _SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}
-"""Ranges in kilograms to which the mass is clipped while an object settles into its resting poses: of basic families,
-and of the others. They are fixed so that a change of `MASS_RANGE` does not move resting poses by rounding errors."""
+"""Ranges in kilograms to which the mass is clipped while an object settles into its resting poses:
+of basic families, and of the others. They are fixed so that a change of `MASS_RANGE` does not move
+resting poses by rounding errors."""
 _SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
 _LEAST_SHARE = 0.1
 _ATTEMPTS = 100
@@ -37,9 +40,10 @@ _ATTEMPTS = 100
 def generate(seed: int, family: str | None = None) -> GraspObject:
     """Generates a random object, the same for the same seed and family.
 
-    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg. Both its
-    graspable and its avoid region have at least a tenth of its surface points. Mass and inertia are those of the sum of
-    its pieces (overlaps count twice), scaled together if the mass is out of range.
+    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02
+    and 0.6 kg. Both its graspable and its avoid region have at least a tenth of its surface points.
+    Mass and inertia are those of the sum of its pieces (overlaps count twice), scaled together if
+    the mass is out of range.
 
     Args:
       seed: not negative; seeds from one million upward are reserved for evaluation.
@@ -51,8 +55,8 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     _check(seed, () if family is None else (family,))
     if family is None:
         family = BASIC_FAMILIES[np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))]
-    # Seeded by name, so that adding families does not change the objects of others; basic ones keep their first
-    # numbers.
+    # Seeded by name, so that adding families does not change the objects of others; basic ones keep
+    # their first numbers.
     stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
     rng = np.random.default_rng((seed, stream))
     for _ in range(_ATTEMPTS):
@@ -63,7 +67,8 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
 
 
 def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[GraspObject]:
-    """Generates `count` objects with the seeds `seed`, `seed` + 1, ..., cycling through the families.
+    """Generates `count` objects with the seeds `seed`, `seed` + 1, ..., cycling through the
+    families.
 
     Args:
       count: number of objects.
@@ -90,7 +95,8 @@ def _check(seed: int, families: Sequence[str]) -> None:
     for family in families:
         if family not in BUILDERS:
             raise CongraspError(
-                f"There is no object family '{family}'.", f"Families: {', '.join((*FAMILIES, *GROUPS))}."
+                f"There is no object family '{family}'.",
+                f"Families: {', '.join((*FAMILIES, *GROUPS))}.",
             )
 
 
@@ -101,7 +107,8 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
     densities = rng.uniform(*draft.density) * weight[[piece.part for piece in draft.pieces]]
     mass, center, inertia = mass_properties(draft.pieces, densities)
     pieces = tuple(
-        dataclasses.replace(piece, pos=tuple((np.array(piece.pos) - center).tolist())) for piece in draft.pieces
+        dataclasses.replace(piece, pos=tuple((np.array(piece.pos) - center).tolist()))
+        for piece in draft.pieces
     )
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     reach = np.max([shapes.support(piece, axes) for piece in pieces], axis=0)
@@ -121,7 +128,10 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
     share = graspable[labels].mean()
     if not (sizes[0] <= size <= sizes[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
         return None
-    settled, clipped = np.clip(mass, *_SETTLED[family in BASIC]), np.clip(draft.heavier * mass, *MASS_RANGE)
+    settled, clipped = (
+        np.clip(mass, *_SETTLED[family in BASIC]),
+        np.clip(draft.heavier * mass, *MASS_RANGE),
+    )
     vertices, faces = shapes.mesh_of(pieces)
     obj = GraspObject(
         name=name,
@@ -138,7 +148,9 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
         visual_vertices=vertices,
         visual_faces=faces,
     )
-    return dataclasses.replace(obj, mass=float(clipped), inertia=inertia * clipped / mass, rest_poses=rest_poses(obj))
+    return dataclasses.replace(
+        obj, mass=float(clipped), inertia=inertia * clipped / mass, rest_poses=rest_poses(obj)
+    )
 
 
 def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspObject:

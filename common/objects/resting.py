@@ -11,17 +11,20 @@ from congrasp.common.objects.spec import GraspObject, Piece
 
 MAX_POSES = 8
 _SAME_NORMAL = np.cos(np.radians(15))  # tolerance at which two directions count as one
-_SAME_KIND = 0.03  # poses whose heights differ by less than this share count as rotations of one another
+_SAME_KIND = (
+    0.03  # poses whose heights differ by less than this share count as rotations of one another
+)
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
 _SPEED_SECONDS = 0.025
 _SECONDS = 0.25  # of settling
 _FREE_SECONDS = 0.5  # time after which an unstable object is recognised by its speed
+# Rad, m; a pose is unstable if a tilt lowers its centre of mass by more than this
 _DROPS = (
     (0.03, 1.5e-6),
     (0.06, 5e-6),
-)  # rad, m; a pose is unstable if a tilt lowers its centre of mass by more than this
+)
 _ROUNDS = 4
 _UPRIGHT = np.radians(30)
 
@@ -32,15 +35,17 @@ class Settled(NamedTuple):
     pose: np.ndarray
     """(7,) position and quaternion in the world frame."""
     speed: float
-    """Upper bound of the mean speed of its fastest point over the last 25 ms, m/s: linear plus angular speed times the
-    object's radius. It is a mean because an appearing or vanishing contact makes the velocity of a resting object jump
-    for one step."""
+    """Upper bound of the mean speed of its fastest point over the last 25 ms, m/s: linear plus
+    angular speed times the object's radius. It is a mean because an appearing or vanishing contact
+    makes the velocity of a resting object jump for one step."""
     moved: float
     """Distance of the centre of mass from its start, m."""
 
 
 class TableScene:
-    """An object above a table whose top is the plane z = 0, with the contact settings of the task (MuJoCo C)."""
+    """An object above a table whose top is the plane z = 0, with the contact settings of the task
+    (MuJoCo C).
+    """
 
     def __init__(self, obj: GraspObject):
         """Compiles the scene."""
@@ -67,15 +72,19 @@ class TableScene:
         Args:
           pose: (7,) initial pose.
           seconds: simulated time.
-          overdamped: damps rotation so strongly that rocking stops quickly; False gives the task's physics.
+          overdamped: damps rotation so strongly that rocking stops quickly; False gives the task's
+          physics.
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = pose
         damping = self.model.dof_damping.copy()
         if overdamped:
-            # A large part of the critical damping of a pendulum with the object's weight, size and inertia.
+            # A large part of the critical damping of a pendulum with the object's weight, size and
+            # inertia.
             inertia = self.model.body_inertia[1].max()
-            self.model.dof_damping[3:] += 0.25 * np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
+            self.model.dof_damping[3:] += 0.25 * np.sqrt(
+                self.model.body_mass[1] * 9.81 * self.radius * inertia
+            )
         steps = max(1, round(seconds / CONTACT.timestep))
         last = min(steps, round(_SPEED_SECONDS / CONTACT.timestep))
         if steps > last:
@@ -85,7 +94,9 @@ class TableScene:
         self.model.dof_damping[:] = damping
         turn = np.zeros(3)
         mujoco.mju_subQuat(turn, self.data.qpos[3:], before[3:])
-        linear, angular = np.linalg.norm([self.data.qpos[:3] - before[:3], turn], axis=-1) / (last * CONTACT.timestep)
+        linear, angular = np.linalg.norm([self.data.qpos[:3] - before[:3], turn], axis=-1) / (
+            last * CONTACT.timestep
+        )
         moved = np.linalg.norm(self.data.qpos[:3] - pose[:3])
         return Settled(self.data.qpos.copy(), float(linear + self.radius * angular), float(moved))
 
@@ -98,9 +109,9 @@ def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
 def rest_poses(obj: GraspObject) -> np.ndarray:
     """Poses (R, 7), 1 <= R <= 8, in which the object rests on the table, most likely first.
 
-    Physics settles the quasi-static poses for 0.25 s, or a few times as long if needed. Poses are dropped if they do
-    not come to rest, if a small tilt would lower them, or if they end in an earlier pose. If none remains, the most
-    likely one is simulated until the object rests.
+    Physics settles the quasi-static poses for 0.25 s, or a few times as long if needed. Poses are
+    dropped if they do not come to rest, if a small tilt would lower them, or if they end in an
+    earlier pose. If none remains, the most likely one is simulated until the object rests.
     """
     candidates, _ = quasi_static_poses(obj.pieces)
     scene = TableScene(obj)
@@ -127,7 +138,9 @@ def rest_poses(obj: GraspObject) -> np.ndarray:
 
 
 def upright_rest(obj: GraspObject) -> int | None:
-    """Index of the resting pose with the object's z axis closest to upright; None if it is 30 degrees off in all."""
+    """Index of the resting pose with the object's z axis closest to upright; None if it is 30
+    degrees off in all.
+    """
     tilts = rest_tilts(obj)
     best = int(np.argmin(tilts))
     return best if tilts[best] < _UPRIGHT else None
@@ -142,18 +155,19 @@ def rest_tilts(obj: GraspObject) -> np.ndarray:
 def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Poses in which the object can rest, from its convex hull, most likely first.
 
-    An object whose centre of mass lies beyond an edge of its supporting facet rolls over that edge onto the next facet,
-    until the facet is below the centre of mass. A pose's likelihood is the solid angle, seen from the centre of mass,
-    of all facets from which the object ends there (quasi-static pose statistics; Goldberg et al. 1999, "Part pose
-    statistics: estimators and experiments"). Round pieces are faceted for this; the resulting poses are then moved to
-    the nearest minimum of the centre of mass's height.
+    An object whose centre of mass lies beyond an edge of its supporting facet rolls over that edge
+    onto the next facet, until the facet is below the centre of mass. A pose's likelihood is the
+    solid angle, seen from the centre of mass, of all facets from which the object ends there
+    (quasi-static pose statistics; Goldberg et al. 1999, "Part pose statistics: estimators and
+    experiments"). Round pieces are faceted for this; the resulting poses are then moved to the
+    nearest minimum of the centre of mass's height.
 
     Args:
       pieces: convex pieces in the object frame, whose origin is the centre of mass.
 
     Returns:
-      Poses (R, 7), 1 <= R <= 8, on the table's top z = 0 with x = y = 0 and arbitrary heading, and their likelihoods
-      (R,). Unlikely poses are dropped.
+      Poses (R, 7), 1 <= R <= 8, on the table's top z = 0 with x = y = 0 and arbitrary heading, and
+      their likelihoods (R,). Unlikely poses are dropped.
     """
     hull = shapes.hull_of(np.concatenate([shapes.tessellate(piece)[0] for piece in pieces]))
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
@@ -183,12 +197,16 @@ def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarra
 
 
 def _height(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
-    """Heights (D,) of the centre of mass above the table, with directions (D, 3) of the object downwards."""
+    """Heights (D,) of the centre of mass above the table, with directions (D, 3) of the object
+    downwards.
+    """
     return np.max([shapes.support(piece, downs) for piece in pieces], axis=0)
 
 
 def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
-    """Directions (D, 3) near the given ones with a lower centre of mass, by pattern search on the sphere."""
+    """Directions (D, 3) near the given ones with a lower centre of mass, by pattern search on the
+    sphere.
+    """
     best, height = downs, _height(pieces, downs)
     columns = np.arange(len(best))
     step = 0.1
@@ -204,13 +222,20 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
 
 
 def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
-    """True if no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
+    """True if no small tilt lowers the centre of mass of an object with a direction (3,)
+    downwards.
+    """
     height = _height(pieces, down[None])[0]
-    return all(_height(pieces, _cone(down[None], tilt, 64)[:, 0]).min() > height - drop for tilt, drop in _DROPS)
+    return all(
+        _height(pieces, _cone(down[None], tilt, 64)[:, 0]).min() > height - drop
+        for tilt, drop in _DROPS
+    )
 
 
 def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.ndarray:
-    """Unit directions (count, D, 3) around each axis (D, 3), at the arc tangent of `slope` from it."""
+    """Unit directions (count, D, 3) around each axis (D, 3), at the arc tangent of `slope` from
+    it.
+    """
     side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(-1)])
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
     turn = (2 * np.pi / count * np.arange(count) + phase)[:, None, None]
@@ -219,7 +244,9 @@ def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.
 
 
 def _solid_angles(corners: np.ndarray) -> np.ndarray:
-    """Solid angles (F,) of triangles (F, 3, 3) seen from the origin (Van Oosterom and Strackee 1983)."""
+    """Solid angles (F,) of triangles (F, 3, 3) seen from the origin (Van Oosterom and Strackee
+    1983).
+    """
     a, b, c = np.moveaxis(corners, 1, 0)
     la, lb, lc = np.linalg.norm(corners, axis=-1).T
     triple = np.abs((a * np.cross(b, c)).sum(-1))
@@ -254,7 +281,9 @@ def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
 
 
 def _upright(down: np.ndarray) -> np.ndarray:
-    """Quaternion (4,) of the smallest rotation that turns a direction (3,) of the object downwards."""
+    """Quaternion (4,) of the smallest rotation that turns a direction (3,) of the object
+    downwards.
+    """
     if down[2] > 1 - 1e-9:
         return np.array([0.0, 1.0, 0.0, 0.0])
     q = np.array([1.0 - down[2], -down[1], down[0], 0.0])

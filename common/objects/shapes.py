@@ -1,4 +1,5 @@
-"""Geometry of convex pieces: volume, inertia, containment, support, surface samples and triangle meshes.
+"""Geometry of convex pieces: volume, inertia, containment, support, surface samples and triangle
+meshes.
 
 Of a union of pieces: labelled points on its outer surface, and mass properties.
 """
@@ -16,9 +17,12 @@ from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 _SEGMENTS = 24
 DENSE = 8192
 """Surface points from which `balanced` chooses."""
-_SEAM = 2e-4  # m; a point is on the outer surface if a step of this length along its normal leaves all pieces
-_REACHABLE = 4e-3  # m; a mesh's surface counts as accessible if the collision pieces end within this distance
-# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
+# M; a point is on the outer surface if a step of this length along its normal leaves all pieces
+_SEAM = 2e-4
+# M; a mesh's surface counts as accessible if the collision pieces end within this distance
+_REACHABLE = 4e-3
+# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4
+# sequence).
 _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
@@ -35,7 +39,8 @@ def matrix(quat: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def hull_of(vertices: np.ndarray) -> ConvexHull:
-    """Convex hull of points (V, 3); the `equations` of its facets point outwards. The last few hulls are cached.
+    """Convex hull of points (V, 3); the `equations` of its facets point outwards. The last few
+    hulls are cached.
 
     Raises:
       scipy.spatial.QhullError: the points lie in a plane.
@@ -50,7 +55,9 @@ def _hull(data: bytes) -> ConvexHull:
 
 
 def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
-    """Convex hull of points (V, 3) as a closed mesh with outward normals; it is cached and must not be modified."""
+    """Convex hull of points (V, 3) as a closed mesh with outward normals; it is cached and must not
+    be modified.
+    """
     return _triangulated(np.ascontiguousarray(vertices, np.float64).tobytes())
 
 
@@ -82,11 +89,16 @@ def volume(piece: Piece) -> float:
 
 
 def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass (3,) and inertia (3, 3) about it for one kilogram of uniform density, in the object frame."""
+    """Centre of mass (3,) and inertia (3, 3) about it for one kilogram of uniform density, in the
+    object frame.
+    """
     a, b, c = piece.size
     if piece.kind == "mesh":
         properties = triangulate(_vertices(piece)).mass_properties
-        center, local = np.asarray(properties["center_mass"]), np.asarray(properties["inertia"]) / properties["mass"]
+        center, local = (
+            np.asarray(properties["center_mass"]),
+            np.asarray(properties["inertia"]) / properties["mass"],
+        )
     else:
         center = np.zeros(3)
         if piece.kind == "box":
@@ -141,7 +153,9 @@ def support(piece: Piece, directions: np.ndarray) -> np.ndarray:
 
 
 def proposal_area(piece: Piece) -> float:
-    """Area from which `propose` draws; larger than the surface's area where `propose` rejects points."""
+    """Area from which `propose` draws; larger than the surface's area where `propose` rejects
+    points.
+    """
     a, b, c = piece.size
     if piece.kind == "box":
         return 8 * (a * b + b * c + c * a)
@@ -158,9 +172,9 @@ def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     """Samples points uniformly on the piece's surface for `u` (N, 4) uniform in the unit cube.
 
     Returns:
-      Points (N, 3) and outward unit normals (N, 3) in the object frame, and a mask (N,) of points to keep. It is True
-      everywhere except for ellipsoids, where points are rejected to correct the area distortion of the map from the
-      sphere.
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and a mask (N,) of points
+      to keep. It is True everywhere except for ellipsoids, where points are rejected to correct the
+      area distortion of the map from the sphere.
     """
     a, b, c = piece.size
     keep = np.ones(len(u), bool)
@@ -187,7 +201,8 @@ def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.n
     """Samples points uniformly on triangles (F, 3, 3) for `u` (N, >= 3) uniform in the unit cube.
 
     Returns:
-      Points (N, 3), unit normals (N, 3) by the right-hand rule, and indices (N,) of each point's triangle.
+      Points (N, 3), unit normals (N, 3) by the right-hand rule, and indices (N,) of each point's
+      triangle.
     """
     crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled = np.linalg.norm(crosses, axis=-1)
@@ -195,7 +210,11 @@ def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.n
     face = np.searchsorted(edges, u[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
     root = np.sqrt(u[:, 1])
     weights = np.stack([1 - root, root * (1 - u[:, 2]), root * u[:, 2]], -1)
-    return np.einsum("ni,nij->nj", weights, triangles[face]), crosses[face] / doubled[face, None], face
+    return (
+        np.einsum("ni,nij->nj", weights, triangles[face]),
+        crosses[face] / doubled[face, None],
+        face,
+    )
 
 
 def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
@@ -214,11 +233,15 @@ def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh_of(pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, concatenated, in the object frame."""
+    """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, concatenated, in the object
+    frame.
+    """
     meshes = [tessellate(piece) for piece in pieces]
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
     vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
-    return vertices, np.concatenate([f + start for (_, f), start in zip(meshes, starts, strict=True)]).astype(np.int32)
+    return vertices, np.concatenate(
+        [f + start for (_, f), start in zip(meshes, starts, strict=True)]
+    ).astype(np.int32)
 
 
 @functools.cache
@@ -230,7 +253,9 @@ def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.creation.cylinder(1.0, 2.0, sections=_SEGMENTS)
     else:
         # An even number of rings has none on the equator, where a capsule is cut in two.
-        mesh = trimesh.creation.uv_sphere(1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2))
+        mesh = trimesh.creation.uv_sphere(
+            1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2)
+        )
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
@@ -280,7 +305,8 @@ def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.nda
 
 def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) on a capsule along z."""
-    # The area of a sphere is uniform along its axis, like that of a cylinder: one coordinate covers both.
+    # The area of a sphere is uniform along its axis, like that of a cylinder: one coordinate covers
+    # both.
     along = (2 * u[:, 0] - 1) * (radius + half)
     center = np.clip(along, -half, half)
     z = (along - center) / radius
@@ -294,8 +320,8 @@ def sample_union(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples points evenly over the outer surface of the union of pieces.
 
-    The points follow a low-discrepancy sequence with a random start, so that any prefix covers the surface evenly.
-    Points of one piece inside another are dropped.
+    The points follow a low-discrepancy sequence with a random start, so that any prefix covers the
+    surface evenly. Points of one piece inside another are dropped.
 
     Args:
       pieces: the convex pieces, in the object frame.
@@ -303,7 +329,8 @@ def sample_union(
       count: number of points N.
 
     Returns:
-      Points (N, 3) and outward unit normals (N, 3) in the object frame, and indices (N,) of each point's piece.
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and indices (N,) of each
+      point's piece.
     """
     edges = np.cumsum([proposal_area(piece) for piece in pieces])
     starts = np.concatenate([[0.0], edges[:-1]])
@@ -334,14 +361,15 @@ def sample_mesh(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples points on the part of a mesh that a finger can reach.
 
-    Points that lie more than a few millimetres below the surface of the collision pieces (inner walls, hollows filled
-    by the pieces) are dropped, unless less than a quarter would remain.
+    Points that lie more than a few millimetres below the surface of the collision pieces (inner
+    walls, hollows filled by the pieces) are dropped, unless less than a quarter would remain.
 
     Args:
       triangles: (F, 3, 3) corners.
       pieces: collision pieces in the same frame.
       rng: generator for the start of the low-discrepancy sequence.
-      oriented: True if all triangles have outward normals; otherwise, normals that point into the pieces while the
+      oriented: True if all triangles have outward normals; otherwise, normals that point into the
+      pieces while the
         other side is free are flipped.
 
     Returns:
@@ -349,7 +377,8 @@ def sample_mesh(
     """
     points, normals, face = on_triangles(triangles, _sequence(rng.random(4), 0, 8 * SURFACE_POINTS))
     outer, inner = (
-        np.any([contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0) for side in (1, -1)
+        np.any([contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0)
+        for side in (1, -1)
     )
     if oriented:
         reachable = ~outer
@@ -363,9 +392,11 @@ def sample_mesh(
 
 
 def balanced(graspable: np.ndarray) -> np.ndarray:
-    """Indices of `SURFACE_POINTS` surface points of which every other one lies in the graspable region.
+    """Indices of `SURFACE_POINTS` surface points of which every other one lies in the graspable
+    region.
 
-    Evenly spread over the whole surface, too few of them are on a thin handle to tell its two sides.
+    Evenly spread over the whole surface, too few of them are on a thin handle to tell its two
+    sides.
 
     Args:
       graspable: (N,) bool, both values occur; any prefix of these points covers the surface evenly.
@@ -375,7 +406,8 @@ def balanced(graspable: np.ndarray) -> np.ndarray:
 
 
 def halves(points: np.ndarray, cut: float) -> np.ndarray:
-    """Labels (N,) 0 and 1 of points (N, 3) on the two sides of a plane across their longest principal axis.
+    """Labels (N,) 0 and 1 of points (N, 3) on the two sides of a plane across their longest
+    principal axis.
 
     Args:
       points: surface points.
@@ -393,7 +425,9 @@ def _sequence(offset: np.ndarray, start: int, count: int) -> np.ndarray:
     return (offset + np.arange(start, start + count)[:, None] * _STRIDE) % 1.0
 
 
-def mass_properties(pieces: tuple[Piece, ...], densities: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties(
+    pieces: tuple[Piece, ...], densities: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass (kg), centre of mass (3,) and inertia (3, 3) about it, in the frame of the pieces.
 
     The object is the sum of its pieces: densities add where pieces overlap.

@@ -1,7 +1,7 @@
 """Specification of an object: convex pieces, a labelled surface, mass and resting poses.
 
-The object frame has its origin at the centre of mass; its orientation is that of the source. Quaternions are (w, x, y,
-z).
+The object frame has its origin at the centre of mass; its orientation is that of the source.
+Quaternions are (w, x, y, z).
 """
 
 import dataclasses
@@ -18,9 +18,13 @@ SURFACE_POINTS = 512
 COLOUR_POINTS = 32_768
 """Greatest number of coloured surface points, if the object has colours."""
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
-"""Most pieces of each kind in a primitive object: the geoms reserved for the object in a batched environment."""
+"""Most pieces of each kind in a primitive object: the geoms reserved for the object in a batched
+environment.
+"""
 SURFACE_ERROR, VOLUME_ERROR = 0.005, 0.5
-"""Deviation in m, and as a share of the mesh's volume, from which an imported shape is unreliable."""
+"""Deviation in m, and as a share of the mesh's volume, from which an imported shape is
+unreliable.
+"""
 MAX_MESH_PIECES = 48
 """Most convex pieces of an object with mesh pieces."""
 MAX_MESH_VERTICES = 64
@@ -31,8 +35,9 @@ MAX_MESH_VERTICES = 64
 class Piece:
     """A convex collision piece in the object frame.
 
-    `size` follows MuJoCo: half extents of a box; radius and half length (along z) of a cylinder or capsule; radii of an
-    ellipsoid; zeros for a mesh, whose `vertices` (V, 3) are in the piece's frame (`pos`, `quat`).
+    `size` follows MuJoCo: half extents of a box; radius and half length (along z) of a cylinder or
+    capsule; radii of an ellipsoid; zeros for a mesh, whose `vertices` (V, 3) are in the piece's
+    frame (`pos`, `quat`).
     """
 
     kind: PieceKind
@@ -57,11 +62,11 @@ class Colours(NamedTuple):
 class GraspObject:
     """An object of the catalogue.
 
-    Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each surface point;
-    `graspable` (parts,) bool, parts that may be grasped by default; `inertia` (3, 3) about the centre of mass, kg.m^2;
-    `rest_poses` (R, 7) position and quaternion in the world frame, with the table's top at z = 0; `visual_vertices` (V,
-    3), `visual_faces` (F, 3) for pictures, in the object frame; `origin` (3,) origin of the imported file in the object
-    frame.
+    Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each
+    surface point; `graspable` (parts,) bool, parts that may be grasped by default; `inertia` (3, 3)
+    about the centre of mass, kg.m^2; `rest_poses` (R, 7) position and quaternion in the world
+    frame, with the table's top at z = 0; `visual_vertices` (V, 3), `visual_faces` (F, 3) for
+    pictures, in the object frame; `origin` (3,) origin of the imported file in the object frame.
     """
 
     name: str
@@ -79,8 +84,8 @@ class GraspObject:
     visual_faces: np.ndarray
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     file_up: Literal["y", "z"] = "z"
-    """Axis of the imported file that is this object's z axis; the y axis of a file becomes z by a quarter turn about
-    x."""
+    """Axis of the imported file that is this object's z axis; the y axis of a file becomes z by a
+    quarter turn about x."""
     file_scale: float = 1.0
     """Metres per unit of the imported file."""
     notes: tuple[str, ...] = ()
@@ -94,7 +99,9 @@ class GraspObject:
 
     @property
     def shape_reliable(self) -> bool:
-        """True if the pieces are close enough to the imported mesh for their grasps to transfer to it."""
+        """True if the pieces are close enough to the imported mesh for their grasps to transfer to
+        it.
+        """
         surface, volume = self.surface_error or 0.0, self.volume_error or 0.0
         return surface <= SURFACE_ERROR and abs(volume) <= VOLUME_ERROR
 
@@ -104,7 +111,9 @@ class GraspObject:
         return ~self.graspable[self.labels]
 
     def mirrored(self) -> "GraspObject":
-        """The mirror image of the object, point by point and resting pose by resting pose (`common.mirror`)."""
+        """The mirror image of the object, point by point and resting pose by resting pose
+        (`common.mirror`).
+        """
         sides = np.array([-1.0, 1.0, 1.0])
 
         def piece(own: Piece) -> Piece:
@@ -121,15 +130,20 @@ class GraspObject:
             inertia=self.inertia * np.outer(sides, sides),
             points=mirror.vector(self.points),
             normals=mirror.vector(self.normals),
-            rest_poses=np.concatenate([mirror.vector(rest[:, :3]), mirror.quaternion(rest[:, 3:])], -1),
+            rest_poses=np.concatenate(
+                [mirror.vector(rest[:, :3]), mirror.quaternion(rest[:, 3:])], -1
+            ),
             visual_vertices=mirror.vector(self.visual_vertices),
             visual_faces=self.visual_faces[:, ::-1],
             origin=(-x, y, z),
-            colours=self.colours and self.colours._replace(points=mirror.vector(self.colours.points)),
+            colours=self.colours
+            and self.colours._replace(points=mirror.vector(self.colours.points)),
         )
 
     def scaled(self, factor: float, *, constant_mass: bool = False) -> "GraspObject":
-        """Scales all lengths by `factor`, at the same density or, with `constant_mass`, the same mass."""
+        """Scales all lengths by `factor`, at the same density or, with `constant_mass`, the same
+        mass.
+        """
         if factor == 1.0:
             return self
         heavier = 1.0 if constant_mass else factor**3

@@ -1,4 +1,6 @@
-"""Objects on disk: one safetensors file each, and folders of them, with checks of an object whatever its source."""
+"""Objects on disk: one safetensors file each, and folders of them, with checks of an object
+whatever its source.
+"""
 
 import hashlib
 import math
@@ -12,7 +14,14 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import LONGEST_NAME, file_name, read_file
-from congrasp.common.objects.spec import COLOUR_POINTS, PIECE_KINDS, SURFACE_POINTS, Colours, GraspObject, Piece
+from congrasp.common.objects.spec import (
+    COLOUR_POINTS,
+    PIECE_KINDS,
+    SURFACE_POINTS,
+    Colours,
+    GraspObject,
+    Piece,
+)
 from congrasp.common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
@@ -20,7 +29,16 @@ MAX_BYTES = 64 << 20
 """Largest size of an object file in bytes."""
 _FORMAT = 1
 _ERRORS = ("surface_error", "volume_error")
-_ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_vertices", "visual_faces")
+_ARRAYS = (
+    "graspable",
+    "inertia",
+    "points",
+    "normals",
+    "labels",
+    "rest_poses",
+    "visual_vertices",
+    "visual_faces",
+)
 
 
 def digest(obj: GraspObject) -> str:
@@ -41,13 +59,15 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
     """Reads an object. Its arrays are read-only.
 
     Raises:
-      CongraspError: the file is missing, of another kind, damaged, or has implausible values (`faults`).
+      CongraspError: the file is missing, of another kind, damaged, or has implausible values
+      (`faults`).
     """
     path = pathlib.Path(path)
     remedy = "Run 'congrasp objects import' or 'congrasp objects generate' again."
     if not path.exists():
         raise CongraspError(
-            f"There is no object file {path}.", "'congrasp objects list' shows the content of a folder."
+            f"There is no object file {path}.",
+            "'congrasp objects list' shows the content of a folder.",
         )
     data = read_file(path, MAX_BYTES, remedy)
     try:
@@ -79,9 +99,12 @@ class Catalogue:
         """
         if not self.folder.is_dir():
             raise CongraspError(
-                f"There is no folder {self.folder}.", "Make one with 'congrasp objects generate' or 'objects import'."
+                f"There is no folder {self.folder}.",
+                "Make one with 'congrasp objects generate' or 'objects import'.",
             )
-        return sorted(path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith("."))
+        return sorted(
+            path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")
+        )
 
     def get(self, name: str) -> GraspObject:
         """Returns the object of this name.
@@ -126,7 +149,10 @@ def _to_message(obj: GraspObject) -> Message:
         "family": obj.family,
         "part_names": list(obj.part_names),
         "mass": float(obj.mass),
-        "units": "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre of mass",
+        "units": (
+            "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre "
+            "of mass"
+        ),
     }
     if any(obj.origin):
         meta["origin"] = list(obj.origin)
@@ -143,7 +169,9 @@ def _to_message(obj: GraspObject) -> Message:
 
 
 def _from_message(message: Message) -> GraspObject:
-    """Returns the object of a message; raises KeyError, IndexError or ValueError if a field is missing or invalid."""
+    """Returns the object of a message; raises KeyError, IndexError or ValueError if a field is
+    missing or invalid.
+    """
     arrays, meta = message.arrays, message.meta
     ends = np.cumsum(arrays["piece_vertex_count"])
     vertices = np.split(arrays["piece_vertices"], ends[:-1])
@@ -171,7 +199,9 @@ def _from_message(message: Message) -> GraspObject:
         surface_error=meta.get("surface_error"),
         volume_error=meta.get("volume_error"),
         **{name: arrays[name] for name in _ARRAYS},
-        colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_points" in arrays else None,
+        colours=Colours(arrays["colour_points"], arrays["colour_values"])
+        if "colour_points" in arrays
+        else None,
     )
 
 
@@ -186,7 +216,9 @@ _ROUNDING = 1e-3
 
 
 def faults(obj: GraspObject) -> Iterator[str]:
-    """Yields the faults of an object, one phrase each; later ones assume that earlier checks passed."""
+    """Yields the faults of an object, one phrase each; later ones assume that earlier checks
+    passed.
+    """
     yield from _facts(obj)
     wrong_shape = list(_shapes(obj))
     yield from wrong_shape
@@ -225,7 +257,9 @@ def _facts(obj: GraspObject) -> Iterator[str]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300
+    )
 
 
 def _is_text(value: object) -> bool:
@@ -253,7 +287,9 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
             yield f"its colour_values are {obj.colours.values.dtype}, not uint8"
     for name, (kinds, shape) in wanted.items():
         array = arrays[name]
-        fits = len(array.shape) == len(shape) and all(w in (None, n) for w, n in zip(shape, array.shape, strict=True))
+        fits = len(array.shape) == len(shape) and all(
+            w in (None, n) for w, n in zip(shape, array.shape, strict=True)
+        )
         if array.dtype.kind not in kinds or not fits:
             words = ", ".join("n" if size is None else str(size) for size in shape)
             yield f"its {name} has the shape {array.shape} and type {array.dtype}, not ({words})"
@@ -261,12 +297,22 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
 
 def _arrays(obj: GraspObject) -> Iterator[str]:
     """Yields implausible values of arrays."""
-    placed = {name: getattr(obj, name) for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices")}
-    for name, values in (placed | ({"colour_points": obj.colours.points} if obj.colours else {})).items():
+    placed = {
+        name: getattr(obj, name)
+        for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices")
+    }
+    for name, values in (
+        placed | ({"colour_points": obj.colours.points} if obj.colours else {})
+    ).items():
         if not np.isfinite(values).all():
             yield f"its {name} holds numbers that are not finite"
-        elif values.size and np.abs(values).max() > (HEAVIEST * LARGEST**2 if name == "inertia" else LARGEST):
-            yield f"its {name} goes up to {np.abs(values).max():.3g}, which is too large for an object"
+        elif values.size and np.abs(values).max() > (
+            HEAVIEST * LARGEST**2 if name == "inertia" else LARGEST
+        ):
+            yield (
+                f"its {name} goes up to {np.abs(values).max():.3g}, which is too large for an "
+                f"object"
+            )
     if obj.labels.min() < 0 or obj.labels.max() >= len(obj.part_names):
         yield "its labels name parts that do not exist"
     if not 1 <= len(obj.rest_poses) <= _RESTS:
@@ -281,7 +327,9 @@ def _arrays(obj: GraspObject) -> Iterator[str]:
 
 
 def _inertia(obj: GraspObject) -> Iterator[str]:
-    """Yields faults of the inertia: principal moments are positive, and two of them exceed the third."""
+    """Yields faults of the inertia: principal moments are positive, and two of them exceed the
+    third.
+    """
     if not np.isfinite(obj.inertia).all():
         return
     if np.abs(obj.inertia - obj.inertia.T).max() > _ROUNDING * np.abs(obj.inertia).max():
@@ -289,13 +337,18 @@ def _inertia(obj: GraspObject) -> Iterator[str]:
         return
     small, middle, large = np.linalg.eigvalsh(obj.inertia.astype(float))
     if small <= 0 or small + middle < (1 - _ROUNDING) * large:
-        yield f"its inertia has principal moments {small:.3g}, {middle:.3g} and {large:.3g}, which no rigid body has"
+        yield (
+            f"its inertia has principal moments {small:.3g}, {middle:.3g} and {large:.3g}, which "
+            f"no rigid body has"
+        )
 
 
 def _piece(piece: Piece, parts: int) -> Iterator[str]:
     """Yields the faults of a piece."""
     numbers = [*piece.size, *piece.pos, *piece.quat]
-    if (len(piece.size), len(piece.pos), len(piece.quat)) != (3, 3, 4) or not all(map(math.isfinite, numbers)):
+    if (len(piece.size), len(piece.pos), len(piece.quat)) != (3, 3, 4) or not all(
+        map(math.isfinite, numbers)
+    ):
         yield "has a size or pose with numbers that are not finite"
         return
     used = piece.size[: _SIZES[piece.kind]]
@@ -315,4 +368,7 @@ def _piece(piece: Piece, parts: int) -> Iterator[str]:
         and np.isfinite(vertices).all()
         and np.abs(vertices).max() <= LARGEST
     ):
-        yield f"has vertices that are not 4 to {_CORNERS} points of finite numbers within {LARGEST:g} m"
+        yield (
+            f"has vertices that are not 4 to {_CORNERS} points of finite numbers within "
+            f"{LARGEST:g} m"
+        )

@@ -1,7 +1,8 @@
 """Policy bundle: weights, critic and normalisers of one version, as one immutable unit.
 
-The learner publishes bundles, actors and the policy server act with them, and the package ships some. Acting normalises
-with the bundle's statistics, so that a log probability belongs to exactly one bundle.
+The learner publishes bundles, actors and the policy server act with them, and the package ships
+some. Acting normalises with the bundle's statistics, so that a log probability belongs to exactly
+one bundle.
 """
 
 import dataclasses
@@ -39,10 +40,12 @@ _SCHEMA = 1
 _MOST_COUNT = 1 << 53
 """Limit of versions and environment steps, which JSON keeps exactly."""
 _LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
-"""Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond them, inference in
-float32 overflows."""
+"""Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond
+them, inference in float32 overflows."""
 _SAMPLES_KEPT = 1e5
-"""Most samples that count when inputs are added: samples of these soon outweigh the unit variance of their start."""
+"""Most samples that count when inputs are added: samples of these soon outweigh the unit variance
+of their start.
+"""
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle from 'congrasp train' of this version."
 
@@ -60,8 +63,8 @@ class PolicySpec:
     network: NetworkConfig
     """Sizes of the networks."""
     privileged: Layout = ()
-    """Names and sizes of the critic's privileged inputs (`common.task.privileged`); not part of the schema, because
-    acting does not use them."""
+    """Names and sizes of the critic's privileged inputs (`common.task.privileged`); not part of the
+    schema, because acting does not use them."""
 
     @property
     def privileged_size(self) -> int:
@@ -93,7 +96,8 @@ class PolicySpec:
         """Raises a `CongraspError` unless `spec`, that of `source`, has the schema of this one."""
         if spec.schema != self.schema:
             raise CongraspError(
-                f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not for hand "
+                f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not "
+                f"for hand "
                 f"'{self.hand_name}' (schema {self.schema}).",
                 "Use a policy of this hand, task and network, or change them.",
             )
@@ -113,7 +117,9 @@ def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
 
 def full_layout(task: TaskConfig) -> Layout:
     """Layout of the full observation of the task, even if its policy observes less."""
-    return task_observation.layout(get_hand(task.hand), dataclasses.replace(task, observation="full"))
+    return task_observation.layout(
+        get_hand(task.hand), dataclasses.replace(task, observation="full")
+    )
 
 
 class InferenceParameters(NamedTuple):
@@ -140,7 +146,9 @@ class PolicyBundle:
     version: int
     """Increases with every update of a run, also across restarts of its learner."""
     run_id: str
-    """Identifier of the run's start: new when training restarts from scratch, unchanged by a resume."""
+    """Identifier of the run's start: new when training restarts from scratch, unchanged by a
+    resume.
+    """
     transitions: int
     """Environment steps of the training."""
     privileged: Statistics | None = None
@@ -154,9 +162,15 @@ class PolicyBundle:
 
     def to_message(self) -> Message:
         """Returns the bundle as arrays and metadata; arrays are shared, not copied."""
-        tree = {**self.params, "observation": self.observation._asdict(), "value": self.value._asdict()}
+        tree = {
+            **self.params,
+            "observation": self.observation._asdict(),
+            "value": self.value._asdict(),
+        }
         if self.spec.privileged:
-            tree["privileged"] = (self.privileged or normalizer.empty((self.spec.privileged_size,)))._asdict()
+            tree["privileged"] = (
+                self.privileged or normalizer.empty((self.spec.privileged_size,))
+            )._asdict()
         meta = {
             "format": FORMAT,
             "version": self.version,
@@ -181,11 +195,14 @@ class PolicyBundle:
           source: name of the bundle in errors.
 
         Raises:
-          CongraspError: an entry is missing, has the wrong shape, or is out of range; the message names the first.
+          CongraspError: an entry is missing, has the wrong shape, or is out of range; the message
+          names the first.
         """
         meta = message.meta
         if meta.get("format") != FORMAT:
-            raise CongraspError(f"The policy {source} has format {meta.get('format')}, not {FORMAT}.", _REMEDY)
+            raise CongraspError(
+                f"The policy {source} has format {meta.get('format')}, not {FORMAT}.", _REMEDY
+            )
         try:
             spec = PolicySpec(
                 hand=check_reference(meta["hand"]),
@@ -195,30 +212,48 @@ class PolicyBundle:
                 privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
             )
             task = _dataclass(TaskConfig, meta["task"])
-            version, run_id, transitions = int(meta["version"]), str(meta["run_id"]), int(meta["transitions"])
+            version, run_id, transitions = (
+                int(meta["version"]),
+                str(meta["run_id"]),
+                int(meta["transitions"]),
+            )
             for name, number in (("version", version), ("transitions", transitions)):
                 if not 0 <= number <= _MOST_COUNT:
                     raise ValueError(f"its {name} is {number:.4g}")
             inputs = (*spec.layout, *spec.privileged)
-            for fault in (*network_faults(spec.network, inputs, spec.action_size), *task_faults(task)):
+            for fault in (
+                *network_faults(spec.network, inputs, spec.action_size),
+                *task_faults(task),
+            ):
                 raise ValueError(fault)
             shapes = _shapes(spec)
         except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
             why = str(error).rstrip(".")[:200]
-            raise CongraspError(f"The policy {source} has invalid metadata: {why}.", _REMEDY) from None
+            raise CongraspError(
+                f"The policy {source} has invalid metadata: {why}.", _REMEDY
+            ) from None
         if meta.get("schema") != spec.schema:
-            raise CongraspError(f"The policy {source} has a schema that does not match its content.", _REMEDY)
+            raise CongraspError(
+                f"The policy {source} has a schema that does not match its content.", _REMEDY
+            )
         _check_arrays(message.arrays, shapes, source)
         tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
         names = ("observation", "value", *(["privileged"] if spec.privileged else []))
         statistics = {name: Statistics(**tree.pop(name)) for name in names}
         return PolicyBundle(
-            spec=spec, task=task, params=tree, version=version, run_id=run_id, transitions=transitions, **statistics
+            spec=spec,
+            task=task,
+            params=tree,
+            version=version,
+            run_id=run_id,
+            transitions=transitions,
+            **statistics,
         )
 
 
 def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> PolicyBundle:
-    """Returns the bundle with the inputs of another spec; new ones of state and critic get zero weight.
+    """Returns the bundle with the inputs of another spec; new ones of state and critic get zero
+    weight.
 
     Args:
       spec: spec of the result: that of the task.
@@ -233,12 +268,18 @@ def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> 
     if spec.schema != bundle.spec.schema:
         hand = get_hand(spec.hand)
         now, before = (_state_inputs(hand, each) for each in (task, bundle.task))
-        grown = dataclasses.replace(bundle.spec, layout=(("state", len(now)), *bundle.spec.layout[1:]))
-        spec.require(grown if len(before) == size and {*before} <= {*now} else bundle.spec, "to begin with")
+        grown = dataclasses.replace(
+            bundle.spec, layout=(("state", len(now)), *bundle.spec.layout[1:])
+        )
+        spec.require(
+            grown if len(before) == size and {*before} <= {*now} else bundle.spec, "to begin with"
+        )
         index = {name: i for i, name in enumerate(before)}
         state = np.array([index.get(name, -1) for name in now])
     same_critic = spec.privileged == bundle.spec.privileged
-    privileged = np.arange(spec.privileged_size) if same_critic else np.full(spec.privileged_size, -1)
+    privileged = (
+        np.arange(spec.privileged_size) if same_critic else np.full(spec.privileged_size, -1)
+    )
     rows = np.concatenate([state, np.arange(size, len(bundle.observation.mean))])
     fewer = min(count, _SAMPLES_KEPT) if (state < 0).any() else count
     scale = fewer / count if count else 1.0
@@ -277,14 +318,18 @@ def load(path: pathlib.Path) -> PolicyBundle:
     try:
         message = decode(data)
     except CongraspError as error:
-        raise CongraspError(f"The policy {path} is damaged, or not a policy: {error}", remedy) from None
+        raise CongraspError(
+            f"The policy {path} is damaged, or not a policy: {error}", remedy
+        ) from None
     return PolicyBundle.from_message(message, str(path))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def mean_action(layout: Layout, parameters: InferenceParameters, observation: Array) -> Array:
     """Deterministic action (..., A) for raw observations (..., D)."""
-    mean, _ = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
+    mean, _ = network.policy(
+        parameters.params, layout, normalizer.apply(parameters.normalization, observation)
+    )
     return mean
 
 
@@ -293,7 +338,9 @@ def sample_action(
     layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
 ) -> tuple[Array, Array]:
     """Sampled action (..., A) for raw observations (..., D), and its log probability (...,)."""
-    mean, log_std = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
+    mean, log_std = network.policy(
+        parameters.params, layout, normalizer.apply(parameters.normalization, observation)
+    )
     action = network.sample(key, mean, log_std)
     return action, network.log_probability(mean, log_std, action)
 
@@ -301,15 +348,19 @@ def sample_action(
 def _act_by_mean(
     layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
 ) -> tuple[Array, Array]:
-    """`mean_action` with the signature of `sample_action`: the key is ignored, and the log probability is 0."""
+    """`mean_action` with the signature of `sample_action`: the key is ignored, and the log
+    probability is 0.
+    """
     return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[:-1])
 
 
 @functools.cache
 def acting(layout: Layout, *, mean: bool) -> Any:
-    """The action of policies with this layout, by their mean or sampled, as a function for rollouts.
+    """The action of policies with this layout, by their mean or sampled, as a function for
+    rollouts.
 
-    The same layout gives the same object, so that rollouts of different policies share compiled programs.
+    The same layout gives the same object, so that rollouts of different policies share compiled
+    programs.
     """
     return functools.partial(_act_by_mean if mean else sample_action, layout)
 
@@ -324,25 +375,51 @@ def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
     """Shapes of a bundle's arrays by name."""
     params = network.shapes(spec.layout, spec.action_size, spec.network, spec.privileged_size)
     size = sum(width for _, width in spec.layout)
-    statistics = {"observation": normalizer.empty((size,))._asdict(), "value": normalizer.empty()._asdict()}
+    statistics = {
+        "observation": normalizer.empty((size,))._asdict(),
+        "value": normalizer.empty()._asdict(),
+    }
     if spec.privileged:
         statistics["privileged"] = normalizer.empty((spec.privileged_size,))._asdict()
     flat = flax.traverse_util.flatten_dict({**params, **statistics}, sep="/")
     return {name: tuple(leaf.shape) for name, leaf in flat.items()}
 
 
-def _check_arrays(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str) -> None:
-    """Raises a `CongraspError` unless the arrays have these names and shapes, and values with which one can act."""
+def _check_arrays(
+    arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str
+) -> None:
+    """Raises a `CongraspError` unless the arrays have these names and shapes, and values with which
+    one can act.
+    """
     if odd := sorted(expected.keys() ^ arrays.keys()):
-        raise CongraspError(f"The policy {source} lacks '{odd[0]}', or should not have it.", _REMEDY)
+        raise CongraspError(
+            f"The policy {source} lacks '{odd[0]}', or should not have it.", _REMEDY
+        )
     for name, shape in expected.items():
         array, last = arrays[name], name.rpartition("/")[2]
-        high = _LARGEST_LOG_STD if last == "log_std" else _LARGEST_STATISTIC if last in Statistics._fields else _LARGEST
+        high = (
+            _LARGEST_LOG_STD
+            if last == "log_std"
+            else _LARGEST_STATISTIC
+            if last in Statistics._fields
+            else _LARGEST
+        )
         low = 0.0 if last in ("count", "m2") else -high
         if tuple(array.shape) != shape:
-            raise CongraspError(f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY)
-        # Arrays on a device never left this process; those from a file or the wire are NumPy arrays.
-        if isinstance(array, np.ndarray) and not (array.dtype.kind == "f" and np.isfinite(array).all()):
-            raise CongraspError(f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY)
-        if isinstance(array, np.ndarray) and not (low <= array.min(initial=0) and array.max(initial=0) <= high):
-            raise CongraspError(f"The policy {source} has values in '{name}' out of range.", _REMEDY)
+            raise CongraspError(
+                f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY
+            )
+        # Arrays on a device never left this process; those from a file or the wire are NumPy
+        # arrays.
+        if isinstance(array, np.ndarray) and not (
+            array.dtype.kind == "f" and np.isfinite(array).all()
+        ):
+            raise CongraspError(
+                f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY
+            )
+        if isinstance(array, np.ndarray) and not (
+            low <= array.min(initial=0) and array.max(initial=0) <= high
+        ):
+            raise CongraspError(
+                f"The policy {source} has values in '{name}' out of range.", _REMEDY
+            )

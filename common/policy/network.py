@@ -1,17 +1,20 @@
-"""Policy and critic networks, which have the same structure but share no weights, and the policy's diagonal Gaussian.
+"""Policy and critic networks, which have the same structure but share no weights, and the policy's
+diagonal Gaussian.
 
-State and heading are always active and feed the trunk directly. Each optional constraint has an encoder whose output is
-multiplied by the constraint's mask bit, so that the trunk receives zeros for an inactive constraint. All points of a
-camera's cloud pass through the same layers, and the trunk receives the maxima over the points, which do not depend on
-their order (Qi et al. 2017, arXiv 1612.00593).
+State and heading are always active and feed the trunk directly. Each optional constraint has an
+encoder whose output is multiplied by the constraint's mask bit, so that the trunk receives zeros
+for an inactive constraint. All points of a camera's cloud pass through the same layers, and the
+trunk receives the maxima over the points, which do not depend on their order (Qi et al. 2017, arXiv
+1612.00593).
 
-All functions are pure. `params` is a nested dict with the entries `actor` and `critic`; observations are already
-normalised (`common.policy.normalizer`) and have any leading axes.
+All functions are pure. `params` is a nested dict with the entries `actor` and `critic`;
+observations are already normalised (`common.policy.normalizer`) and have any leading axes.
 
-Where an actor process and the learner must agree on a log probability, the policy's matrix products are true float32 on
-every backend: an error of the mean is amplified by 1/std and then exponentiated. The critic, which is only regressed,
-and the ratios inside an update, whose two policies are computed in the same way, use the backend's default (TF32 on
-NVIDIA GPUs) at half the cost.
+Where an actor process and the learner must agree on a log probability, the policy's matrix products
+are true float32 on every backend: an error of the mean is amplified by 1/std and then
+exponentiated. The critic, which is only regressed, and the ratios inside an update, whose two
+policies are computed in the same way, use the backend's default (TF32 on NVIDIA GPUs) at half the
+cost.
 """
 
 import itertools
@@ -52,14 +55,24 @@ def gated(layout: Layout) -> tuple[str, ...]:
 def check_layout(layout: Layout) -> None:
     """Raises a `CongraspError` unless the layout has exactly the blocks of the networks."""
     names = [name for name, _ in layout]
-    if len(set(names)) < len(names) or not {*TRUNK} <= {*names} or dict(layout)["mask"] != len(gated(layout)):
-        raise CongraspError(f"The observation layout {names} does not match the network.", "Use this version's layout.")
+    if (
+        len(set(names)) < len(names)
+        or not {*TRUNK} <= {*names}
+        or dict(layout)["mask"] != len(gated(layout))
+    ):
+        raise CongraspError(
+            f"The observation layout {names} does not match the network.",
+            "Use this version's layout.",
+        )
 
 
 def split(layout: Layout, observation: Array) -> dict[str, Array]:
     """Splits observations (..., D) into blocks by name."""
     ends = itertools.accumulate(size for _, size in layout)
-    return {name: observation[..., end - size : end] for (name, size), end in zip(layout, ends, strict=True)}
+    return {
+        name: observation[..., end - size : end]
+        for (name, size), end in zip(layout, ends, strict=True)
+    }
 
 
 class GatedNetwork(nn.Module):
@@ -113,7 +126,9 @@ def _exact(
     return GatedNetwork(layout, hidden, points, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
-def _fast(layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+def _fast(
+    layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int
+) -> GatedNetwork:
     """Returns the critic network of `_sizes`, in the device's default precision."""
     return GatedNetwork(layout, hidden, points, encoder, outputs, None)
 
@@ -122,7 +137,9 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], tuple[int, ...], int, int]:
     """Units of a network's trunk, points, encoders and output, from its kernels' shapes."""
     units = {name: layer["kernel"].shape[-1] for name, layer in tree.items()}
     depths = {kind: layer_count(tree, kind) for kind in ("trunk", CLOUD)}
-    hidden, points = (tuple(units.pop(f"{kind}_{i}") for i in range(depth)) for kind, depth in depths.items())
+    hidden, points = (
+        tuple(units.pop(f"{kind}_{i}") for i in range(depth)) for kind, depth in depths.items()
+    )
     outputs = units.pop("output")
     return hidden, points, next(iter(units.values()), 0), outputs
 
@@ -156,10 +173,14 @@ def shapes(layout: Layout, action_size: int, config: NetworkConfig, privileged: 
     }
 
 
-def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0) -> Params:
-    """Initial parameters with orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`.
+def init(
+    seed: int, layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0
+) -> Params:
+    """Initial parameters with orthogonal weights and zero biases: `{"actor": {"network",
+    "log_std"}, "critic": {...}}`.
 
-    Weights are drawn with NumPy, since compiling a QR decomposition for each kernel's shape would take seconds.
+    Weights are drawn with NumPy, since compiling a QR decomposition for each kernel's shape would
+    take seconds.
 
     Args:
       seed: seed of the weights; the actor's do not depend on `privileged`.
@@ -176,7 +197,9 @@ def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig, pri
         gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
         return {
             name: {
-                "kernel": (gains[name] * _orthogonal(rng, layer["kernel"].shape)).astype(np.float32),
+                "kernel": (gains[name] * _orthogonal(rng, layer["kernel"].shape)).astype(
+                    np.float32
+                ),
                 "bias": np.zeros(layer["bias"].shape, np.float32),
             }
             for name, layer in layers.items()
@@ -188,26 +211,37 @@ def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig, pri
 
 
 def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """A random matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014, arXiv 1312.6120)."""
+    """A random matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014,
+    arXiv 1312.6120).
+    """
     tall = rng.normal(size=(max(shape), min(shape)))
     q, r = np.linalg.qr(tall)
     q *= np.sign(np.diag(r))
     return q if q.shape == shape else q.T
 
 
-def policy(params: Params, layout: Layout, observation: Array, *, exact: bool = True) -> tuple[Array, Array]:
-    """Mean (..., A) and log standard deviation (A,) of the action; the latter does not depend on the observation.
+def policy(
+    params: Params, layout: Layout, observation: Array, *, exact: bool = True
+) -> tuple[Array, Array]:
+    """Mean (..., A) and log standard deviation (A,) of the action; the latter does not depend on
+    the observation.
 
-    Without `exact`, matrix products have the backend's default precision, for means that are only compared with each
-    other.
+    Without `exact`, matrix products have the backend's default precision, for means that are only
+    compared with each other.
     """
     actor = params["actor"]
     build = _exact if exact else _fast
-    return build(layout, *_sizes(actor["network"])).apply({"params": actor["network"]}, observation), actor["log_std"]
+    return build(layout, *_sizes(actor["network"])).apply(
+        {"params": actor["network"]}, observation
+    ), actor["log_std"]
 
 
-def value(params: Params, layout: Layout, observation: Array, privileged: Array | None = None) -> Array:
-    """Estimate (...,) of the normalised return by the critic, from observations and its privileged inputs (..., P)."""
+def value(
+    params: Params, layout: Layout, observation: Array, privileged: Array | None = None
+) -> Array:
+    """Estimate (...,) of the normalised return by the critic, from observations and its privileged
+    inputs (..., P).
+    """
     critic = params["critic"]
     if privileged is not None:
         layout = _critic_layout(layout, privileged.shape[-1])
@@ -217,12 +251,14 @@ def value(params: Params, layout: Layout, observation: Array, privileged: Array 
 
 
 def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Params:
-    """Returns the parameters of networks with more inputs, which get zero weight: results do not change yet.
+    """Returns the parameters of networks with more inputs, which get zero weight: results do not
+    change yet.
 
     Args:
       params: parameters of actor and critic.
-      state: for each input of the new state its index in the old one, all of which must occur, or -1 if it is new.
-      privileged: the same for the critic's privileged inputs, of which some may be dropped.
+      state: for each input of the new state its index in the old one, all of which must occur, or
+      -1 if it is new. privileged: the same for the critic's privileged inputs, of which some may be
+      dropped.
     """
     before = len(params["actor"]["network"]["trunk_0"]["kernel"])
     kept = np.concatenate([state, np.arange(np.count_nonzero(state >= 0), before)])

@@ -1,10 +1,10 @@
 """Running statistics of observations and returns.
 
-A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32; the
-host merges these few hundred numbers into the running statistics in float64 (Chan et al. 1979). Counts beyond 2^24
-therefore stay exact and small updates of an old mean are not lost, without 64-bit mode on the device. Merging is
-associative up to float64 rounding: the deltas of several learner ranks, merged in rank order on every rank, are bitwise
-identical.
+A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the
+mean) in float32; the host merges these few hundred numbers into the running statistics in float64
+(Chan et al. 1979). Counts beyond 2^24 therefore stay exact and small updates of an old mean are not
+lost, without 64-bit mode on the device. Merging is associative up to float64 rounding: the deltas
+of several learner ranks, merged in rank order on every rank, are bitwise identical.
 """
 
 import functools
@@ -49,7 +49,8 @@ def empty(shape: tuple[int, ...] = ()) -> Statistics:
 def moments(samples: Array, event_axes: int = 0) -> Statistics:
     """Float32 statistics of a batch over all axes but the last `event_axes`.
 
-    Two passes with the compensation of the mean's rounding (Chan, Golub and LeVeque 1983, equation 1.7).
+    Two passes with the compensation of the mean's rounding (Chan, Golub and LeVeque 1983, equation
+    1.7).
     """
     axes = tuple(range(samples.ndim - event_axes))
     count = np.prod([samples.shape[axis] for axis in axes], dtype=np.float64)
@@ -85,10 +86,10 @@ def _std(statistics: Statistics) -> np.ndarray:
 def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
     """Normalisation of observations (..., D); the identity while there are no samples.
 
-    `state` and `heading` are centred and divided by their standard deviation. Optional blocks are divided by their root
-    mean square without centring: zero, which means "inactive", stays exactly zero, and a nearly constant feature is not
-    amplified to the clip. Mask bits are unchanged. All points of a cloud have the same scales, so that their order does
-    not matter.
+    `state` and `heading` are centred and divided by their standard deviation. Optional blocks are
+    divided by their root mean square without centring: zero, which means "inactive", stays exactly
+    zero, and a nearly constant feature is not amplified to the clip. Mask bits are unchanged. All
+    points of a cloud have the same scales, so that their order does not matter.
     """
     size = sum(width for _, width in layout)
     shift, scale = np.zeros(size), np.ones(size)
@@ -110,19 +111,27 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
 
 
 def privileged_affine(statistics: Statistics) -> Affine:
-    """Normalisation of the critic's privileged inputs (..., P) by mean and standard deviation, or the identity."""
+    """Normalisation of the critic's privileged inputs (..., P) by mean and standard deviation, or
+    the identity.
+    """
     if statistics.count == 0:
-        return Affine(np.zeros_like(statistics.mean, np.float32), np.ones_like(statistics.mean, np.float32))
+        return Affine(
+            np.zeros_like(statistics.mean, np.float32), np.ones_like(statistics.mean, np.float32)
+        )
     return Affine(statistics.mean.astype(np.float32), (1.0 / _std(statistics)).astype(np.float32))
 
 
 def apply(affine: Affine, observation: Array) -> Array:
-    """Normalised observations (..., D) in float32, clipped to `LIMIT`. Zeros of inactive blocks stay zero."""
+    """Normalised observations (..., D) in float32, clipped to `LIMIT`. Zeros of inactive blocks
+    stay zero.
+    """
     return jnp.clip((observation.astype(jnp.float32) - affine.shift) * affine.scale, -LIMIT, LIMIT)
 
 
 def value_affine(statistics: Statistics) -> Affine:
-    """Normalisation of returns by mean and standard deviation; the identity while there are no samples."""
+    """Normalisation of returns by mean and standard deviation; the identity while there are no
+    samples.
+    """
     if statistics.count == 0:
         return Affine(np.float32(0.0), np.float32(1.0))
     return Affine(np.float32(statistics.mean), np.float32(1.0 / _std(statistics)))

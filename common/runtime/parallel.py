@@ -1,4 +1,6 @@
-"""Cores and memory available to this process, and work distributed among processes if that pays for starting them."""
+"""Cores and memory available to this process, and work distributed among processes if that pays for
+starting them.
+"""
 
 import concurrent.futures
 import contextlib
@@ -22,27 +24,45 @@ Result = TypeVar("Result")
 _WORTH_IT = 64  # calls; below this, starting processes takes longer than it saves
 _MOST_WORKERS = 16
 _PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constraints")
-"""Modules imported once, before the workers fork; workers import anything else their functions need."""
+"""Modules imported once, before the workers fork; workers import anything else their functions
+need.
+"""
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-"""Environment of processes that share the cores: each would otherwise start a thread for every core, for products so
-small that the threads cost several times the work."""
+"""Environment of processes that share the cores: each would otherwise start a thread for every
+core, for products so small that the threads cost several times the work."""
 _GROUPS = pathlib.Path("/sys/fs/cgroup")
 _MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """Number of cores available to this process, by its affinity and the quotas of its control groups, rounded up."""
-    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quotas = (text.split() for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us"))
+    """Number of cores available to this process, by its affinity and the quotas of its control
+    groups, rounded up.
+    """
+    affinity = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    quotas = (
+        text.split() for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us")
+    )
     shares = [int(quota) / int(period) for quota, period in quotas if quota not in ("max", "-1")]
     return max(1, math.ceil(min([affinity, *shares])))
 
 
 def memory() -> int:
-    """Bytes of memory available to this process: free ones, and what the limits of its control groups leave."""
+    """Bytes of memory available to this process: free ones, and what the limits of its control
+    groups leave.
+    """
     limits = _limits("memory", "memory.max", "memory.limit_in_bytes")
     used = psutil.Process().memory_info().rss
-    return max(0, min([psutil.virtual_memory().available, *(int(text) - used for text in limits if text != "max")]))
+    return max(
+        0,
+        min(
+            [
+                psutil.virtual_memory().available,
+                *(int(text) - used for text in limits if text != "max"),
+            ]
+        ),
+    )
 
 
 def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
@@ -58,7 +78,9 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
             _, controllers, group = line.split(":", 2)
             if controllers and controller not in controllers.split(","):
                 continue
-            mount, files = (_GROUPS / controller, separate) if controllers else (_GROUPS, (unified,))
+            mount, files = (
+                (_GROUPS / controller, separate) if controllers else (_GROUPS, (unified,))
+            )
             path = pathlib.PurePath(group.lstrip("/"))
             for folder in (path, *path.parents):
                 with contextlib.suppress(OSError):
@@ -68,8 +90,9 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
     """`map` over processes, in order; runs in this process if there are few calls or few cores.
 
-    The workers are children of a helper process that imports congrasp alone: they never run the caller's `__main__`.
-    What fails there, for instance for something that only this process has registered, runs in this process.
+    The workers are children of a helper process that imports congrasp alone: they never run the
+    caller's `__main__`. What fails there, for instance for something that only this process has
+    registered, runs in this process.
 
     Args:
       function: a top-level function of a module; it must not use an accelerator.
@@ -78,7 +101,10 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
     rows = list(zip(*columns, strict=True))
     workers = _workers(len(rows))
     results = _helper().results(workers, function, rows) if workers else [None] * len(rows)
-    return [function(*row) if found is None else found[0] for row, found in zip(rows, results, strict=True)]
+    return [
+        function(*row) if found is None else found[0]
+        for row, found in zip(rows, results, strict=True)
+    ]
 
 
 def prepare_workers(calls: int) -> None:
@@ -96,19 +122,24 @@ def _workers(calls: int) -> int:
 class _Helper:
     """A process that forks workers, since forking this one could deadlock if it has started JAX.
 
-    Python's fork server would import the caller's `__main__` in each worker, and is shared with the caller's own use.
+    Python's fork server would import the caller's `__main__` in each worker, and is shared with the
+    caller's own use.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._running: tuple[subprocess.Popen[bytes], multiprocessing.connection.Connection] | None = None
+        self._running: (
+            tuple[subprocess.Popen[bytes], multiprocessing.connection.Connection] | None
+        ) = None
 
     def start(self) -> None:
         """Starts the process if it is not running."""
         with self._lock:
             self._connected()
 
-    def results(self, workers: int, function: Callable[..., Result], rows: list[Any]) -> list[tuple[Result] | None]:
+    def results(
+        self, workers: int, function: Callable[..., Result], rows: list[Any]
+    ) -> list[tuple[Result] | None]:
         """Returns the result of each call, None for those that failed."""
         with self._lock:
             try:
@@ -132,7 +163,8 @@ class _Helper:
                     [
                         multiprocessing.spawn.get_executable(),
                         "-c",
-                        f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve({number})",
+                        f"import sys; sys.path[:] = {paths}; from {__name__} import serve; "
+                        f"serve({number})",
                     ],
                     stdin=subprocess.DEVNULL,
                     pass_fds=[number],

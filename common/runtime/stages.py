@@ -1,4 +1,6 @@
-"""Timing of the stages of a run's start, up to its first update, in any thread; each is a line of the log."""
+"""Timing of the stages of a run's start, up to its first update, in any thread; each is a line of
+the log.
+"""
 
 import contextlib
 import logging
@@ -40,7 +42,9 @@ def since_start() -> float:
 
 @contextlib.contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Times the block as the stage of this name, unless the stage exists: later calls do not belong to the start."""
+    """Times the block as the stage of this name, unless the stage exists: later calls do not belong
+    to the start.
+    """
     began = since_start()
     try:
         yield
@@ -49,7 +53,8 @@ def stage(name: str) -> Iterator[None]:
 
 
 def imported(ended: float | None = None) -> None:
-    """Records everything up to now as the stage of imports, and from now on JAX's work on programs as stages.
+    """Records everything up to now as the stage of imports, and from now on JAX's work on programs
+    as stages.
 
     Args:
       ended: the end of the imports in seconds since this process began, if it is earlier.

@@ -1,9 +1,11 @@
-"""Depth camera instead of a tracker: a cloud of the visible part of an object's surface, and no pose of the object.
+"""Depth camera instead of a tracker: a cloud of the visible part of an object's surface, and no
+pose of the object.
 
-An image is taken periodically or once, before the reach (`SensingConfig`). Its points are the object's surface points
-that no other part of the object hides (z-buffer on a coarse grid) nor the hand's capsules, with errors. The policy's
-object frame is the world frame: surface and goal of its scene are the cloud and the goal as stated at the start, both
-with the camera's constant error. The true pose is not part of that scene.
+An image is taken periodically or once, before the reach (`SensingConfig`). Its points are the
+object's surface points that no other part of the object hides (z-buffer on a coarse grid) nor the
+hand's capsules, with errors. The policy's object frame is the world frame: surface and goal of its
+scene are the cloud and the goal as stated at the start, both with the camera's constant error. The
+true pose is not part of that scene.
 """
 
 import functools
@@ -37,7 +39,9 @@ class Camera(NamedTuple):
     goal: Goal
     """Goal of the episode, with the constant error."""
     cloud: Surface
-    """Latest cloud, N points with labels, and normals estimated from them if the policy observes normals."""
+    """Latest cloud, N points with labels, and normals estimated from them if the policy observes
+    normals.
+    """
 
 
 class Capsules(NamedTuple):
@@ -49,7 +53,9 @@ class Capsules(NamedTuple):
     """(C,) m."""
 
 
-def begin(task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal) -> Camera:
+def begin(
+    task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal
+) -> Camera:
     """Returns cameras with one image before the reach, in which the hand hides nothing.
 
     Args:
@@ -62,27 +68,36 @@ def begin(task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface
     """
     origin = pose[:, :3]
     position = origin + sensors.position_bias
-    quaternion = rotations.multiply(rotations.from_rotation_vector(sensors.rotation_bias), pose[:, 3:])
-    empty = Surface(jnp.broadcast_to(position[:, None], surface.points.shape), jnp.zeros_like(surface.avoid))
+    quaternion = rotations.multiply(
+        rotations.from_rotation_vector(sensors.rotation_bias), pose[:, 3:]
+    )
+    empty = Surface(
+        jnp.broadcast_to(position[:, None], surface.points.shape), jnp.zeros_like(surface.avoid)
+    )
     if surface.normals is not None:
         empty = empty._replace(normals=jnp.zeros_like(surface.normals))
     poses = jnp.broadcast_to(pose[:, None], (len(pose), steps, 7))
     camera = Camera(sensors, origin, poses, goal_in_world(task, goal, position, quaternion), empty)
-    return _image(camera, jnp.zeros(len(pose), jnp.int32), jnp.ones(len(pose), bool), pose, surface, None)
+    return _image(
+        camera, jnp.zeros(len(pose), jnp.int32), jnp.ones(len(pose), bool), pose, surface, None
+    )
 
 
-def look(hand: Hand, camera: Camera, time: Array, state: Any, start: Any, surface: Surface) -> Camera:
+def look(
+    hand: Hand, camera: Camera, time: Array, state: Any, start: Any, surface: Surface
+) -> Camera:
     """Advances the cameras by one control step.
 
-    An image that arrives shows the object as it was `Sensors.delay` steps ago, behind the hand of this step.
+    An image that arrives shows the object as it was `Sensors.delay` steps ago, behind the hand of
+    this step.
 
     Args:
       hand: the hand.
       camera: state after the previous step.
       time: (B,) int control steps since the start of the episodes, including this one.
       state: true state of the engine after the step (`actors.physics.engine.PhysicsState`).
-      start: initial state of the episodes (`actors.physics.engine.ResetState`), for the wrist's base.
-      surface: labelled surface points, object frame.
+      start: initial state of the episodes (`actors.physics.engine.ResetState`), for the wrist's
+      base. surface: labelled surface points, object frame.
     """
     pose = jnp.concatenate([state.object_position, state.object_quaternion], -1)
     poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)
@@ -110,9 +125,15 @@ def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> C
 
 
 def _image(
-    camera: Camera, time: Array, due: Array, pose: Array, surface: Surface, hand: Callable[[Array], Capsules] | None
+    camera: Camera,
+    time: Array,
+    due: Array,
+    pose: Array,
+    surface: Surface,
+    hand: Callable[[Array], Capsules] | None,
 ) -> Camera:
-    """Replaces the clouds of cameras with a due image (B,) in which any point is visible, a small batch at a time.
+    """Replaces the clouds of cameras with a due image (B,) in which any point is visible, a small
+    batch at a time.
 
     Args:
       camera: the cameras.
@@ -122,7 +143,8 @@ def _image(
       surface: labelled surface points, object frame.
       hand: returns the capsules of these environments' hands; None if the hands hide nothing.
     """
-    camera, time, pose, surface = jax.tree.map(jnp.asarray, (camera, time, pose, surface))  # for traced rows
+    # For traced rows
+    camera, time, pose, surface = jax.tree.map(jnp.asarray, (camera, time, pose, surface))
     batch = len(due)
     together = min(batch, _TOGETHER)
 
@@ -135,11 +157,18 @@ def _image(
         cloud = jax.tree.map(lambda x, new: x.at[replaced].set(new, mode="drop"), cloud, fresh)
         return cloud, left.at[rows].set(False, mode="drop")
 
-    return camera._replace(cloud=jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (camera.cloud, due))[0])
+    return camera._replace(
+        cloud=jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (camera.cloud, due))[0]
+    )
 
 
 def _taken(
-    hand: Capsules | None, sensors: Sensors, origin: Array, time: Array, pose: Array, surface: Surface
+    hand: Capsules | None,
+    sensors: Sensors,
+    origin: Array,
+    time: Array,
+    pose: Array,
+    surface: Surface,
 ) -> tuple[Array, Surface]:
     """Returns which points (B, N) are visible, and the clouds of B images, world frame."""
     count = surface.points.shape[1]
@@ -157,10 +186,16 @@ def _taken(
     ray = points - eye[:, None]
     ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), 1e-6)
     measured = points + (sensors.position_noise[:, None] * noise)[..., None] * ray
-    shift, turn = origin + sensors.position_bias, rotations.from_rotation_vector(sensors.rotation_bias)
+    shift, turn = (
+        origin + sensors.position_bias,
+        rotations.from_rotation_vector(sensors.rotation_bias),
+    )
     measured = rotations.transform(shift, turn, measured - origin[:, None])
     index = _filled(visible)
-    cloud = Surface(jnp.take_along_axis(measured, index[..., None], 1), jnp.take_along_axis(surface.avoid, index, 1))
+    cloud = Surface(
+        jnp.take_along_axis(measured, index[..., None], 1),
+        jnp.take_along_axis(surface.avoid, index, 1),
+    )
     if surface.normals is not None:
         shown = rotations.transform(shift, turn, sensors.eye[:, None])[:, 0]
         cloud = cloud._replace(normals=estimated_normals(cloud.points, shown))
@@ -170,8 +205,9 @@ def _taken(
 def facing(eye: Array, points: Array) -> Array:
     """(B, N) bool: points (B, N, 3) that no other point hides from cameras at (B, 3).
 
-    The image of the points is divided into sqrt(N) / 2 by as many cells. Visible are the points of a cell that are no
-    farther than its nearest one by more than the longer side of a cell at the points' middle.
+    The image of the points is divided into sqrt(N) / 2 by as many cells. Visible are the points of
+    a cell that are no farther than its nearest one by more than the longer side of a cell at the
+    points' middle.
     """
     middle = jnp.mean(points, 1)
     quaternion = rotations.frame_from_axes(middle - eye, jnp.array((0.0, 0.0, 1.0)))
@@ -181,7 +217,9 @@ def facing(eye: Array, points: Array) -> Array:
     for tangent in (each / depth for each in across):
         low = jnp.min(tangent, -1, keepdims=True)
         side = jnp.maximum(jnp.max(tangent, -1, keepdims=True) - low, 1e-6) / cells
-        place = place * cells + jnp.clip(jnp.floor((tangent - low) / side), 0, cells - 1).astype(jnp.int32)
+        place = place * cells + jnp.clip(jnp.floor((tangent - low) / side), 0, cells - 1).astype(
+            jnp.int32
+        )
         sides.append(side)
     row = jnp.arange(len(points))[:, None]
     nearest = jnp.full((len(points), cells**2), jnp.inf).at[row, place].min(depth)
@@ -192,11 +230,14 @@ def facing(eye: Array, points: Array) -> Array:
 def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     """(B, N) bool: points (B, N, 3) whose ray from the camera (B, 3) meets a capsule.
 
-    The least distance between ray and axis follows Ericson 2005, Real-Time Collision Detection, section 5.1.9.
+    The least distance between ray and axis follows Ericson 2005, Real-Time Collision Detection,
+    section 5.1.9.
     """
     ray, axis = points - eye[:, None], capsules.ends[:, :, 1] - capsules.ends[:, :, 0]
     away = eye[:, None] - capsules.ends[:, :, 0]
-    product = functools.partial(jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST)
+    product = functools.partial(
+        jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST
+    )
     a = jnp.sum(ray * ray, -1)[:, :, None]
     e = jnp.maximum(jnp.sum(axis * axis, -1), 1e-12)[:, None]
     f = jnp.sum(axis * away, -1)[:, None]
@@ -204,17 +245,25 @@ def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     s = jnp.clip((b * f - c * e) / jnp.maximum(a * e - b * b, 1e-12), 0.0, 1.0)
     t = jnp.clip((b * s + f) / e, 0.0, 1.0)
     s = jnp.clip((b * t - c) / a, 0.0, 1.0)
-    squared = jnp.sum(away * away, -1)[:, None] + s * (s * a + 2.0 * c) + t * (t * e - 2.0 * f - 2.0 * s * b)
+    squared = (
+        jnp.sum(away * away, -1)[:, None]
+        + s * (s * a + 2.0 * c)
+        + t * (t * e - 2.0 * f - 2.0 * s * b)
+    )
     return jnp.any(squared <= capsules.radii**2, -1)
 
 
 def _filled(which: Array) -> Array:
-    """Indices (B, N) of the true flags (B, N), repeated evenly until there are N; zeros if there is none."""
+    """Indices (B, N) of the true flags (B, N), repeated evenly until there are N; zeros if there is
+    none.
+    """
     size, row = which.shape[1], jnp.arange(len(which))[:, None]
     rank = jnp.where(which, jnp.cumsum(which, -1) - 1, size)
     numbers = jnp.broadcast_to(jnp.arange(size), which.shape)
     found = jnp.zeros(which.shape, jnp.int32).at[row, rank].set(numbers, mode="drop")
-    return jnp.take_along_axis(found, jnp.arange(size) * jnp.sum(which, -1, keepdims=True) // size, 1)
+    return jnp.take_along_axis(
+        found, jnp.arange(size) * jnp.sum(which, -1, keepdims=True) // size, 1
+    )
 
 
 def goal_in_world(task: TaskSettings, goal: Goal, position: Array, quaternion: Array) -> Goal:

@@ -1,6 +1,8 @@
-"""Configuration of the task: its settings, with a weight for each reward term and a probability for each constraint.
+"""Configuration of the task: its settings, with a weight for each reward term and a probability for
+each constraint.
 
-Weights and probabilities are derived from `common.task.reward.GRASP` and `common.task.constraints.CONSTRAINTS`.
+Weights and probabilities are derived from `common.task.reward.GRASP` and
+`common.task.constraints.CONSTRAINTS`.
 """
 
 import dataclasses
@@ -18,16 +20,28 @@ __all__ = ["ControlConfig", "RewardWeights", "SensingConfig", "TaskConfig"]
 
 
 def _declared(fields: Iterable[tuple[str, float, str]]) -> Any:
-    """Returns a frozen dataclass of numbers declared elsewhere, from (name, default, help) triples."""
-    made = [(name, Annotated[float, Doc(text)], dataclasses.field(default=value)) for name, value, text in fields]
+    """Returns a frozen dataclass of numbers declared elsewhere, from (name, default, help)
+    triples.
+    """
+    made = [
+        (name, Annotated[float, Doc(text)], dataclasses.field(default=value))
+        for name, value, text in fields
+    ]
     return dataclasses.make_dataclass("Declared", made, frozen=True)
 
 
 _Weights: Any = _declared(
-    (*(term[:3] for term in GRASP), *(weight for constraint in CONSTRAINTS for weight in constraint.weights))
+    (
+        *(term[:3] for term in GRASP),
+        *(weight for constraint in CONSTRAINTS for weight in constraint.weights),
+    )
 )
 _Shares: Any = _declared(
-    (f"p_{c.name}", 0.5, f"Probability that an episode has the constraint '{c.name}', where the object allows it.")
+    (
+        f"p_{c.name}",
+        0.5,
+        f"Probability that an episode has the constraint '{c.name}', where the object allows it.",
+    )
     for c in CONSTRAINTS
     if c.optional
 )
@@ -36,7 +50,9 @@ _Shares: Any = _declared(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RewardWeights(_Weights):
-    """Weights of all reward terms, of the grasp and of each constraint, in units of reward per control step."""
+    """Weights of all reward terms, of the grasp and of each constraint, in units of reward per
+    control step.
+    """
 
 
 @dataclasses.dataclass(frozen=True)

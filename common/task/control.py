@@ -1,4 +1,6 @@
-"""Decodes actions to joint targets: incremental fingers and guided wrist (paper, section Control Space)."""
+"""Decodes actions to joint targets: incremental fingers and guided wrist (paper, section Control
+Space).
+"""
 
 from typing import NamedTuple
 
@@ -51,9 +53,10 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
 def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     """Returns joint targets for a residual action (B, M + 6) of the M finger motors and the wrist.
 
-    Motors: m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits), which gives q_tgt of the joints. Wrist: u_tgt = u_g +
-    alpha_w a_w, moved closer to the wrist if it would exceed the limits of speed or acceleration (`_lead`). After the
-    table is removed, u_tgt also compensates the load (`wrist_load`), and the limits apply relative to that.
+    Motors: m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits), which gives q_tgt of the joints. Wrist:
+    u_tgt = u_g + alpha_w a_w, moved closer to the wrist if it would exceed the limits of speed or
+    acceleration (`_lead`). After the table is removed, u_tgt also compensates the load
+    (`wrist_load`), and the limits apply relative to that.
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.motors)
@@ -68,14 +71,16 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     """Greatest distance (B,) of the wrist's target from the wrist, m.
 
-    The limit is `guidance_position_limit`. While the table is present it is lower near the object, so that the hand
-    arrives slowly: it rises from `closing_position_limit` at `closing_distance` from the object to
-    `approach_position_limit` at twice that.
+    The limit is `guidance_position_limit`. While the table is present it is lower near the object,
+    so that the hand arrives slowly: it rises from `closing_position_limit` at `closing_distance`
+    from the object to `approach_position_limit` at twice that.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
     slow, fast = control.closing_position_limit, control.approach_position_limit
     share = jnp.clip(gap / control.closing_distance - 1.0, 0.0, 1.0)
-    return jnp.where(scene.state.table, slow + share * (fast - slow), control.guidance_position_limit)
+    return jnp.where(
+        scene.state.table, slow + share * (fast - slow), control.guidance_position_limit
+    )
 
 
 class Guided(NamedTuple):
@@ -93,7 +98,9 @@ class Guided(NamedTuple):
     def bounded(self, control: ControlConfig) -> Array:
         """Returns the lead (..., 6) of the guidance alone, before the limits of acceleration."""
         slides = _limit(self.ahead[..., :3], self.limit[..., None])
-        return jnp.concatenate([slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1)
+        return jnp.concatenate(
+            [slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1
+        )
 
 
 def guided(scene: Scene, control: ControlConfig) -> Guided:
@@ -115,7 +122,12 @@ def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Arra
     share = jnp.where(given.table, 1.0, control.hold_acceleration)
     leads = []
     for part, scale, farthest, hardest in (
-        (slice(0, 3), control.wrist_position_scale, given.limit[..., None], control.wrist_acceleration),
+        (
+            slice(0, 3),
+            control.wrist_position_scale,
+            given.limit[..., None],
+            control.wrist_acceleration,
+        ),
         (
             slice(3, 6),
             control.wrist_rotation_scale,
@@ -126,25 +138,36 @@ def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Arra
         stiffness, damping = hand.wrist_servos[:, part.start]
         servo = _Servo(stiffness, damping, farthest, hardest)
         leads.append(
-            _lead(servo, given.ahead[..., part], scale * residual[..., part], given.velocity[..., part], share)
+            _lead(
+                servo,
+                given.ahead[..., part],
+                scale * residual[..., part],
+                given.velocity[..., part],
+                share,
+            )
         )
     return jnp.concatenate(leads, -1)
 
 
 def carried_lead(hand: Hand, state: SceneState) -> Array:
-    """(B, 6) by which the wrist's target leads so that its servos carry the load, after the table is removed."""
+    """(B, 6) by which the wrist's target leads so that its servos carry the load, after the table
+    is removed.
+    """
     stiffness, _ = hand.wrist_servos
     return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)
 
 
-def track_load(hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
-    """Updates the load observer's momentum z (B, 6) after a control step, m/s and rad/s; initially zero.
+def track_load(
+    hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array, u_target: Array
+) -> Array:
+    """Updates the load observer's momentum z (B, 6) after a control step, m/s and rad/s; initially
+    zero.
 
-    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is the acceleration of the
-    wrist by everything else. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z)
-    is d after a low-pass filter of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662).
-    In discrete time the servos act on the mean of u over the step (trapezoidal rule), which only changes w
-    (`_generalised_speed`).
+    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is the
+    acceleration of the wrist by everything else. The observer integrates dz/dt = stiffness (u_tgt -
+    u) + rate (w - z), so that rate (w - z) is d after a low-pass filter of time constant 1 / rate
+    (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662). In discrete time the servos act on
+    the mean of u over the step (trapezoidal rule), which only changes w (`_generalised_speed`).
 
     Args:
       hand: the hand, for its servos.
@@ -156,12 +179,18 @@ def track_load(hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velo
     """
     stiffness, _ = hand.wrist_servos
     decay = task.control_dt * task.control.load_rate
-    gained = task.control_dt * stiffness * (u_target - u) + decay * _generalised_speed(hand, task, u, u_velocity)
+    gained = task.control_dt * stiffness * (u_target - u) + decay * _generalised_speed(
+        hand, task, u, u_velocity
+    )
     return (momentum + gained) / (1.0 + decay)
 
 
-def wrist_load(hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array) -> Array:
-    """Acceleration d (B, 6) of the wrist by everything but its servos, m/s^2 and rad/s^2; see `track_load`."""
+def wrist_load(
+    hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array
+) -> Array:
+    """Acceleration d (B, 6) of the wrist by everything but its servos, m/s^2 and rad/s^2; see
+    `track_load`.
+    """
     return task.control.load_rate * (_generalised_speed(hand, task, u, u_velocity) - momentum)
 
 
@@ -187,8 +216,9 @@ class _Servo(NamedTuple):
 def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
     """Lead (..., 3) of the target over three wrist joints.
 
-    A target that leads by damping v / stiffness keeps a joint's speed; one r from there accelerates it by stiffness r.
-    Braking along the guidance may use v stiffness / damping, however small the share is.
+    A target that leads by damping v / stiffness keeps a joint's speed; one r from there accelerates
+    it by stiffness r. Braking along the guidance may use v stiffness / damping, however small the
+    share is.
 
     Args:
       servo: servos of the joints.
@@ -206,7 +236,9 @@ def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: 
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
-    """(B, M) rad by which motors move towards the closed hand, at most `rate`, from the middle of the approach on."""
+    """(B, M) rad by which motors move towards the closed hand, at most `rate`, from the middle of
+    the approach on.
+    """
     begun = 2.0 * scene.state.time >= scene.task.approach_steps
     ahead = motor_positions(scene.hand, jnp.array(scene.hand.q_closed) - scene.state.q_target)
     return begun[:, None] * jnp.clip(ahead, -rate, rate)

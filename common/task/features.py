@@ -1,4 +1,5 @@
-"""Geometry between hand, object and goal in a control step, shared by observation, control, reward and metrics.
+"""Geometry between hand, object and goal in a control step, shared by observation, control, reward
+and metrics.
 
 It is computed once for each control step. Vectors are in the wrist frame unless stated otherwise.
 """
@@ -16,7 +17,9 @@ from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Contacts, Features, Goal, SceneState, Surface
 
 
-def features(hand: Hand, task: TaskSettings, state: SceneState, surface: Surface, goal: Goal) -> Features:
+def features(
+    hand: Hand, task: TaskSettings, state: SceneState, surface: Surface, goal: Goal
+) -> Features:
     """Computes the geometry of hand, object and goal in one control step."""
     wrist_position, wrist_quaternion = wrist_pose(state)
     object_position, object_quaternion = rotations.relative_pose(
@@ -27,11 +30,14 @@ def features(hand: Hand, task: TaskSettings, state: SceneState, surface: Surface
     if not task.dynamic_center:
         fingers = kinematics.keypoints(hand, kinematics.link_transforms(hand, state.q_initial))
 
-    # Distances are computed in the object frame, where coordinates are small and the surface does not move.
+    # Distances are computed in the object frame, where coordinates are small and the surface does
+    # not move.
     contact_shape = state.contact_found.shape
     local = rotations.inverse_transform(object_position, object_quaternion, keypoints)
     contacts = rotations.inverse_transform(
-        state.object_position, state.object_quaternion, state.contact_position.reshape(*contact_shape[:-2], -1, 3)
+        state.object_position,
+        state.object_quaternion,
+        state.contact_position.reshape(*contact_shape[:-2], -1, 3),
     )
     squared = squared_distances(surface.points, jnp.concatenate([local, contacts], -2))
     index = nearest_index(squared)
@@ -64,12 +70,24 @@ def features(hand: Hand, task: TaskSettings, state: SceneState, surface: Surface
         touching=jnp.any(found, -1),
         of={},
     )
-    made = Contacts(surface, local, squared[..., :points], index[..., points:].reshape(contact_shape), found, forces)
+    made = Contacts(
+        surface,
+        local,
+        squared[..., :points],
+        index[..., points:].reshape(contact_shape),
+        found,
+        forces,
+    )
     return common._replace(of={c.name: c.features(hand, made, common, goal) for c in known(task)})
 
 
 def scene_of(
-    hand: Hand, task: TaskSettings, state: SceneState, surface: Surface, goal: Goal, readings: Readings | None = None
+    hand: Hand,
+    task: TaskSettings,
+    state: SceneState,
+    surface: Surface,
+    goal: Goal,
+    readings: Readings | None = None,
 ) -> Scene:
     """Returns one control step as input of the constraints."""
     return Scene(hand, task, state, features(hand, task, state, surface, goal), goal, readings)

@@ -34,14 +34,18 @@ def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Arra
 def wrist_pose(state: SceneState) -> tuple[Array, Array]:
     """Position (B, 3) and quaternion (B, 4) of the wrist frame in the world frame."""
     return rotations.compose_pose(
-        state.base_position, state.base_quaternion, state.u[..., :3], rotations.euler_to_quaternion(state.u[..., 3:])
+        state.base_position,
+        state.base_quaternion,
+        state.u[..., :3],
+        rotations.euler_to_quaternion(state.u[..., 3:]),
     )
 
 
 def wrist_to_joints(state: SceneState, position: Array, quaternion: Array) -> Array:
     """Virtual wrist joints (B, ..., 6) that put the wrist at world poses (B, ..., 3), (B, ..., 4).
 
-    Among equivalent angles these are nearest to the current ones: no hinge differs from the state's by more than pi.
+    Among equivalent angles these are nearest to the current ones: no hinge differs from the state's
+    by more than pi.
     """
     extra = position.ndim - 2
     base_position = state.base_position.reshape(-1, *([1] * extra), 3)
@@ -53,8 +57,12 @@ def wrist_to_joints(state: SceneState, position: Array, quaternion: Array) -> Ar
     return jnp.concatenate([local, rotations.quaternion_to_euler(turned, present)], -1)
 
 
-def in_world(object_position: Array, object_quaternion: Array, position: Array, quaternion: Array) -> tuple[Array, ...]:
-    """Transforms poses (B, ..., 3), (B, ..., 4) from object to world frame, for object poses (B, 3), (B, 4)."""
+def in_world(
+    object_position: Array, object_quaternion: Array, position: Array, quaternion: Array
+) -> tuple[Array, ...]:
+    """Transforms poses (B, ..., 3), (B, ..., 4) from object to world frame, for object poses (B,
+    3), (B, 4).
+    """
     extra = position.ndim - 2
     origin = object_position.reshape(-1, *([1] * extra), 3)
     turn = jnp.broadcast_to(object_quaternion.reshape(-1, *([1] * extra), 4), quaternion.shape)
@@ -68,10 +76,11 @@ def squared_distances(a: Array, b: Array) -> Array:
 
 
 def nearest_index(squared: Array) -> Array:
-    """Index (B, M) of the least of N squared distances (B, N, M); ties within 0.01 % are broken arbitrarily.
+    """Index (B, M) of the least of N squared distances (B, N, M); ties within 0.01 % are broken
+    arbitrarily.
 
-    Non-negative floats are ordered like their bits, and the last bits hold the index: one minimum along a vector's
-    lanes, several times faster than `argmin`.
+    Non-negative floats are ordered like their bits, and the last bits hold the index: one minimum
+    along a vector's lanes, several times faster than `argmin`.
     """
     n = squared.shape[-2]
     room = (1 << (n - 1).bit_length()) - 1
@@ -80,12 +89,18 @@ def nearest_index(squared: Array) -> Array:
 
 
 def least_distance(points: Array, which: Array, target: Array) -> Array:
-    """Least distance (B,) from targets (B, 3) to the points (B, N, 3) selected by `which` (B, N); inf if none is."""
-    return jnp.min(jnp.where(which, jnp.linalg.norm(points - target[:, None], axis=-1), jnp.inf), -1)
+    """Least distance (B,) from targets (B, 3) to the points (B, N, 3) selected by `which` (B, N);
+    inf if none is.
+    """
+    return jnp.min(
+        jnp.where(which, jnp.linalg.norm(points - target[:, None], axis=-1), jnp.inf), -1
+    )
 
 
 def least_distance_to_segment(points: Array, which: Array, start: Array, end: Array) -> Array:
-    """Least distance (B,) from the selected points to segments from start to end (B, 3); inf if none is selected."""
+    """Least distance (B,) from the selected points to segments from start to end (B, 3); inf if
+    none is selected.
+    """
     along = end - start
     length = jnp.sum(along**2, -1)[:, None]
     t = jnp.clip(jnp.einsum("bni,bi->bn", points - start[:, None], along) / length, 0.0, 1.0)
@@ -104,7 +119,9 @@ def squash(force: Array) -> Array:
 
 
 def share(part: Array, whole: Array) -> tuple[Array, Array]:
-    """Numerator and denominator (B,) of a ratio error: numbers of true flags in a part (B, N) and in the whole."""
+    """Numerator and denominator (B,) of a ratio error: numbers of true flags in a part (B, N) and
+    in the whole.
+    """
     return jnp.sum(part, -1).astype(jnp.float32), jnp.sum(whole, -1).astype(jnp.float32)
 
 

@@ -1,7 +1,8 @@
-"""Methods for comparison: the paper's method, its baselines and its ablations, each defined by its changes to a run.
+"""Methods for comparison: the paper's method, its baselines and its ablations, each defined by its
+changes to a run.
 
-`congrasp train --method NAME` trains those that learn. The task of a policy records its method, and `congrasp evaluate
---method NAME` rejects policies of other methods.
+`congrasp train --method NAME` trains those that learn. The task of a policy records its method, and
+`congrasp evaluate --method NAME` rejects policies of other methods.
 """
 
 import dataclasses
@@ -17,10 +18,14 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"
 """Method of policies with a robot's sensors; `congrasp train --teacher` distils them."""
 CAMERA = "camera"
-"""Method of students with a depth camera instead of a tracker; `congrasp train --teacher NAME --method camera`."""
+"""Method of students with a depth camera instead of a tracker; `congrasp train --teacher NAME
+--method camera`.
+"""
 STUDENTS = (STUDENT, CAMERA)
 STATIONARY_SHARE = 0.6
-"""Share of the updates with stationary objects, in training with two phases: the paper's 15 of 25 hours."""
+"""Share of the updates with stationary objects, in training with two phases: the paper's 15 of 25
+hours.
+"""
 
 
 class Method(NamedTuple):
@@ -42,22 +47,32 @@ class Method(NamedTuple):
 
 
 def _two_phases(run: RunConfig) -> RunConfig:
-    """Stationary objects first, then free ones; the weights of the ramp's end apply from the change on."""
+    """Stationary objects first, then free ones; the weights of the ramp's end apply from the change
+    on.
+    """
     free, curriculum = max(round(STATIONARY_SHARE * run.updates), 1), run.curriculum
     ramp = (free - 1, free) if curriculum.ramped else curriculum.ramp
-    return dataclasses.replace(run, curriculum=dataclasses.replace(curriculum, stationary_updates=free, ramp=ramp))
+    return dataclasses.replace(
+        run, curriculum=dataclasses.replace(curriculum, stationary_updates=free, ramp=ramp)
+    )
 
 
 def _single_stage(run: RunConfig) -> RunConfig:
     """Free objects and the weights of the ramp's end from the first update on."""
     last = run.curriculum.reward if run.curriculum.ramped else run.task.reward
-    return dataclasses.replace(run, curriculum=CurriculumConfig(), task=dataclasses.replace(run.task, reward=last))
+    return dataclasses.replace(
+        run, curriculum=CurriculumConfig(), task=dataclasses.replace(run.task, reward=last)
+    )
 
 
 METHODS = {
-    "ours": Method("one policy for every combination of constraints, objects free from the start, weights ramped"),
+    "ours": Method(
+        "one policy for every combination of constraints, objects free from the start, weights "
+        "ramped"
+    ),
     "pd": Method(
-        "no learning: the wrist follows its guidance, then the fingers close from their initial angles to a fist",
+        "no learning: the wrist follows its guidance, then the fingers close from their initial "
+        "angles to a fist",
         control={
             "finger_scale": 0.0,
             "wrist_position_scale": 0.0,
@@ -78,20 +93,28 @@ METHODS = {
         weights={"heading_direction": 0.0, "heading_position": 0.0},
         needs=("pose",),
     ),
-    "no-dynamic-center": Method("the hand centre fixed at that of the initial fingers", task={"dynamic_center": False}),
-    "no-feedforward": Method("the guidance aims at the nearest waypoint, not the next", control={"lookahead": 0}),
+    "no-dynamic-center": Method(
+        "the hand centre fixed at that of the initial fingers", task={"dynamic_center": False}
+    ),
+    "no-feedforward": Method(
+        "the guidance aims at the nearest waypoint, not the next", control={"lookahead": 0}
+    ),
     "two-phase": Method(
         "the paper's two phases: stationary objects, then free ones with larger constraint weights",
         schedule=_two_phases,
     ),
-    "single-stage": Method("free objects and the final weights from the start, no ramp", schedule=_single_stage),
+    "single-stage": Method(
+        "free objects and the final weights from the start, no ramp", schedule=_single_stage
+    ),
     STUDENT: Method(
-        "no privileged observations: joints, wrist and a tracker's object poses over some steps, no forces and "
+        "no privileged observations: joints, wrist and a tracker's object poses over some steps, "
+        "no forces and "
         "no velocities",
         task={"observation": "tracked"},
     ),
     CAMERA: Method(
-        "no privileged observations: joints, wrist and a partial cloud of the object's surface, no pose of it",
+        "no privileged observations: joints, wrist and a partial cloud of the object's surface, no "
+        "pose of it",
         task={"observation": "camera"},
     ),
 }
@@ -104,7 +127,9 @@ def get_method(name: str) -> Method:
       CongraspError: there is no such method.
     """
     if name not in METHODS:
-        raise CongraspError(f"There is no method '{name}'.", f"Choose one of: {', '.join(METHODS)}.")
+        raise CongraspError(
+            f"There is no method '{name}'.", f"Choose one of: {', '.join(METHODS)}."
+        )
     return METHODS[name]
 
 
@@ -117,7 +142,8 @@ def with_method(run: RunConfig, name: str) -> RunConfig:
     method = get_method(name)
     if not method.learns:
         raise CongraspError(
-            f"The method '{name}' does not learn.", f"Evaluate it with 'congrasp evaluate --method {name}'."
+            f"The method '{name}' does not learn.",
+            f"Evaluate it with 'congrasp evaluate --method {name}'.",
         )
     run = method.schedule(run)
     last = dataclasses.replace(run.curriculum.reward, **method.weights)
@@ -130,7 +156,8 @@ def evaluated_as(task: TaskConfig, name: str, source: str) -> TaskConfig:
 
     Args:
       task: task of the policy.
-      name: name of the method. One that does not learn accepts any policy, takes its hand and geometry, and ignores its
+      name: name of the method. One that does not learn accepts any policy, takes its hand and
+      geometry, and ignores its
         actions.
       source: name of the policy in errors.
 

@@ -1,4 +1,6 @@
-"""Errors of one control step, with the paper's definitions (section Metrics), and the metrics of an episode."""
+"""Errors of one control step, with the paper's definitions (section Metrics), and the metrics of an
+episode.
+"""
 
 from collections.abc import Mapping
 
@@ -15,7 +17,9 @@ DIVERGED = "diverged"
 
 
 def metric_names(task: TaskSettings) -> tuple[str, ...]:
-    """Metrics of a finished episode: outcome, errors of the constraints, forces, and active blocks."""
+    """Metrics of a finished episode: outcome, errors of the constraints, forces, and active
+    blocks.
+    """
     return (
         "success",
         "held",
@@ -33,7 +37,10 @@ def metric_names(task: TaskSettings) -> tuple[str, ...]:
 
 def episode_fields(task: TaskSettings) -> tuple[str, ...]:
     """Wire names of an actor's report of a finished episode: metrics, then sums of reward terms."""
-    return (*(f"episode/{name}" for name in metric_names(task)), *(f"term/{name}" for name in terms(task)))
+    return (
+        *(f"episode/{name}" for name in metric_names(task)),
+        *(f"term/{name}" for name in terms(task)),
+    )
 
 
 def specs(task: TaskSettings) -> tuple[ErrorSpec, ...]:
@@ -42,14 +49,26 @@ def specs(task: TaskSettings) -> tuple[ErrorSpec, ...]:
 
 
 def errors(scene: Scene) -> dict[str, tuple[Array, Array]]:
-    """Numerator and denominator (B,) of every error in one step, whether or not its constraint is active."""
-    found = {name: value for constraint in known(scene.task) for name, value in constraint.measure(scene).items()}
+    """Numerator and denominator (B,) of every error in one step, whether or not its constraint is
+    active.
+    """
+    found = {
+        name: value
+        for constraint in known(scene.task)
+        for name, value in constraint.measure(scene).items()
+    }
     one = jnp.ones_like(scene.state.time)
-    return {name: value if isinstance(value, tuple) else (value, one) for name, value in found.items()}
+    return {
+        name: value if isinstance(value, tuple) else (value, one) for name, value in found.items()
+    }
 
 
 def accumulate(
-    task: TaskSettings, sums: Mapping[str, Array], step: Mapping[str, tuple[Array, Array]], approach: Array, hold: Array
+    task: TaskSettings,
+    sums: Mapping[str, Array],
+    step: Mapping[str, tuple[Array, Array]],
+    approach: Array,
+    hold: Array,
 ) -> dict[str, Array]:
     """Adds one step to the sums of an episode.
 
@@ -79,4 +98,7 @@ def episode_errors(task: TaskSettings, sums: Mapping[str, Array]) -> dict[str, A
 
     The value is zero if there were no steps, as for errors of the hold when the table stays.
     """
-    return {spec.name: sums[spec.name] / jnp.maximum(sums[f"{spec.name}/of"], 1.0) for spec in specs(task)}
+    return {
+        spec.name: sums[spec.name] / jnp.maximum(sums[f"{spec.name}/of"], 1.0)
+        for spec in specs(task)
+    }

@@ -1,17 +1,18 @@
 """Outward normals of a cloud of surface points, for surfaces that arrive without them.
 
-Planes are fitted to the nearest neighbours of each point, as in Hoppe et al. 1992. Near an edge such a plane cuts the
-corner; there that of a neighbour is taken if it fits much better.
+Planes are fitted to the nearest neighbours of each point, as in Hoppe et al. 1992. Near an edge
+such a plane cuts the corner; there that of a neighbour is taken if it fits much better.
 
-A camera sees the outer side of each of its points. For the cloud of a whole object three cues vote on the side:
+A camera sees the outer side of each of its points. For the cloud of a whole object three cues vote
+on the side:
 
 * The field of equal charges at all points, which drives each charge out of the object.
 * The mean height of a point above its neighbours, which is positive where the surface is convex.
-* Its height above a paraboloid through its neighbours. Of a thin wall both sides are among these: the paraboloid lies
-  between them.
+* Its height above a paraboloid through its neighbours. Of a thin wall both sides are among these:
+  the paraboloid lies between them.
 
-Each point then counts the votes of the neighbours in its plane. With 256 points thin walls remain uncertain: about one
-normal in eight of a bowl 3 mm thick points inward.
+Each point then counts the votes of the neighbours in its plane. With 256 points thin walls remain
+uncertain: about one normal in eight of a bowl 3 mm thick points inward.
 """
 
 import jax
@@ -40,7 +41,8 @@ def estimated_normals(points: Array, eye: Array | None = None) -> Array:
 
     Args:
       points: points of the surface of an object, in any unit and frame.
-      eye: (B, 3) positions of cameras toward which the normals point; None for clouds of whole objects.
+      eye: (B, 3) positions of cameras toward which the normals point; None for clouds of whole
+      objects.
     """
     points = jnp.asarray(points, jnp.float32)
     middle = jnp.mean(points, 1, keepdims=True)
@@ -57,7 +59,9 @@ def estimated_normals(points: Array, eye: Array | None = None) -> Array:
 
 
 def _neighbours(points: Array, count: int) -> tuple[Array, Array]:
-    """Indices (N, count) of each point's nearest points, itself first, and (N, count) 1 where they differ, else 0."""
+    """Indices (N, count) of each point's nearest points, itself first, and (N, count) 1 where they
+    differ, else 0.
+    """
     squared = jnp.sum((points[:, None] - points) ** 2, -1)
     earlier = jnp.tri(len(points), k=-1, dtype=bool)
     repeated = jnp.any((squared == 0.0) & earlier, -1)
@@ -86,10 +90,11 @@ def _planes(points: Array, index: Array, differs: Array) -> Array:
 
 
 def _least_axis(matrix: Array) -> Array:
-    """Unit eigenvectors (..., 3) of the least eigenvalues of symmetric matrices (..., 3, 3), in closed form.
+    """Unit eigenvectors (..., 3) of the least eigenvalues of symmetric matrices (..., 3, 3), in
+    closed form.
 
-    Smith 1961, Eigenvalues of a symmetric 3 x 3 matrix; the eigenvector is the longest cross product of two rows of
-    the matrix less the eigenvalue.
+    Smith 1961, Eigenvalues of a symmetric 3 x 3 matrix; the eigenvector is the longest cross
+    product of two rows of the matrix less the eigenvalue.
     """
     eye = jnp.eye(3)
     mean = jnp.trace(matrix, axis1=-2, axis2=-1)[..., None, None] / 3.0
@@ -108,7 +113,9 @@ def _least_axis(matrix: Array) -> Array:
 
 
 def _outward(points: Array) -> Array:
-    """Outward unit normals (N, 3) of one object's cloud (N, 3) with a root mean square radius of 1."""
+    """Outward unit normals (N, 3) of one object's cloud (N, 3) with a root mean square radius of
+    1.
+    """
     index, differs = _neighbours(points, _AROUND)
     normal = _planes(points, index[:, : _PLANE + 1], differs[:, : _PLANE + 1])
     weight = differs.astype(jnp.float32)
@@ -116,8 +123,14 @@ def _outward(points: Array) -> Array:
     height = jnp.sum(offset * normal[:, None], -1)
     distance = jnp.linalg.norm(offset, axis=-1)
     near = slice(1, _NEAR + 1)
-    convex = -jnp.sum((height * weight)[:, near], -1) / jnp.maximum(jnp.sum((distance * weight)[:, near], -1), _SMALL)
-    vote = _field(points, normal) + _CONVEX * convex + _SHEET * _above_paraboloid(normal, offset, height, weight)
+    convex = -jnp.sum((height * weight)[:, near], -1) / jnp.maximum(
+        jnp.sum((distance * weight)[:, near], -1), _SMALL
+    )
+    vote = (
+        _field(points, normal)
+        + _CONVEX * convex
+        + _SHEET * _above_paraboloid(normal, offset, height, weight)
+    )
     rise = jnp.maximum(jnp.abs(height), jnp.abs(jnp.sum(offset * normal[index], -1)))
     agree = weight * (rise < _COPLANAR * distance) * jnp.sum(normal[:, None] * normal[index], -1)
     vote = vote + jnp.sum(agree * jnp.clip(vote, -1.0, 1.0)[index], -1)
@@ -125,16 +138,20 @@ def _outward(points: Array) -> Array:
 
 
 def _field(points: Array, normal: Array) -> Array:
-    """Cosines (N,) between normals and the field of equal charges at all points; softened near each charge."""
+    """Cosines (N,) between normals and the field of equal charges at all points; softened near each
+    charge.
+    """
     offset = points[:, None] - points
     squared = jnp.sum(offset**2, -1)
-    soft = 4.0 * jnp.pi / len(points) / 50.0  # a seventh of the points' distance on a sphere, squared
+    # A seventh of the points' distance on a sphere, squared
+    soft = 4.0 * jnp.pi / len(points) / 50.0
     field = jnp.sum(offset / (squared + soft)[..., None] ** 1.5, 1)
     return jnp.sum(field * normal, -1) / jnp.maximum(jnp.linalg.norm(field, axis=-1), _SMALL)
 
 
 def _above_paraboloid(normal: Array, offset: Array, height: Array, weight: Array) -> Array:
-    """Heights (N,) of points above paraboloids a + b x + c y + d (x^2 + y^2) through neighbours, over their distance.
+    """Heights (N,) of points above paraboloids a + b x + c y + d (x^2 + y^2) through neighbours,
+    over their distance.
 
     Args:
       normal: (N, 3) unit normals.
@@ -147,10 +164,16 @@ def _above_paraboloid(normal: Array, offset: Array, height: Array, weight: Array
     across = jnp.cross(normal, along)
     x, y = (jnp.sum(offset * axis[:, None], -1) for axis in (along, across))
     radius = x * x + y * y
-    scale = jnp.sqrt(jnp.sum(weight * radius, -1, keepdims=True) / jnp.sum(weight, -1, keepdims=True))
+    scale = jnp.sqrt(
+        jnp.sum(weight * radius, -1, keepdims=True) / jnp.sum(weight, -1, keepdims=True)
+    )
     scale = jnp.maximum(scale, _SMALL)
     basis = jnp.stack([jnp.ones_like(x), x / scale, y / scale, radius / scale**2], -1)
     highest = jax.lax.Precision.HIGHEST
-    matrix = jnp.einsum("nki,nkj,nk->nij", basis, basis, weight, precision=highest) + 1e-4 * jnp.eye(4)
-    found = jnp.linalg.solve(matrix, jnp.einsum("nki,nk->ni", basis, height * weight, precision=highest)[..., None])
+    matrix = jnp.einsum(
+        "nki,nkj,nk->nij", basis, basis, weight, precision=highest
+    ) + 1e-4 * jnp.eye(4)
+    found = jnp.linalg.solve(
+        matrix, jnp.einsum("nki,nk->ni", basis, height * weight, precision=highest)[..., None]
+    )
     return -found[:, 0, 0] / scale[:, 0]

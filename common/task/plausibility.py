@@ -1,8 +1,8 @@
 """Plausibility of a motion: penetration, speed, jerk and effort, from samples of control steps.
 
-Everything is computed from joint angles, poses and contact forces, so that it means the same in every engine. The
-hand's links are capsules; for a custom hand, points on the meshes of its file are tested against the object as well. A
-sample is the state after a control step.
+Everything is computed from joint angles, poses and contact forces, so that it means the same in
+every engine. The hand's links are capsules; for a custom hand, points on the meshes of its file are
+tested against the object as well. A sample is the state after a control step.
 """
 
 import functools
@@ -26,7 +26,9 @@ from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
-"""Exclusive bounds of a clean episode's penetrations, mm; `hand_mesh_mm` is only measured for hands with meshes."""
+"""Exclusive bounds of a clean episode's penetrations, mm; `hand_mesh_mm` is only measured for hands
+with meshes.
+"""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -34,7 +36,9 @@ MEASURES = (
 )
 """Names of the `measures` of an episode."""
 _SPACING = 0.004
-"""Spacing of points on a capsule's axis, m: a sharp edge 7 mm from the axis appears at most 0.3 mm farther away."""
+"""Spacing of points on a capsule's axis, m: a sharp edge 7 mm from the axis appears at most 0.3 mm
+farther away.
+"""
 _CELL, _MOST = 0.004, 2048
 """Spacing of points on a hand's meshes, m, and their greatest number."""
 
@@ -43,13 +47,17 @@ class Sample(NamedTuple):
     """Sample of a control step of B environments."""
 
     hand_hand: Array
-    """(B,) deepest penetration of two links that are not neighbours, m; 0 if there is none, also below."""
+    """(B,) deepest penetration of two links that are not neighbours, m; 0 if there is none, also
+    below.
+    """
     hand_table: Array
     """(B,) deepest point of the hand below the table's top, m; 0 after the table is removed."""
     hand_object: Array
     """(B,) deepest penetration of a link and the object's surface, m."""
     hand_mesh: Array
-    """(B,) deepest penetration of the hand's meshes and the object's surface, m; NaN for hands without meshes."""
+    """(B,) deepest penetration of the hand's meshes and the object's surface, m; NaN for hands
+    without meshes.
+    """
     wrist_velocity: Array
     """(B, 3) velocity of the wrist's origin, m/s."""
     finger_velocity: Array
@@ -65,7 +73,9 @@ class Sample(NamedTuple):
 
 
 class _Capsules(NamedTuple):
-    """Pairs of capsules that must not overlap, and points on axes or on solids, in the wrist frame at zero."""
+    """Pairs of capsules that must not overlap, and points on axes or on solids, in the wrist frame
+    at zero.
+    """
 
     pairs: np.ndarray  # (2, Q) capsules that must not overlap
     links: np.ndarray  # (P,) link of each point
@@ -106,10 +116,12 @@ def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
 
 
 def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """Overlap (..., Q) of pairs of capsules of different links in metres; negative if they are apart.
+    """Overlap (..., Q) of pairs of capsules of different links in metres; negative if they are
+    apart.
 
-    Pairs are those that collide in the hand's model with `hand_self_collision`: not a link and its parent, nor those
-    whose capsules nest in the open pose or at zero (`common.hands.mjcf.overlapping`).
+    Pairs are those that collide in the hand's model with `hand_self_collision`: not a link and its
+    parent, nor those whose capsules nest in the open pose or at zero
+    (`common.hands.mjcf.overlapping`).
 
     Args:
       hand: the hand.
@@ -118,12 +130,17 @@ def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     radii, ends = hand.capsule_radii, kinematics.capsules(hand, transforms)
     first, second = _capsules(hand).pairs
     apart = segment_distance(
-        ends[..., first, 0, :], ends[..., first, 1, :], ends[..., second, 0, :], ends[..., second, 1, :]
+        ends[..., first, 0, :],
+        ends[..., first, 1, :],
+        ends[..., second, 0, :],
+        ends[..., second, 1, :],
     )
     return radii[first] + radii[second] - apart
 
 
-def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array) -> Array:
+def hand_table(
+    hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array
+) -> Array:
     """Depth (B,) in metres of the hand's lowest point below the plane z = 0.
 
     Args:
@@ -133,7 +150,9 @@ def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Arra
       wrist_quaternion: (B, 4) wrist frame to world frame.
     """
     ends = kinematics.capsules(hand, transforms)
-    ends = rotations.transform(wrist_position, wrist_quaternion, ends.reshape(*ends.shape[:-3], -1, 3))
+    ends = rotations.transform(
+        wrist_position, wrist_quaternion, ends.reshape(*ends.shape[:-3], -1, 3)
+    )
     return jnp.maximum(jnp.max(np.repeat(hand.capsule_radii, 2) - ends[..., 2], -1), 0.0)
 
 
@@ -145,10 +164,12 @@ def hand_object(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """Penetration (B,) in m of the object by a capsule: its radius minus its axis's distance from the surface.
+    """Penetration (B,) in m of the object by a capsule: its radius minus its axis's distance from
+    the surface.
 
-    A finger through a thin blade therefore counts with the thickness of the finger, not of the blade. Links that
-    collide as solids are represented by points on these, and count with the thickness of the blade.
+    A finger through a thin blade therefore counts with the thickness of the finger, not of the
+    blade. Links that collide as solids are represented by points on these, and count with the
+    thickness of the blade.
 
     Args:
       hand: the hand.
@@ -172,21 +193,29 @@ def hand_mesh(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """Penetration (B,) in m of the object by points on the hand's meshes (`common.hands.meshes`); NaN without any.
+    """Penetration (B,) in m of the object by points on the hand's meshes (`common.hands.meshes`);
+    NaN without any.
 
-    Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's thickness.
+    Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's
+    thickness.
     """
     links, points = _surface(hand)
     if not len(points):
         return jnp.full(len(index), jnp.nan)
-    local = rotations.inverse_transform(object_position, object_quaternion, _moved(transforms, links, points))
+    local = rotations.inverse_transform(
+        object_position, object_quaternion, _moved(transforms, links, points)
+    )
     return jnp.maximum(jnp.max(-field.at(index, local), -1), 0.0)
 
 
 def torque_share(scene: Scene) -> Array:
-    """(B, M) |clip(kp (m_target - m) - kv m_velocity, limit)| / limit: torques of the fingers' motors at m."""
+    """(B, M) |clip(kp (m_target - m) - kv m_velocity, limit)| / limit: torques of the fingers'
+    motors at m.
+    """
     hand, state = scene.hand, scene.state
-    gains = np.array([(motor.kp, motor.kv, motor.torque_limit) for motor in hand.motors], np.float32)
+    gains = np.array(
+        [(motor.kp, motor.kv, motor.torque_limit) for motor in hand.motors], np.float32
+    )
     ahead, speed = (motor_positions(hand, x) for x in (state.q_target - state.q, state.q_velocity))
     torque = gains[:, 0] * ahead - gains[:, 1] * speed
     return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
@@ -201,7 +230,9 @@ def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
     uw, vw = _dot(u, w), _dot(v, w)
     across = uu * vv - uv * uv
-    s = jnp.where(across > 1e-14, jnp.clip((uv * vw - uw * vv) / jnp.maximum(across, 1e-14), 0.0, 1.0), 0.0)
+    s = jnp.where(
+        across > 1e-14, jnp.clip((uv * vw - uw * vv) / jnp.maximum(across, 1e-14), 0.0, 1.0), 0.0
+    )
     t = jnp.clip((uv * s + vw) / jnp.maximum(vv, 1e-14), 0.0, 1.0)
     s = jnp.clip((uv * t - uw) / jnp.maximum(uu, 1e-14), 0.0, 1.0)
     return jnp.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
@@ -210,31 +241,44 @@ def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
 def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
     """Measures (B,) of episodes, over all of their control steps.
 
-    Accelerations are differences of successive velocities over the control step, the first from rest; jerks are second
-    differences.
+    Accelerations are differences of successive velocities over the control step, the first from
+    rest; jerks are second differences.
 
     Args:
       samples: with leading axis T, NumPy arrays (T, B, ...).
       control_dt: seconds of a control step.
 
     Returns:
-      The maxima `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes, `hand_mesh_mm`, in mm.
-        `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's
-        steps. `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N): that of the link
-        with the highest force; `link_force`: the mean over touching links (0 if none touches). `torque_share` and
+      The maxima `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes,
+      `hand_mesh_mm`, in mm.
+        `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over
+            the episode's
+        steps. `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak`
+            (N): that of the link
+        with the highest force; `link_force`: the mean over touching links (0 if none touches).
+        `torque_share` and
         `torque_share_peak`: mean and peak over motors and steps.
     """
-    wrist, fingers = (np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity))
+    wrist, fingers = (
+        np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity)
+    )
     force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
     acceleration = np.diff(wrist, axis=0, prepend=0 * wrist[:1]) / control_dt
     jerk = np.diff(fingers, n=2, axis=0, prepend=np.zeros_like(fingers[:2])) / control_dt**2
-    depths = {name: getattr(samples, name) for name in ("hand_hand", "hand_table", "hand_object", "hand_mesh")}
+    depths = {
+        name: getattr(samples, name)
+        for name in ("hand_hand", "hand_table", "hand_object", "hand_mesh")
+    }
     if np.isnan(samples.hand_mesh).all():
         del depths["hand_mesh"]
     found = {f"{name}_mm": 1e3 * np.max(depth, 0) for name, depth in depths.items()}
     for name, vectors in (("wrist_speed", wrist), ("wrist_acceleration", acceleration)):
         size = np.linalg.norm(vectors, axis=-1)
-        found |= {name: size.max(0), f"{name}_mean": size.mean(0), f"{name}_p95": np.percentile(size, 95, axis=0)}
+        found |= {
+            name: size.max(0),
+            f"{name}_mean": size.mean(0),
+            f"{name}_p95": np.percentile(size, 95, axis=0),
+        }
     return found | {
         "finger_jerk": np.sqrt((jerk**2).mean((0, 2))),
         "link_force": force.sum((0, 2)) / np.maximum((force > 0).sum((0, 2)), 1),
@@ -245,13 +289,16 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
 
 
 def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(B,) bool: the object was held for two seconds without the table, and every penetration is below `CLEAN_MM`.
+    """(B,) bool: the object was held for two seconds without the table, and every penetration is
+    below `CLEAN_MM`.
 
     Args:
       held: (B,) bool, True if the object was held.
       found: result of `measures`.
     """
-    return np.all([held, *(found[name] < limit for name, limit in CLEAN_MM.items() if name in found)], 0)
+    return np.all(
+        [held, *(found[name] < limit for name, limit in CLEAN_MM.items() if name in found)], 0
+    )
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -268,7 +315,9 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 @functools.cache
 def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """Links (P,) of the points on the hand's meshes, and the points (P, 3) in the wrist frame at zero."""
+    """Links (P,) of the points on the hand's meshes, and the points (P, 3) in the wrist frame at
+    zero.
+    """
     names = [link.name for link in hand.links]
     return _spread({names.index(name): mesh for name, mesh in own_meshes(hand).items()})
 
@@ -276,9 +325,9 @@ def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
 def _spread(meshes: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Links (P,) of points on meshes, and the points (P, 3).
 
-    In each cell of a grid the point farthest from its link's centre is kept, so that corners are preserved. Cells are
-    `_CELL` wide, or wider if more than `_MOST` points would remain. The initial spacing sqrt(area / `_MOST`) bounds the
-    number of samples.
+    In each cell of a grid the point farthest from its link's centre is kept, so that corners are
+    preserved. Cells are `_CELL` wide, or wider if more than `_MOST` points would remain. The
+    initial spacing sqrt(area / `_MOST`) bounds the number of samples.
     """
     area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
     cell = max(_CELL, float(np.sqrt(area / _MOST)))
@@ -297,15 +346,22 @@ def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray
     samples = trimesh.sample.sample_surface(mesh, max(1, int(8 * mesh.area / cell**2)), seed=0)[0]
     points = np.concatenate([vertices[np.unique(faces)], samples])
     farthest = np.argsort(-np.linalg.norm(points - points.mean(0), axis=-1), kind="stable")
-    return points[farthest][np.unique(np.floor(points[farthest] / cell), axis=0, return_index=True)[1]]
+    return points[farthest][
+        np.unique(np.floor(points[farthest] / cell), axis=0, return_index=True)[1]
+    ]
 
 
 @functools.cache
 def _capsules(hand: Hand) -> _Capsules:
-    """Pairs of the hand's capsules that must not overlap, and points on the axes of colliding ones or on solids."""
+    """Pairs of the hand's capsules that must not overlap, and points on the axes of colliding ones
+    or on solids.
+    """
     links, radii = hand.capsule_links, hand.capsule_radii
     names = [link.name for link in hand.links]
-    nested = {frozenset(pair) for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))}
+    nested = {
+        frozenset(pair)
+        for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))
+    }
     first, second = np.triu_indices(len(links), 1)
     apart = [
         a != b and frozenset((names[a], names[b])) not in nested
@@ -317,7 +373,9 @@ def _capsules(hand: Hand) -> _Capsules:
         if link.solids
     }
     axes = {
-        k: np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(np.float32)
+        k: np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(
+            np.float32
+        )
         for k, (start, end) in enumerate(hand.capsules)
         if links[k] not in solid
     }

@@ -1,15 +1,19 @@
-"""Privileged inputs in training: those of the critic and of a teacher, which policies of robots cannot observe.
+"""Privileged inputs in training: those of the critic and of a teacher, which policies of robots
+cannot observe.
 
-The critic's are the true parameters of an episode, and the true state if the policy has sensors (asymmetric
-actor-critic, Pinto et al. 2018, arXiv 1710.06542). Actors record these inputs; no policy acts on them.
+The critic's are the true parameters of an episode, and the true state if the policy has sensors
+(asymmetric actor-critic, Pinto et al. 2018, arXiv 1710.06542). Actors record these inputs; no
+policy acts on them.
 
-The teacher's are the full observation, and what converts its actions to those of a student that observes another state.
-A residual is relative to the guidance of its policy. A student's guidance differs if its tracker has errors, so that
-the teacher's residual would move its wrist to another place. Both share the wrist's target: the student's label is
-(u_tgt - u_g) / alpha_w with the teacher's target u_tgt and the student's guidance u_g.
+The teacher's are the full observation, and what converts its actions to those of a student that
+observes another state. A residual is relative to the guidance of its policy. A student's guidance
+differs if its tracker has errors, so that the teacher's residual would move its wrist to another
+place. Both share the wrist's target: the student's label is (u_tgt - u_g) / alpha_w with the
+teacher's target u_tgt and the student's guidance u_g.
 
-Both share the fingers' targets likewise. The teacher continues from the targets m that the servos follow, the student
-from its newest ones m', which the servos follow later (`SensingConfig.latency`): its label is a_f + (m - m') / alpha_f.
+Both share the fingers' targets likewise. The teacher continues from the targets m that the servos
+follow, the student from its newest ones m', which the servos follow later
+(`SensingConfig.latency`): its label is a_f + (m - m') / alpha_f.
 """
 
 import dataclasses
@@ -29,7 +33,9 @@ from congrasp.common.task.types import Array
 MOST_LOAD = 10.0
 """Upper bound of `load`."""
 _WRIST = (6, 7, 13, 14, 20)
-"""Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance alone."""
+"""Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance
+alone.
+"""
 
 
 class Parameters(NamedTuple):
@@ -61,10 +67,14 @@ def fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
         ObservationField("friction", 1, "sliding friction between the hand and the object"),
         ObservationField("gain_scale", 1, "factor on the finger servos' gains"),
         ObservationField(
-            "load", 1, "object's weight over friction times the sum of the fingertips' forces, at most 10"
+            "load",
+            1,
+            "object's weight over friction times the sum of the fingertips' forces, at most 10",
         ),
         ObservationField("stationary", 1, "1 if the object is fixed"),
-        ObservationField("hold_remaining", 1, "remaining control steps of the hold over the longest hold"),
+        ObservationField(
+            "hold_remaining", 1, "remaining control steps of the hold over the longest hold"
+        ),
     )
     if not task.sensed:
         return episode
@@ -73,8 +83,12 @@ def fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
         *episode,
         ObservationField("period", 1, "control steps between two samples of the tracker"),
         ObservationField("delay", 1, "control steps until a sample arrives"),
-        ObservationField("position_noise", 1, "m, standard deviation of each coordinate of a sample"),
-        ObservationField("rotation_noise", 1, "rad, standard deviation of a sample's rotation about each axis"),
+        ObservationField(
+            "position_noise", 1, "m, standard deviation of each coordinate of a sample"
+        ),
+        ObservationField(
+            "rotation_noise", 1, "rad, standard deviation of a sample's rotation about each axis"
+        ),
         ObservationField("dropout", 1, "probability that a sample is lost"),
         ObservationField("observation", size, "full observation of the true state, without noise"),
     )
@@ -83,8 +97,8 @@ def fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
 def observe(scene: Scene, parameters: Parameters) -> Array:
     """Privileged inputs (B, P), laid out like `fields`.
 
-    With the control step t and the sum F of `tip_forces`, load = min(m g / (mu F), 10) and hold_remaining =
-    max(min(approach_steps + hold - t, hold), 0) / max(hold_steps, hold_steps_max).
+    With the control step t and the sum F of `tip_forces`, load = min(m g / (mu F), 10) and
+    hold_remaining = max(min(approach_steps + hold - t, hold), 0) / max(hold_steps, hold_steps_max).
 
     Args:
       scene: the true control step, with the task of the policy.
@@ -92,7 +106,9 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
     """
     hand, task = scene.hand, scene.task
     strength = jnp.maximum(parameters.friction * float(tip_forces(hand).sum()), 1e-6)
-    remaining = jnp.minimum(task.approach_steps + parameters.hold - scene.state.time, parameters.hold)
+    remaining = jnp.minimum(
+        task.approach_steps + parameters.hold - scene.state.time, parameters.hold
+    )
     values = [
         parameters.mass,
         parameters.friction,
@@ -103,7 +119,13 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
     ]
     if parameters.sensors is not None:
         sensors = parameters.sensors
-        values += [sensors.period, sensors.delay, sensors.position_noise, sensors.rotation_noise, sensors.dropout]
+        values += [
+            sensors.period,
+            sensors.delay,
+            sensors.position_noise,
+            sensors.rotation_noise,
+            sensors.dropout,
+        ]
     numbers = jnp.stack([jnp.asarray(value, jnp.float32) for value in values], -1)
     if not task.sensed:
         return numbers
@@ -116,7 +138,9 @@ def _full(task: TaskSettings) -> TaskSettings:
 
 
 def extra(hand: Hand) -> int:
-    """Numbers after the observation: the wrist's, and the lag (M) of the motors' followed targets, rad."""
+    """Numbers after the observation: the wrist's, and the lag (M) of the motors' followed targets,
+    rad.
+    """
     return _WRIST[-1] + len(hand.motors)
 
 
@@ -132,7 +156,9 @@ def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Arr
     limit, table = teacher.limit[:, None], jnp.asarray(teacher.table, teacher.ahead.dtype)[:, None]
     own = guided(seen, control).bounded(control)
     lag = motor_positions(true.hand, true.state.q_target - seen.state.q_target)
-    return jnp.concatenate([observation.observe(true), teacher.ahead, limit, teacher.velocity, table, own, lag], -1)
+    return jnp.concatenate(
+        [observation.observe(true), teacher.ahead, limit, teacher.velocity, table, own, lag], -1
+    )
 
 
 def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Array) -> Array:
@@ -149,4 +175,6 @@ def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Arra
     teacher = Guided(ahead, limit[..., 0], velocity, table[..., 0] > 0.5)
     lead = wrist_lead(hand, control, teacher, action[..., -6:])
     scale = jnp.repeat(jnp.stack([control.wrist_position_scale, control.wrist_rotation_scale]), 3)
-    return jnp.concatenate([action[..., :-6] + lag / control.finger_scale, (lead - own) / scale], -1)
+    return jnp.concatenate(
+        [action[..., :-6] + lag / control.finger_scale, (lead - own) / scale], -1
+    )

@@ -8,13 +8,14 @@ Array = Any
 def resting_mean(
     xp: Any, mean: Array, count: Array, reading: Array, table: Array, settle: float
 ) -> tuple[Array, Array]:
-    """Adds a reading to an object's mean pose while it rests on the table and no reading is far from the mean.
+    """Adds a reading to an object's mean pose while it rests on the table and no reading is far
+    from the mean.
 
     Args:
       xp: numpy or jax.numpy.
       mean: (..., 7) position, m, and quaternion so far.
-      count: (...) number of readings in the mean; 0 for good once the object has moved or the table is removed.
-      reading: (..., 7) newest reading.
+      count: (...) number of readings in the mean; 0 for good once the object has moved or the table
+      is removed. reading: (..., 7) newest reading.
       table: (...) bool: the table is present.
       settle: largest distance of an included reading from the mean, m.
 
@@ -23,7 +24,9 @@ def resting_mean(
     """
     away = reading[..., :3] - mean[..., :3]
     still = (count > 0) & table & (xp.sqrt((away * away).sum(-1)) <= settle)
-    same = (mean[..., 3:] * reading[..., 3:]).sum(-1)[..., None] >= 0.0  # a quaternion and its negative are one turn
+    same = (mean[..., 3:] * reading[..., 3:]).sum(-1)[
+        ..., None
+    ] >= 0.0  # a quaternion and its negative are one turn
     turn = count[..., None] * mean[..., 3:] + xp.where(same, 1.0, -1.0) * reading[..., 3:]
     length = xp.sqrt((turn * turn).sum(-1))[..., None]
     place = mean[..., :3] + away / (count[..., None] + 1)

@@ -1,4 +1,6 @@
-"""Reward terms (paper, section Reward Function): those of the grasp are here, those of constraints in their files."""
+"""Reward terms (paper, section Reward Function): those of the grasp are here, those of constraints
+in their files.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -35,11 +37,14 @@ class Term(NamedTuple):
     meaning: str
     """Symbol in the paper, and unit."""
     value: Callable[[Scene, Earning], Array] | None
-    """Value (B,) before the weight, signed and bounded; None for a parameter that other terms share."""
+    """Value (B,) before the weight, signed and bounded; None for a parameter that other terms
+    share.
+    """
 
 
 def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
-    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `center_fingers`.
+    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of
+    `center_fingers`.
 
     Keypoints of other fingers get no weight; those of the set and the palm share it.
     """
@@ -78,7 +83,9 @@ def _force_excess(scene: Scene, earning: Earning) -> Array:
 
 def _object_position(scene: Scene, earning: Earning) -> Array:
     """Squared displacement of the object since the start."""
-    return -jnp.minimum(square(scene.state.object_position - scene.state.object_position_initial), 0.04)
+    return -jnp.minimum(
+        square(scene.state.object_position - scene.state.object_position_initial), 0.04
+    )
 
 
 def _object_rotation(scene: Scene, earning: Earning) -> Array:
@@ -96,7 +103,8 @@ GRASP: tuple[Term, ...] = (
     Term(
         "distance",
         0.3,
-        "w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most).",
+        "w_dis: per metre of the weighted distance from the hand's keypoints to the object's "
+        "surface (0.3 m at most).",
         _distance,
     ),
     Term(
@@ -110,7 +118,8 @@ GRASP: tuple[Term, ...] = (
     Term(
         "force_excess",
         0.01,
-        "Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands then squeeze hard).",
+        "Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands "
+        "then squeeze hard).",
         _force_excess,
     ),
     Term(
@@ -120,7 +129,10 @@ GRASP: tuple[Term, ...] = (
         _object_position,
     ),
     Term(
-        "object_rotation", 0.1, "w_R: per square radian of the object's rotation (at most 1 rad^2).", _object_rotation
+        "object_rotation",
+        0.1,
+        "w_R: per square radian of the object's rotation (at most 1 rad^2).",
+        _object_rotation,
     ),
     Term(
         "wrist_velocity",
@@ -136,11 +148,15 @@ GRASP: tuple[Term, ...] = (
     ),
     Term("drop", 1.0, "w_drop: per step with the object fallen.", _drop),
 )
-"""Terms of r^grasp; `RewardWeights` (`common.task.config`) and the names of all terms derive from them."""
+"""Terms of r^grasp; `RewardWeights` (`common.task.config`) and the names of all terms derive from
+them.
+"""
 
 
 def terms(task: TaskSettings) -> tuple[str, ...]:
-    """Names of the terms, which are those of their weights: the grasp's, then those of the constraints."""
+    """Names of the terms, which are those of their weights: the grasp's, then those of the
+    constraints.
+    """
     grasp = (term.name for term in GRASP if term.value is not None)
     return (*grasp, *(weight.name for constraint in known(task) for weight in constraint.weights))
 
@@ -151,7 +167,9 @@ def fallen(task: TaskSettings, state: SceneState) -> Array:
 
 
 def reward_terms(scene: Scene, weights: Any) -> dict[str, Array]:
-    """Weighted terms (B,) by the names in `terms`; the reward is their sum. `weights` are `RewardWeights`."""
+    """Weighted terms (B,) by the names in `terms`; the reward is their sum. `weights` are
+    `RewardWeights`.
+    """
     touching, force, most = scene.features.touching, scene.features.force, weights.force_max
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)

@@ -1,9 +1,10 @@
-"""Sensors of a robot instead of the simulator's state: a tracker's samples of the object's pose, and joint encoders.
+"""Sensors of a robot instead of the simulator's state: a tracker's samples of the object's pose,
+and joint encoders.
 
-A tracker samples the object's pose periodically. A sample arrives some control steps later, with errors, or is lost;
-the newest arrived sample is shown until the next one. A policy without privileged observations
-(`TaskSettings.observation` "tracked") observes the last control steps of it, with its joints and their targets, which
-substitute for contact forces and velocities.
+A tracker samples the object's pose periodically. A sample arrives some control steps later, with
+errors, or is lost; the newest arrived sample is shown until the next one. A policy without
+privileged observations (`TaskSettings.observation` "tracked") observes the last control steps of
+it, with its joints and their targets, which substitute for contact forces and velocities.
 """
 
 import math
@@ -18,10 +19,20 @@ from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.settings import SensingConfig, TaskSettings
 from congrasp.common.task.types import Array, SceneState
 
+# In the order of their random numbers; the ranges are those of `SensingConfig`, or 0 to 1
 _DRAWN = (
-    *("period", "phase", "delay", "position_noise", "rotation_noise", "dropout", "position_bias", "rotation_bias"),
+    *(
+        "period",
+        "phase",
+        "delay",
+        "position_noise",
+        "rotation_noise",
+        "dropout",
+        "position_bias",
+        "rotation_bias",
+    ),
     *("latency", "camera_distance", "camera_elevation", "camera_azimuth", "once"),
-)  # in the order of their random numbers; the ranges are those of `SensingConfig`, or 0 to 1
+)
 NEVER = 20_000.0
 """Period in control steps that no episode reaches."""
 
@@ -58,9 +69,13 @@ class Tracker(NamedTuple):
 
     sensors: Sensors
     poses: Array
-    """(B, K, 7) true positions and quaternions of the object in the last K control steps, newest first."""
+    """(B, K, 7) true positions and quaternions of the object in the last K control steps, newest
+    first.
+    """
     first: Array
-    """(B, 7) resting pose of the object: the pose shown at the start of the episode, or the mean since then."""
+    """(B, 7) resting pose of the object: the pose shown at the start of the episode, or the mean
+    since then.
+    """
     rested: Array
     """(B,) number of readings in that mean; 0 once the object has moved or the table is removed."""
     shown: Array
@@ -68,7 +83,9 @@ class Tracker(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Readings of sensors and controller in the last H control steps, newest first; fields as in `SceneState`."""
+    """Readings of sensors and controller in the last H control steps, newest first; fields as in
+    `SceneState`.
+    """
 
     q: Array
     """(B, H, F)."""
@@ -98,7 +115,11 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
     low, high = np.array([*ranges.values()], np.float32).T
     drawn = dict(zip(ranges, (low + (high - low) * numbers["ranges"]).T, strict=True))
     position_bias, rotation_bias = jnp.split(chance.normal(numbers["biases"]), 2, -1)
-    once, up, around = drawn["once"] < config.single_image, drawn["camera_elevation"], drawn["camera_azimuth"]
+    once, up, around = (
+        drawn["once"] < config.single_image,
+        drawn["camera_elevation"],
+        drawn["camera_azimuth"],
+    )
     way = jnp.stack([jnp.cos(up) * jnp.cos(around), jnp.cos(up) * jnp.sin(around), jnp.sin(up)], -1)
     return Sensors(
         key=jax.random.key_data(jax.random.split(key, batch)),
@@ -121,19 +142,29 @@ def longest(config: SensingConfig, control_dt: float) -> int:
 
 
 def begin(sensors: Sensors, steps: int, position: Array, quaternion: Array) -> Tracker:
-    """Returns trackers of objects that have rested at poses (B, 3), (B, 4), with `steps` (K) samples in transit."""
+    """Returns trackers of objects that have rested at poses (B, 3), (B, 4), with `steps` (K)
+    samples in transit.
+    """
     pose = jnp.concatenate([position, quaternion], -1)
     shown = _sampled(sensors, jnp.zeros(pose.shape[0], jnp.int32), pose)[0]
     rested = jnp.ones(len(pose), jnp.int32)
-    return Tracker(sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, rested, shown)
+    return Tracker(
+        sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, rested, shown
+    )
 
 
 def track(
-    tracker: Tracker, time: Array, position: Array, quaternion: Array, table: Array | bool = True, settle: float = 0.0
+    tracker: Tracker,
+    time: Array,
+    position: Array,
+    quaternion: Array,
+    table: Array | bool = True,
+    settle: float = 0.0,
 ) -> Tracker:
     """Advances the trackers by one control step.
 
-    A sample is taken in control step n where floor(n / period + phase) rises, and is shown from step n + delay on.
+    A sample is taken in control step n where floor(n / period + phase) rises, and is shown from
+    step n + delay on.
 
     Args:
       tracker: state after the previous step.
@@ -143,17 +174,22 @@ def track(
       table: (B,) bool: the table is present.
       settle: see `SensingConfig`.
     """
-    poses, arrived, due = arrival(tracker.sensors, tracker.poses, time, jnp.concatenate([position, quaternion], -1))
+    poses, arrived, due = arrival(
+        tracker.sensors, tracker.poses, time, jnp.concatenate([position, quaternion], -1)
+    )
     sample, lost = _sampled(tracker.sensors, time, arrived)
     shown = jnp.where((due & ~lost)[:, None], sample, tracker.shown)
     if settle:
-        first, rested = resting_mean(jnp, tracker.first, tracker.rested, shown, jnp.asarray(table), settle)
+        first, rested = resting_mean(
+            jnp, tracker.first, tracker.rested, shown, jnp.asarray(table), settle
+        )
         tracker = tracker._replace(first=first, rested=rested)
     return tracker._replace(poses=poses, shown=shown)
 
 
 def arrival(sensors: Sensors, poses: Array, time: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """Returns the poses in transit (B, K, 7) after a control step, the oldest (B, 7), and a mask (B,) of due samples.
+    """Returns the poses in transit (B, K, 7) after a control step, the oldest (B, 7), and a mask
+    (B,) of due samples.
 
     Args:
       sensors: periods and delays.
@@ -164,7 +200,11 @@ def arrival(sensors: Sensors, poses: Array, time: Array, pose: Array) -> tuple[A
     poses = jnp.concatenate([pose[:, None], poses[:, :-1]], 1)
     taken = time - sensors.delay
     periods = [jnp.floor(n / sensors.period + sensors.phase) for n in (taken - 1, taken)]
-    return poses, jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0], periods[1] > periods[0]
+    return (
+        poses,
+        jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0],
+        periods[1] > periods[0],
+    )
 
 
 def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
@@ -178,7 +218,9 @@ def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
     position = pose[:, :3] + sensors.position_bias + sensors.position_noise[:, None] * errors[:, :3]
     noise_turn = rotations.from_rotation_vector(sensors.rotation_noise[:, None] * errors[:, 3:])
     turn = rotations.multiply(noise_turn, rotations.from_rotation_vector(sensors.rotation_bias))
-    return jnp.concatenate([position, rotations.multiply(turn, pose[:, 3:])], -1), luck < sensors.dropout
+    return jnp.concatenate(
+        [position, rotations.multiply(turn, pose[:, 3:])], -1
+    ), luck < sensors.dropout
 
 
 def still(reading: Readings, steps: int) -> Readings:
@@ -189,26 +231,38 @@ def still(reading: Readings, steps: int) -> Readings:
 def push(readings: Readings, newest: Readings) -> Readings:
     """Prepends the newest readings (B, ...) and drops the oldest."""
     return Readings(
-        *(jnp.concatenate([new[:, None], old[:, :-1]], 1) for new, old in zip(newest, readings, strict=True))
+        *(
+            jnp.concatenate([new[:, None], old[:, :-1]], 1)
+            for new, old in zip(newest, readings, strict=True)
+        )
     )
 
 
 def seen_by(task: TaskSettings, state: SceneState, readings: Readings) -> SceneState:
     """Returns a control step as observed by the policy: the tracker's pose and the newest targets.
 
-    In a tracked observation, forces and velocities are unknown except the wrist's velocity, on which its targets depend
-    (`common.task.control`): it is the wrist's displacement in the last control step over its duration.
+    In a tracked observation, forces and velocities are unknown except the wrist's velocity, on
+    which its targets depend (`common.task.control`): it is the wrist's displacement in the last
+    control step over its duration.
 
     Args:
       task: the task.
-      state: the true state, except for the object's initial pose, which must be the first shown by the tracker.
-      readings: the last control steps.
+      state: the true state, except for the object's initial pose, which must be the first shown by
+      the tracker. readings: the last control steps.
     """
     newest = ("q_target", "u_target", "object_position", "object_quaternion")
     state = state._replace(**{name: getattr(readings, name)[:, 0] for name in newest})
     if task.observation == "full":
         return state
-    blind = ("q_velocity", "object_velocity", "object_angular_velocity", "contact_force", "contact_position")
+    blind = (
+        "q_velocity",
+        "object_velocity",
+        "object_angular_velocity",
+        "contact_force",
+        "contact_position",
+    )
     state = state._replace(**{name: jnp.zeros_like(getattr(state, name)) for name in blind})
     moved = readings.u[:, 0] - readings.u[:, 1]
-    return state._replace(contact_found=jnp.zeros_like(state.contact_found), u_velocity=moved / task.control_dt)
+    return state._replace(
+        contact_found=jnp.zeros_like(state.contact_found), u_velocity=moved / task.control_dt
+    )

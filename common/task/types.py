@@ -1,8 +1,9 @@
 """Arrays used in the formulas of the task.
 
-Every array has a leading batch axis B. Quantities are in the world frame unless stated otherwise; its z axis points up
-and the table's top is at z = 0. Quaternions are (w, x, y, z) and rotate from the named body's frame into the world (or
-object) frame. F finger joints, L links, P keypoints, C contacts kept per link, N surface points, K waypoints.
+Every array has a leading batch axis B. Quantities are in the world frame unless stated otherwise;
+its z axis points up and the table's top is at z = 0. Quaternions are (w, x, y, z) and rotate from
+the named body's frame into the world (or object) frame. F finger joints, L links, P keypoints, C
+contacts kept per link, N surface points, K waypoints.
 """
 
 import dataclasses
@@ -24,7 +25,9 @@ class SceneState(NamedTuple):
     q: Array
     """(B, F) finger joint angles, rad."""
     u: Array
-    """(B, 6) virtual wrist joints relative to the base: x, y, z (m), then intrinsic x-y-z angles (rad)."""
+    """(B, 6) virtual wrist joints relative to the base: x, y, z (m), then intrinsic x-y-z angles
+    (rad).
+    """
     q_velocity: Array
     """(B, F) rad/s."""
     u_velocity: Array
@@ -74,7 +77,9 @@ class Surface(NamedTuple):
     avoid: Array
     """(B, N) bool, true in the avoid region."""
     normals: Array | None = None
-    """(B, N, 3) outward unit normals at the points, same frame; None if the policy does not observe them."""
+    """(B, N, 3) outward unit normals at the points, same frame; None if the policy does not observe
+    them.
+    """
 
 
 @jax.tree_util.register_dataclass
@@ -83,10 +88,12 @@ class Goal:
     """Goal of an episode by constraint (`common.task.constraints`); object frame."""
 
     values: dict[str, Any]
-    """Goal arrays (B, ...) of each constraint, as the NamedTuple that the constraint names `goal`."""
+    """Goal arrays (B, ...) of each constraint, as the NamedTuple that the constraint names
+    `goal`.
+    """
     active: dict[str, Array]
-    """(B,) bool for each optional block of the observation: True if its constraint is active after the priority rules.
-    Values gated by an inactive block are ignored."""
+    """(B,) bool for each optional block of the observation: True if its constraint is active after
+    the priority rules. Values gated by an inactive block are ignored."""
 
     def __getitem__(self, constraint: str) -> Any:
         """Returns the goal arrays of a constraint."""
@@ -94,7 +101,9 @@ class Goal:
 
     def replace(self, constraint: str, **arrays: Array) -> "Goal":
         """Returns the goal with other arrays of one constraint."""
-        return dataclasses.replace(self, values={**self.values, constraint: self.values[constraint]._replace(**arrays)})
+        return dataclasses.replace(
+            self, values={**self.values, constraint: self.values[constraint]._replace(**arrays)}
+        )
 
     def where(self, mask: Array, constraint: str, **arrays: Array) -> "Goal":
         """Returns the goal with other arrays of one constraint in the masked environments (B,)."""
@@ -141,14 +150,18 @@ class Features(NamedTuple):
     keypoints: Array
     """(B, P, 3) link origins and fingertips."""
     center: Array
-    """(B, 3) hand centre p of the current fingers (in the ablation, of the initial fingers), restricted to those that
-    an active choice of fingers allows."""
+    """(B, 3) hand centre p of the current fingers (in the ablation, of the initial fingers),
+    restricted to those that an active choice of fingers allows."""
     nearest: Array
     """(B, P, 3) d: from each keypoint to the nearest surface point."""
     normal: Array | None
-    """(B, P, 3) n: outward unit normal at the nearest surface point; None if the surface has no normals."""
+    """(B, P, 3) n: outward unit normal at the nearest surface point; None if the surface has no
+    normals.
+    """
     height: Array | None
-    """(B, P) -n . d: signed height of each keypoint above the tangent plane there, m; None without normals."""
+    """(B, P) -n . d: signed height of each keypoint above the tangent plane there, m; None without
+    normals.
+    """
     force: Array
     """(B, L, 3) f: net contact force on each link, N."""
     touching: Array

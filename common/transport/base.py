@@ -13,7 +13,9 @@ from congrasp.common.wire.codec import Message
 Handler = Callable[[str, Message], Message]
 """(key, request) -> reply."""
 Answerer = Callable[[str, Message], "Message | Future[Message]"]
-"""A handler that may also return a future of the reply: its thread then continues with the next request."""
+"""A handler that may also return a future of the reply: its thread then continues with the next
+request.
+"""
 Damage = Callable[[str, CongraspError], None]
 """(key, fault): called for a request that could not be decoded."""
 Admission = Callable[[str], Message | None]
@@ -28,7 +30,8 @@ def join(threads: Iterable[threading.Thread], deadline: float) -> None:
 
 
 class Subscription:
-    """Messages published under a key expression: a ring buffer that keeps the newest and counts lost ones.
+    """Messages published under a key expression: a ring buffer that keeps the newest and counts
+    lost ones.
 
     Attributes:
       dropped: messages lost so far, in transit or because `receive` was called too rarely.
@@ -53,7 +56,8 @@ class Subscription:
             self._changed.notify()
 
     def receive(self, timeout: float) -> tuple[str, Message] | None:
-        """Returns the oldest buffered message with its key; None if none arrives within `timeout` seconds.
+        """Returns the oldest buffered message with its key; None if none arrives within `timeout`
+        seconds.
 
         A message that cannot be decoded counts as dropped.
         """
@@ -110,12 +114,13 @@ class Transport(Closing, Protocol):
 
         Args:
           key: key or key expression.
-          handler: returns the reply; called in a separate daemon thread. Message and code of its CongraspError are
+          handler: returns the reply; called in a separate daemon thread. Message and code of its
+          CongraspError are
             sent.
           workers: threads that run the handler.
           depth: length of the queue; further queries wait at their senders.
-          on_damage: called for requests that cannot be decoded; these are refused without calling the handler.
-          admission: called before a request is decoded; it may reject it with a reply.
+          on_damage: called for requests that cannot be decoded; these are refused without calling
+          the handler. admission: called before a request is decoded; it may reject it with a reply.
         """
         ...
 
@@ -128,13 +133,16 @@ class Transport(Closing, Protocol):
           timeout: seconds to wait for the reply, and for each further chunk of a long one.
 
         Raises:
-          RefusedError: the peer answered with an error; of the subclass that its code names (`common.errors`).
-          TransportError: no peer serves the key, or there was no response in time.
+          RefusedError: the peer answered with an error; of the subclass that its code names
+          (`common.errors`). TransportError: no peer serves the key, or there was no response in
+          time.
         """
         ...
 
     def publish(self, key: str, message: Message) -> None:
-        """Publishes a message to all subscribers; does not block for long, and may lose the message."""
+        """Publishes a message to all subscribers; does not block for long, and may lose the
+        message.
+        """
         ...
 
     def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
@@ -146,5 +154,7 @@ class Transport(Closing, Protocol):
         ...
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
-        """Calls `on_change`, in a daemon thread, for each token that exists, appears or disappears."""
+        """Calls `on_change`, in a daemon thread, for each token that exists, appears or
+        disappears.
+        """
         ...

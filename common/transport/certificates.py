@@ -10,7 +10,14 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.transport.security import CERTIFICATE_FILE, ROLES, Credentials, Identity, not_ours, parse_identity
+from congrasp.common.transport.security import (
+    CERTIFICATE_FILE,
+    ROLES,
+    Credentials,
+    Identity,
+    not_ours,
+    parse_identity,
+)
 
 
 class Certificate(NamedTuple):
@@ -42,7 +49,8 @@ def load(path: pathlib.Path) -> x509.Certificate:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError):
         raise CongraspError(
-            f"{path} is missing or is not a certificate.", "Create it with 'congrasp certs', or correct the path."
+            f"{path} is missing or is not a certificate.",
+            "Create it with 'congrasp certs', or correct the path.",
         ) from None
 
 
@@ -98,5 +106,7 @@ def find(folder: pathlib.Path, role: str) -> Credentials:
     try:
         ssl.create_default_context().load_cert_chain(credentials.certificate, credentials.key)
     except (ssl.SSLError, OSError):
-        raise CongraspError(f"{credentials.key} is not the key of {credentials.certificate}.", remedy) from None
+        raise CongraspError(
+            f"{credentials.key} is not the key of {credentials.certificate}.", remedy
+        ) from None
     return credentials

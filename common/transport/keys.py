@@ -19,11 +19,13 @@ def check_name(what: str, name: str) -> str:
     """Returns a name that is valid within a key.
 
     Raises:
-      CongraspError: it is empty, too long, or has characters other than letters, digits, `_`, `.` and `-`.
+      CongraspError: it is empty, too long, or has characters other than letters, digits, `_`, `.`
+      and `-`.
     """
     if not _NAME.fullmatch(name):
         raise CongraspError(
-            f"{ascii(name)[:70]} cannot be the name of {'an' if what[0] in 'aeiou' else 'a'} {what}.",
+            f"{ascii(name)[:70]} cannot be the name of {'an' if what[0] in 'aeiou' else 'a'} "
+            f"{what}.",
             "Use 1 to 64 letters, digits, '_', '.' and '-'.",
         )
     return name
@@ -31,7 +33,9 @@ def check_name(what: str, name: str) -> str:
 
 def process_name(role: str) -> str:
     """Default name of this process: the names of the machine and of the process."""
-    return re.sub(r"[^\w.-]", "-", f"{platform.node() or role}-{os.getpid()}", flags=re.ASCII)[-64:].lstrip(".-")
+    return re.sub(r"[^\w.-]", "-", f"{platform.node() or role}-{os.getpid()}", flags=re.ASCII)[
+        -64:
+    ].lstrip(".-")
 
 
 def flow(key: str) -> Flow:
@@ -52,7 +56,9 @@ class Alive(NamedTuple):
 
 
 def parse_alive(key: str) -> Alive | None:
-    """Returns the owner of a liveliness token; None if the key is not one, or contains an invalid name."""
+    """Returns the owner of a liveliness token; None if the key is not one, or contains an invalid
+    name.
+    """
     parts = key.split("/")
     named = len(parts) == 6 and parts[2] == "alive" and all(map(_NAME.fullmatch, parts[3:]))
     return Alive(*parts[3:]) if named else None
@@ -73,7 +79,9 @@ def below(key: str) -> str:
 
 
 def account(key: str) -> str:
-    """Common part of the keys of all peers with one certificate: the number at the start of their names."""
+    """Common part of the keys of all peers with one certificate: the number at the start of their
+    names.
+    """
     before, slash, name = key.rpartition("/")
     return before + slash + name.partition(".")[0]
 

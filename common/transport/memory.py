@@ -16,7 +16,14 @@ from concurrent.futures import Future
 from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
-from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, Transport, join
+from congrasp.common.transport.base import (
+    Admission,
+    Answerer,
+    Damage,
+    Subscription,
+    Transport,
+    join,
+)
 from congrasp.common.transport.keys import matches
 from congrasp.common.wire.codec import Message
 
@@ -98,9 +105,13 @@ class MemoryTransport(Transport):
         self._check_open()
         deadline = time.monotonic() + timeout
         with self._hub.lock:
-            server = next((server for server in self._hub.servers if matches(server.key, key)), None)
+            server = next(
+                (server for server in self._hub.servers if matches(server.key, key)), None
+            )
         if server is None:
-            raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
+            raise TransportError(
+                f"No response for {key}.", "The process that serves it may have ended."
+            )
         question = _Question(key, request, Future())
         try:
             server.questions.put(question, timeout=timeout)
@@ -113,7 +124,9 @@ class MemoryTransport(Transport):
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`."""
         with self._hub.lock:
-            subscriptions = [ring for expression, ring in self._hub.subscriptions if matches(expression, key)]
+            subscriptions = [
+                ring for expression, ring in self._hub.subscriptions if matches(expression, key)
+            ]
         for ring in subscriptions:
             ring.push(key, lambda: message)
 
@@ -154,7 +167,8 @@ class MemoryTransport(Transport):
     def close(self) -> None:
         """See `Transport.close`.
 
-        Waits for its threads: one that releases a device array while the interpreter shuts down kills the process.
+        Waits for its threads: one that releases a device array while the interpreter shuts down
+        kills the process.
         """
         if self._closed:
             return
@@ -195,7 +209,9 @@ _listening = threading.Condition()
 
 
 def listen_in_memory(name: str) -> MemoryTransport:
-    """Creates the listening endpoint of a named hub; raises a CongraspError if there is one already."""
+    """Creates the listening endpoint of a named hub; raises a CongraspError if there is one
+    already.
+    """
     with _listening:
         hub = _named.setdefault(name, MemoryHub())
         if hub.listening:
@@ -206,7 +222,9 @@ def listen_in_memory(name: str) -> MemoryTransport:
 
 
 def connect_in_memory(name: str, wait: float) -> MemoryTransport:
-    """Creates an endpoint of a named hub; raises a TransportError if there is no listener within `wait` seconds."""
+    """Creates an endpoint of a named hub; raises a TransportError if there is no listener within
+    `wait` seconds.
+    """
 
     def found() -> MemoryHub | None:
         hub = _named.get(name)
@@ -215,7 +233,9 @@ def connect_in_memory(name: str, wait: float) -> MemoryTransport:
     with _listening:
         if hub := _listening.wait_for(found, wait):
             return MemoryTransport(hub)
-    raise TransportError(f"No response from memory/{name}.", "It can only be reached within its process.")
+    raise TransportError(
+        f"No response from memory/{name}.", "It can only be reached within its process."
+    )
 
 
 def _refuse_waiting(server: _Server) -> None:
@@ -226,7 +246,9 @@ def _refuse_waiting(server: _Server) -> None:
         except queue.Empty:
             break
         if question is not None:
-            question.answer.set_exception(TransportError(f"No response for {question.key}: its server has closed."))
+            question.answer.set_exception(
+                TransportError(f"No response for {question.key}: its server has closed.")
+            )
     for _ in range(server.workers):
         with contextlib.suppress(queue.Full):
             server.questions.put_nowait(None)
@@ -240,7 +262,9 @@ def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
             _answer(question, functools.partial(_ask, question, handler, admission))
 
 
-def _ask(question: _Question, handler: Answerer, admission: Admission) -> "Message | Future[Message]":
+def _ask(
+    question: _Question, handler: Answerer, admission: Admission
+) -> "Message | Future[Message]":
     """Returns the handler's reply to an admitted query."""
     return admission(question.key) or handler(question.key, question.request)
 
@@ -257,7 +281,9 @@ def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message
         question.answer.set_exception(error_of(error.code, str(error)))
     except Exception as error:
         _log.exception("The reply to %s failed.", question.key)
-        question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))
+        question.answer.set_exception(
+            RefusedError(f"The peer failed on {question.key}: {type(error).__name__}.")
+        )
 
 
 def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
@@ -270,7 +296,9 @@ def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
 
 
 class PairTransport(Transport):
-    """Serves, publishes and declares tokens on two transports of the caller; queries and subscribes on the first."""
+    """Serves, publishes and declares tokens on two transports of the caller; queries and subscribes
+    on the first.
+    """
 
     def __init__(self, first: Transport, second: Transport):
         """Combines two transports; `query` and `subscribe` use only the first."""

@@ -20,8 +20,8 @@ SERVER_URL = "tcp/127.0.0.1:7457"
 """Default address of a policy server."""
 _URL = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
 _LOWEST, _COUNT = 15000, 15000
-"""First port for free ports: below the system's range for outgoing connections (from 32768 on Linux), which cannot take
-them."""
+"""First port for free ports: below the system's range for outgoing connections (from 32768 on
+Linux), which cannot take them."""
 _ATTEMPTS = 1000
 _lock, _reserved = threading.Lock(), set[int]()
 
@@ -59,7 +59,8 @@ def reachable_url(url: str) -> str:
 def free_port(count: int = len(FLOWS)) -> int:
     """Returns a free loopback port such that the `count` - 1 following ones are free as well.
 
-    While this process lives, none of them is returned again, neither here nor in another process of this user.
+    While this process lives, none of them is returned again, neither here nor in another process of
+    this user.
 
     Raises:
       OSError: no such ports are free.
@@ -90,7 +91,8 @@ def _reserve(file: int, ports: range) -> None:
 
 @functools.cache
 def _reservations() -> int:
-    """Descriptor of this user's lock file, open until the process ends: closing it would release every lock.
+    """Descriptor of this user's lock file, open until the process ends: closing it would release
+    every lock.
 
     Where no such file can be opened, that of a file of this process alone.
     """

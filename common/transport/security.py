@@ -1,12 +1,15 @@
-"""Authentication and authorisation on the wire: mutual TLS, and the rights of each role at a listener.
+"""Authentication and authorisation on the wire: mutual TLS, and the rights of each role at a
+listener.
 
-Every peer presents a certificate of the authority with the common name `<run>.<role>.<number>`. The listening process
-(the learner, or a policy server) denies everything except what `RIGHTS` grants that name, both for its endpoint and for
-what it would forward. A peer's names on the wire begin with its certificate's number, so it cannot impersonate another
-certificate. The connecting process denies everything to a listener that is not its run's learner or policy server.
+Every peer presents a certificate of the authority with the common name `<run>.<role>.<number>`. The
+listening process (the learner, or a policy server) denies everything except what `RIGHTS` grants
+that name, both for its endpoint and for what it would forward. A peer's names on the wire begin
+with its certificate's number, so it cannot impersonate another certificate. The connecting process
+denies everything to a listener that is not its run's learner or policy server.
 
-Zenoh reads its rules once and compares whole common names. The rules therefore contain all numbers, whether or not
-their certificates exist yet, except those in the file `revoked`. When that file changes, the sessions are reopened.
+Zenoh reads its rules once and compares whole common names. The rules therefore contain all numbers,
+whether or not their certificates exist yet, except those in the file `revoked`. When that file
+changes, the sessions are reopened.
 """
 
 import contextlib
@@ -57,14 +60,17 @@ def parse_identity(common_name: str) -> Identity | None:
 def not_ours(path: pathlib.Path, common_name: str) -> CongraspError:
     """Error for a certificate whose common name is not an identity."""
     return CongraspError(
-        f"{path} is a certificate for {ascii(common_name)[:90]}, which is not a run, role and number.",
+        f"{path} is a certificate for {ascii(common_name)[:90]}, which is not a run, role and "
+        f"number.",
         "Issue one with 'congrasp certs issue'.",
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class Credentials:
-    """A folder with the authority's certificate, a peer's certificate and its key, under Kubernetes file names."""
+    """A folder with the authority's certificate, a peer's certificate and its key, under Kubernetes
+    file names.
+    """
 
     folder: pathlib.Path
     role: str
@@ -87,14 +93,19 @@ class Credentials:
 
     @property
     def identity(self) -> Identity:
-        """Identity of the certificate; raises a CongraspError if it cannot be read or does not name run and role."""
+        """Identity of the certificate; raises a CongraspError if it cannot be read or does not name
+        run and role.
+        """
         try:
             decoded: Any = ssl._ssl._test_decode_cert(str(self.certificate))  # type: ignore[attr-defined]
         except (OSError, ValueError):
             raise CongraspError(
-                f"The credentials in {self.folder} cannot be used.", "Issue new ones with 'congrasp certs issue'."
+                f"The credentials in {self.folder} cannot be used.",
+                "Issue new ones with 'congrasp certs issue'.",
             ) from None
-        names = [value for entry in decoded["subject"] for key, value in entry if key == "commonName"]
+        names = [
+            value for entry in decoded["subject"] for key, value in entry if key == "commonName"
+        ]
         found = parse_identity(names[0]) if names else None
         if found is None:
             raise not_ours(self.certificate, "".join(names))
@@ -111,21 +122,27 @@ class Credentials:
         except FileNotFoundError:
             return frozenset()
         except (OSError, UnicodeDecodeError):
-            raise CongraspError(f"{self.folder / REVOKED_FILE} cannot be read.", "Copy it again.") from None
+            raise CongraspError(
+                f"{self.folder / REVOKED_FILE} cannot be read.", "Copy it again."
+            ) from None
 
     def expects(self, name: Flow, common_name: str | None) -> bool:
         """True if a certificate with this common name may listen to these credentials in a flow."""
         return common_name in self._listeners(name)
 
     def _listeners(self, name: Flow) -> list[str]:
-        """Common names that may listen to these credentials: the learner's, in some flows also the server's."""
+        """Common names that may listen to these credentials: the learner's, in some flows also the
+        server's.
+        """
         run, revoked = self.identity.run, self.revoked()
         roles = LISTENERS if name == "policy" else LISTENERS[:1]
         names = [str(Identity(run, role, number)) for role in roles for number in range(NUMBERS)]
         return [one for one in names if one not in revoked]
 
     def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
-        """Zenoh configuration of the session of one flow that listens or connects with these credentials."""
+        """Zenoh configuration of the session of one flow that listens or connects with these
+        credentials.
+        """
         side = "listen" if listens else "connect"
         tls = {
             "root_ca_certificate": str(self.ca),
@@ -136,13 +153,19 @@ class Credentials:
             "close_link_on_expiration": True,
         }
         settings: dict[str, Any] = {"transport/link/protocols": ["tls"], "transport/link/tls": tls}
-        rules = _access_control(self.identity, name, self.revoked()) if listens else _only(self._listeners(name))
+        rules = (
+            _access_control(self.identity, name, self.revoked())
+            if listens
+            else _only(self._listeners(name))
+        )
         return {**settings, "access_control": rules}
 
 
 @dataclasses.dataclass(frozen=True)
 class Rights:
-    """Rights of a role at a listener, as key expressions below the run; `{name}` matches the certificate's names."""
+    """Rights of a role at a listener, as key expressions below the run; `{name}` matches the
+    certificate's names.
+    """
 
     ask: tuple[str, ...] = ()
     """Keys it may query."""
@@ -163,9 +186,13 @@ RIGHTS: dict[str, dict[str, Rights]] = {
             show=("alive/actor/{name}/*",),
         ),
         "server": Rights(
-            ask=("config", "weights/latest/server/{name}"), hear=("weights/announce",), show=("alive/server/*/*",)
+            ask=("config", "weights/latest/server/{name}"),
+            hear=("weights/announce",),
+            show=("alive/server/*/*",),
         ),
-        "observer": Rights(ask=("config", "status"), hear=("log/**",), show=("alive/recorder/*/*",)),
+        "observer": Rights(
+            ask=("config", "status"), hear=("log/**",), show=("alive/recorder/*/*",)
+        ),
     },
     "server": {
         "client": Rights(ask=("policy/act/{name}", "policy/health")),
@@ -177,15 +204,17 @@ RIGHTS: dict[str, dict[str, Rights]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """Limit of what one connection may send under an expression; excess is dropped, and such a query gets no reply."""
+    """Limit of what one connection may send under an expression; excess is dropped, and such a
+    query gets no reply.
+    """
 
     keys: str
     """Expression below the run."""
     size: int
     """Largest message in bytes."""
     rate: float
-    """With certificates: most messages per second. They must be evenly spaced; one that follows another too soon is
-    dropped. 0 for no limit."""
+    """With certificates: most messages per second. They must be evenly spaced; one that follows
+    another too soon is dropped. 0 for no limit."""
 
 
 _SMALL, _LOG = 64 << 10, 16 << 20
@@ -194,7 +223,10 @@ LIMITS: tuple[Limit, ...] = (
     Limit("status", _SMALL, 100.0),
     Limit("weights/latest/**", _SMALL, 0.0),  # counted per peer by the hub
     Limit("ticket/*", _SMALL, 0.0),  # counted per actor by the hub
-    *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
+    *(
+        Limit(f"log/{channel}/**", _LOG, 100.0)
+        for channel in ("metrics", "event", "version", "episode", "rollout")
+    ),
     # The policy server's queue refuses excess with a message.
     Limit("policy/act/**", 1 << 20, 0.0),
     Limit("policy/health", _SMALL, 100.0),
@@ -211,15 +243,20 @@ def secured(endpoint: str, credentials: Credentials | None) -> str:
     """Returns the endpoint to use: with credentials always TLS.
 
     Raises:
-      CongraspError: a TLS or QUIC endpoint has no credentials, or one with credentials is neither TCP nor TLS.
+      CongraspError: a TLS or QUIC endpoint has no credentials, or one with credentials is neither
+      TCP nor TLS.
     """
     protocol, _, rest = endpoint.partition("/")
     if credentials is None:
         if protocol in ("tls", "quic"):
-            raise CongraspError(f"'{endpoint}' needs certificates.", "Pass --certs; 'congrasp certs' creates them.")
+            raise CongraspError(
+                f"'{endpoint}' needs certificates.", "Pass --certs; 'congrasp certs' creates them."
+            )
         return endpoint
     if protocol not in ("tcp", "tls"):
-        raise CongraspError(f"'{endpoint}' cannot be used with certificates.", "Write it like tls/10.0.0.5:7447.")
+        raise CongraspError(
+            f"'{endpoint}' cannot be used with certificates.", "Write it like tls/10.0.0.5:7447."
+        )
     return f"tls/{rest}"
 
 
@@ -232,12 +269,14 @@ def check_exposure(endpoint: str, credentials: Credentials | None, *, insecure: 
     if credentials is None and not insecure and not _is_loopback(endpoint):
         raise CongraspError(
             f"'{endpoint}' would be reachable from other machines without protection.",
-            "Pass --certs ('congrasp certs' creates them), or --insecure in a network where every machine is trusted.",
+            "Pass --certs ('congrasp certs' creates them), or --insecure in a network where every "
+            "machine is trusted.",
         )
 
 
 def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | None:
-    """Returns the error of a connection if its certificates cause it; takes one attempt of one or two seconds.
+    """Returns the error of a connection if its certificates cause it; takes one attempt of one or
+    two seconds.
 
     Zenoh reports every failure in the same way: that it could not connect.
     """
@@ -252,7 +291,9 @@ def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | N
         return None
 
 
-def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Credentials | None) -> CongraspError | None:
+def _handshake(
+    raw: socket.socket, host: str, endpoint: str, credentials: Credentials | None
+) -> CongraspError | None:
     """Returns the error of a TLS handshake if it is caused by the certificates."""
     context = ssl.create_default_context()
     if credentials is None:
@@ -270,20 +311,31 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
         with context.wrap_socket(raw, server_hostname=host) as connection:
             if credentials is None:
                 return CongraspError(
-                    f"{endpoint} requires certificates.", "Pass --certs; 'congrasp certs' creates them on its machine."
+                    f"{endpoint} requires certificates.",
+                    "Pass --certs; 'congrasp certs' creates them on its machine.",
                 )
             with contextlib.suppress(TimeoutError):
                 connection.recv(1)  # in TLS 1.3 the peer checks our certificate after the handshake
             return None
     except ssl.SSLCertVerificationError as error:
         what = f"{endpoint} presents a certificate that is not trusted: {error.verify_message}."
-        return CongraspError(what, "Use certificates of one authority, and pass --host with the host when issuing.")
+        return CongraspError(
+            what, "Use certificates of one authority, and pass --host with the host when issuing."
+        )
     except ssl.SSLError as error:
         if "ALERT" not in (error.reason or ""):
             return None
-        why = "expired" if "EXPIRED" in error.reason else "missing" if "REQUIRED" in error.reason else "not accepted"
+        why = (
+            "expired"
+            if "EXPIRED" in error.reason
+            else "missing"
+            if "REQUIRED" in error.reason
+            else "not accepted"
+        )
         where = credentials.certificate if credentials else "none"
-        return CongraspError(f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority.")
+        return CongraspError(
+            f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority."
+        )
 
 
 def _is_loopback(endpoint: str) -> bool:
@@ -305,18 +357,27 @@ def _only(names: list[str]) -> dict[str, Any]:
     messages = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
     liveliness = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
     rule = {
-        "id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": messages + liveliness,
+        "id": "all",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
+        "messages": messages + liveliness,
         "key_exprs": ["**"],
-    }  # fmt: skip
+    }
     subjects = [{"id": "listener", "cert_common_names": names}]
     policies = [{"rules": ["all"], "subjects": ["listener"]}]
     return {
-        "enabled": True, "default_permission": "deny", "rules": [rule], "subjects": subjects, "policies": policies,
-    }  # fmt: skip
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule],
+        "subjects": subjects,
+        "policies": policies,
+    }
 
 
 def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> dict[str, Any]:
-    """Access control of a listener in one flow: the rights of each certificate; everything else is denied."""
+    """Access control of a listener in one flow: the rights of each certificate; everything else is
+    denied.
+    """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -329,7 +390,8 @@ def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> di
         subjects.append({"id": who, "cert_common_names": names})
         policies.append({"rules": [rule["id"] for rule in allowed], "subjects": [who]})
 
-    run = mine.run if mine.role == "learner" else "*"  # clients of a server use other names for the policy
+    # Clients of a server use other names for the policy
+    run = mine.run if mine.role == "learner" else "*"
     for other, rights in RIGHTS.get(mine.role, {}).items():
         shared, own = _split(rights)
         peers = [Identity(mine.run, other, number) for number in range(NUMBERS)]
@@ -339,8 +401,12 @@ def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> di
             for peer in peers:
                 allow(str(peer), [str(peer)], _filled(own, numbered(peer.number, "$*")))
     return {
-        "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
-    }  # fmt: skip
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
 
 
 def _rules(who: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str, Any]]:
@@ -374,21 +440,35 @@ def _split(rights: Rights) -> tuple[Rights, Rights]:
     """Splits rights into those shared by a role and those restricted to names."""
     parts = dataclasses.asdict(rights)
     return (
-        Rights(**{kind: tuple(key for key in keys if "{name}" not in key) for kind, keys in parts.items()}),
-        Rights(**{kind: tuple(key for key in keys if "{name}" in key) for kind, keys in parts.items()}),
+        Rights(
+            **{
+                kind: tuple(key for key in keys if "{name}" not in key)
+                for kind, keys in parts.items()
+            }
+        ),
+        Rights(
+            **{kind: tuple(key for key in keys if "{name}" in key) for kind, keys in parts.items()}
+        ),
     )
 
 
 def _filled(rights: Rights, name: str) -> Rights:
     """Replaces `{name}` in rights by a name."""
     parts = dataclasses.asdict(rights)
-    return Rights(**{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()})
+    return Rights(
+        **{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()}
+    )
 
 
 def limits(name: Flow, *, rates: bool) -> dict[str, Any]:
     """Zenoh configuration of the size and rate limits of a listener in one flow."""
     both = {"flows": ["ingress"], "messages": ["query", "put"]}
     found = [(key, limit) for limit in LIMITS for key in _of_flow([limit.keys], name)]
-    sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in found]
+    sizes = [
+        {"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in found
+    ]
     often = [{"key_expr": key, "freq": limit.rate} for key, limit in found if limit.rate and rates]
-    return {"low_pass_filter": sizes, "downsampling": [{"id": "rates", **both, "rules": often}] if often else []}
+    return {
+        "low_pass_filter": sizes,
+        "downsampling": [{"id": "rates", **both, "rules": often}] if often else [],
+    }

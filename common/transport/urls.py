@@ -1,7 +1,8 @@
-"""Opens transports by URL and role; the only place that decides ports, flows and certificates of a role.
+"""Opens transports by URL and role; the only place that decides ports, flows and certificates of a
+role.
 
-A URL is `SCHEME/ADDRESS`: `tcp/HOST:PORT` and `tls/HOST:PORT` over Zenoh, `memory/NAME` within a process. `SCHEMES`
-maps schemes to factories; an external transport adds a row.
+A URL is `SCHEME/ADDRESS`: `tcp/HOST:PORT` and `tls/HOST:PORT` over Zenoh, `memory/NAME` within a
+process. `SCHEMES` maps schemes to factories; an external transport adds a row.
 """
 
 import importlib.util
@@ -30,8 +31,8 @@ PEER_FLOWS: dict[Peer, tuple[Flow, ...]] = {
     "observer": FLOWS[:3],
     "client": ("policy",),
 }
-"""Flows that each role needs at its listener (a client's is a policy server, all others' a learner): the first of the
-listener's flows."""
+"""Flows that each role needs at its listener (a client's is a policy server, all others' a
+learner): the first of the listener's flows."""
 
 
 class Endpoint(NamedTuple):
@@ -57,7 +58,9 @@ class Endpoint(NamedTuple):
         return self.url.partition("/")[2]
 
 
-def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, run: str | None = None) -> Transport:
+def connect(
+    url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, run: str | None = None
+) -> Transport:
     """Connects to the listener at a URL.
 
     Args:
@@ -68,7 +71,8 @@ def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, ru
       run: required run of the certificate.
 
     Raises:
-      CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted, or of another role or
+      CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted,
+      or of another role or
         run; or the listener's certificate does not allow it to listen.
       TransportError: no listener responds.
     """
@@ -89,22 +93,28 @@ def listen(
     Args:
       url: `SCHEME/ADDRESS`.
       role: learner or policy server.
-      certs: folder of the role's certificate: enables mutual TLS, and restricts each role to its rights.
-      insecure: allows listening beyond loopback without certificates.
+      certs: folder of the role's certificate: enables mutual TLS, and restricts each role to its
+      rights. insecure: allows listening beyond loopback without certificates.
       run: required run of the certificate.
-      longest_rollout: longest rollout accepted by a learner, in bytes; longer ones are dropped undecoded.
+      longest_rollout: longest rollout accepted by a learner, in bytes; longer ones are dropped
+      undecoded.
 
     Raises:
-      CongraspError: the URL is malformed or in use; or it is exposed to other machines without protection; or the
+      CongraspError: the URL is malformed or in use; or it is exposed to other machines without
+      protection; or the
         certificates are missing, expired, or of another role or run.
     """
-    return _open(Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout))
+    return _open(
+        Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout)
+    )
 
 
 def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credentials | None:
-    """Returns the credentials of a role, for a run if one is given; None without a folder of certificates.
+    """Returns the credentials of a role, for a run if one is given; None without a folder of
+    certificates.
 
-    Without the package cryptography, as for a client that needs only NumPy and Zenoh, only the peer checks them.
+    Without the package cryptography, as for a client that needs only NumPy and Zenoh, only the peer
+    checks them.
 
     Raises:
       CongraspError: they are missing, damaged, expired, or of another role or run.
@@ -118,14 +128,18 @@ def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credent
     credentials = find(pathlib.Path(certs), role)
     if run is not None and credentials.identity.run != run:
         raise CongraspError(
-            f"{credentials.certificate} belongs to the run '{credentials.identity.run}', not '{run}'.",
-            f"Connect to that run, or issue a certificate for this one: congrasp certs issue --run {run} --role {role}",
+            f"{credentials.certificate} belongs to the run '{credentials.identity.run}', not "
+            f"'{run}'.",
+            f"Connect to that run, or issue a certificate for this one: congrasp certs issue --run "
+            f"{run} --role {role}",
         )
     return credentials
 
 
 def name_on_wire(name: str, certs: Certs, role: str = "actor") -> str:
-    """Name of an actor, server or client on the wire: it begins with its certificate's number, if it has one."""
+    """Name of an actor, server or client on the wire: it begins with its certificate's number, if
+    it has one.
+    """
     credentials = find_credentials(certs, role)
     return name if credentials is None else numbered(credentials.identity.number, name)
 
@@ -134,7 +148,8 @@ def _open(endpoint: Endpoint) -> Transport:
     scheme = endpoint.url.partition("/")[0]
     if scheme not in SCHEMES:
         raise CongraspError(
-            f"'{endpoint.url}' is not an endpoint.", f"Write it like {LEARNER_URL}; schemes: {', '.join(SCHEMES)}."
+            f"'{endpoint.url}' is not an endpoint.",
+            f"Write it like {LEARNER_URL}; schemes: {', '.join(SCHEMES)}.",
         )
     return SCHEMES[scheme](endpoint)
 
@@ -154,10 +169,15 @@ def _open_zenoh(endpoint: Endpoint) -> Transport:
         check_exposure(endpoint.url, credentials, insecure=endpoint.insecure)
         flows = LISTENER_FLOWS[endpoint.role]  # type: ignore[index]
         return ZenohTransport(
-            listen=[endpoint.url], flows=flows, credentials=credentials, longest_rollout=endpoint.longest_rollout
+            listen=[endpoint.url],
+            flows=flows,
+            credentials=credentials,
+            longest_rollout=endpoint.longest_rollout,
         )
     flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
-    return ZenohTransport(connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials)
+    return ZenohTransport(
+        connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials
+    )
 
 
 Factory = Callable[[Endpoint], Transport]

@@ -1,11 +1,12 @@
 """Zenoh sessions: their configuration and limits, and the threads that work inside them.
 
-A listener bounds the resources of untrusted peers: silent connections, incomplete messages, and replies that are not
-read. If a reader's link is full, a reply waits a few milliseconds and is then dropped: Zenoh replies with the
-congestion control of the query, which every process here overwrites on arrival.
+A listener bounds the resources of untrusted peers: silent connections, incomplete messages, and
+replies that are not read. If a reader's link is full, a reply waits a few milliseconds and is then
+dropped: Zenoh replies with the congestion control of the query, which every process here overwrites
+on arrival.
 
-Zenoh closes a connection in the thread that waits for the data of all of them, and closing lasts until the peer has
-acknowledged it (zenoh #1101). A listener therefore has many such threads.
+Zenoh closes a connection in the thread that waits for the data of all of them, and closing lasts
+until the peer has acknowledged it (zenoh #1101). A listener therefore has many such threads.
 """
 
 import contextlib
@@ -32,22 +33,38 @@ from congrasp.common.wire.codec import Message, decode
 LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
 """Largest message that is reassembled, in bytes; each connection may reassemble several at once."""
 _LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "policy": 2500}
-_BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
+_BLOCK_US: dict[Flow, int] = {
+    "control": 2_000_000,
+    "bulk": 5_000_000,
+    "log": 1_000_000,
+    "policy": 2_000_000,
+}
 _OVERHEAD = 64 << 10  # bytes of Zenoh's overhead for a message
 _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are handled between two
-_CLOSE = 2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
+_CLOSE = (
+    2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
+)
 _REOPEN = 10.0  # deadline of reopening, s
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
-"""Microseconds that a reply waits for room in its reader's link; then replies are dropped until there is room."""
+"""Microseconds that a reply waits for room in its reader's link; then replies are dropped until
+there is room.
+"""
 _ROOM_LONG_US = 200_000  # total wait of a chunk's fragments, microseconds
-_QUEUE = 8  # batches of 64 KiB queued for a link: an acknowledgement fits in addition to a chunk of a long reply
+# Batches of 64 KiB queued for a link: an acknowledgement fits in addition to a chunk of a long
+# reply
+_QUEUE = 8
 _ACCEPT_MS = 5000  # deadline of a connection's handshake, ms
 _PENDING = 4096  # most connections in a handshake, but at most a quarter of the open files
 _FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
 _CLOSERS = 64  # threads of a listener that accept and close connections and wait for their data
-_RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"  # of the user; read at the first session
-if not re.search(r"\bacc\s*:", _RUNTIME):  # other values than of the form (…) or Name(…) are the user's alone
-    os.environ["ZENOH_RUNTIME"] = re.sub(r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {_CLOSERS}), ", _RUNTIME)
+# Of the user; read at the first session
+_RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"
+if not re.search(
+    r"\bacc\s*:", _RUNTIME
+):  # other values than of the form (…) or Name(…) are the user's alone
+    os.environ["ZENOH_RUNTIME"] = re.sub(
+        r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {_CLOSERS}), ", _RUNTIME
+    )
 _POOL = "(?:app|acc|tx|rx|net)"
 _THREADS = r"worker_threads:\+?\d[\d_]{0,3}|max_blocking_threads:\+?[1-9][\d_]{0,3}"
 _SETTINGS = rf"\((?:(?:{_THREADS}|handover:(?:{_POOL}|None|Some\({_POOL}\)))(?:,|(?=\))))*\)"
@@ -56,14 +73,19 @@ _FORM = re.compile(
     rf"\((?!.*\b(\w+):\(.*\b\1:\()(?:{_POOL}:(?:RuntimeParamHelper)?{_SETTINGS}(?:,|(?=\))))*\)"
 )
 _FILLING = re.compile(r"/\*.*?\*/|//[^\n]*|\s+", re.DOTALL)
-_SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
+# Most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
+_SESSIONS = 1000
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""
 _log = logging.getLogger(__name__)
 
 
 def configuration(
-    name: Flow, endpoints: list[str], listens: bool, max_message: int, credentials: Credentials | None
+    name: Flow,
+    endpoints: list[str],
+    listens: bool,
+    max_message: int,
+    credentials: Credentials | None,
 ) -> zenoh.Config:
     """Returns the Zenoh configuration of one flow's session.
 
@@ -93,7 +115,9 @@ def configuration(
         "transport/link/tx/queue/size/data": _QUEUE,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US[name],
-        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": _ROOM_LONG_US,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (
+            _ROOM_LONG_US
+        ),
         "transport/link/rx/max_message_size": longest + _OVERHEAD,
         "qos/network": [{**answers, "overwrite": {"congestion_control": "drop"}}],
         **(limits(name, rates=credentials is not None) if listens else {}),
@@ -110,14 +134,17 @@ def configuration(
 
 @functools.cache
 def _open_files() -> int:
-    """Files that this process may have open; raises the limit to `_FILES` where the system allows it, else warns."""
+    """Files that this process may have open; raises the limit to `_FILES` where the system allows
+    it, else warns.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     if most < _FILES:
         _log.warning(
-            "This process may open %d files: more than %d silent connections keep new peers out. Raise the hard limit "
+            "This process may open %d files: more than %d silent connections keep new peers out. "
+            "Raise the hard limit "
             "to %d (ulimit -n, LimitNOFILE=).",
             most,
             most // 4,
@@ -127,7 +154,9 @@ def _open_files() -> int:
 
 
 def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
-    """Opens a listening session; raises a CongraspError if it cannot listen, such as on a port in use."""
+    """Opens a listening session; raises a CongraspError if it cannot listen, such as on a port in
+    use.
+    """
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -135,20 +164,26 @@ def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
         if "in use" in str(error):
             raise CongraspError(
                 f"The port of {where} is in use.",
-                f"Stop the process that listens there, or use another port ({', '.join(FLOWS)} take one each, in "
+                f"Stop the process that listens there, or use another port ({', '.join(FLOWS)} "
+                f"take one each, in "
                 "this order).",
             ) from None
         raise CongraspError(f"Cannot listen on {where}: {first_line(error)}.") from None
 
 
 def connect(
-    config: zenoh.Config, endpoints: list[str], deadline: float, name: Flow, credentials: Credentials | None
+    config: zenoh.Config,
+    endpoints: list[str],
+    deadline: float,
+    name: Flow,
+    credentials: Credentials | None,
 ) -> zenoh.Session:
     """Opens a connected session.
 
     Raises:
       TransportError: there is no response before the deadline.
-      CongraspError: the listener rejects our certificate, or its certificate does not allow it to listen for this run.
+      CongraspError: the listener rejects our certificate, or its certificate does not allow it to
+      listen for this run.
     """
     while True:
         try:
@@ -163,12 +198,15 @@ def connect(
                 remedy = "Start the learner or the server there, or correct the address."
                 if "Unable to connect" in str(error):
                     raise TransportError(f"No response from {where}.", remedy) from None
-                raise TransportError(f"Cannot connect to {where}: {first_line(error)}.", remedy) from None
+                raise TransportError(
+                    f"Cannot connect to {where}: {first_line(error)}.", remedy
+                ) from None
     shown = [link.auth_identifier for link in session.info.links()] if credentials else []
     if credentials and shown and not any(credentials.expects(name, one) for one in shown):
         session.close()
         raise CongraspError(
-            f"{', '.join(endpoints)} presents the certificate {ascii(shown[0])[:90]}, which may not listen for "
+            f"{', '.join(endpoints)} presents the certificate {ascii(shown[0])[:90]}, which may "
+            f"not listen for "
             f"{credentials.identity}.",
             "Connect to a learner or server of the same run whose certificate is not revoked.",
         )
@@ -183,7 +221,12 @@ def first_line(error: Exception) -> str:
 class _Declaration:
     """A declaration in a flow, repeated whenever its session is reopened."""
 
-    def __init__(self, name: Flow, declare: Callable[[zenoh.Session], Any], works: tuple[Callable[[Any], None], ...]):
+    def __init__(
+        self,
+        name: Flow,
+        declare: Callable[[zenoh.Session], Any],
+        works: tuple[Callable[[Any], None], ...],
+    ):
         self.name, self.declare, self.works = name, declare, works
         self.entity: Any = None
 
@@ -191,7 +234,8 @@ class _Declaration:
 class Sessions:
     """Sessions of a transport, their declarations, and the threads inside them.
 
-    A thread that is inside Zenoh when the interpreter exits aborts the process, so closing waits for all threads.
+    A thread that is inside Zenoh when the interpreter exits aborts the process, so closing waits
+    for all threads.
 
     Attributes:
       closed: set once the sessions are closed.
@@ -215,13 +259,16 @@ class Sessions:
         self._open[name] = opener()
 
     def get(self, name: Flow) -> zenoh.Session | None:
-        """Returns a flow's session; None if there is none, or while it is closed or being reopened."""
+        """Returns a flow's session; None if there is none, or while it is closed or being
+        reopened.
+        """
         return self._open.get(name)
 
     def declare(
         self, name: Flow, declare: Callable[[zenoh.Session], Any], *works: Callable[[Any], None]
     ) -> Callable[[], None]:
-        """Declares something in a session; each of `works` runs with its channel in a daemon thread.
+        """Declares something in a session; each of `works` runs with its channel in a daemon
+        thread.
 
         Returns:
           A function that undeclares it.
@@ -253,16 +300,22 @@ class Sessions:
             for name, opener in self._openers.items():
                 if not self.closed.is_set():
                     self._open[name] = opener()
-            if self.closed.is_set():  # by another thread, which only saw the sessions open at that time
+            if (
+                self.closed.is_set()
+            ):  # by another thread, which only saw the sessions open at that time
                 self.close()
                 return
             for declaration in self._declarations:
                 self._start_all(declaration)
 
     def start(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Runs a function in a separate daemon thread; it must return when the sessions are closed."""
+        """Runs a function in a separate daemon thread; it must return when the sessions are
+        closed.
+        """
         what = getattr(function, "func", function).__name__
-        thread = threading.Thread(target=function, args=arguments, daemon=True, name=f"zenoh-{what}")
+        thread = threading.Thread(
+            target=function, args=arguments, daemon=True, name=f"zenoh-{what}"
+        )
         thread.start()
         self._threads = [*(one for one in self._threads if one.is_alive()), thread]
 
@@ -295,13 +348,16 @@ class Sessions:
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
-    def watch_revocations(self, credentials: Credentials, period: float, known: frozenset[str] | None) -> None:
+    def watch_revocations(
+        self, credentials: Credentials, period: float, known: frozenset[str] | None
+    ) -> None:
         """Checks for revoked certificates in a thread, until the sessions are closed.
 
         Args:
           credentials: credentials of this process.
           period: seconds between two checks.
-          known: the certificates that were revoked when a listener's sessions were opened; None if they connect.
+          known: the certificates that were revoked when a listener's sessions were opened; None if
+          they connect.
         """
         if known is None:
             self.start(heed_revocations, self, credentials, period)
@@ -310,20 +366,31 @@ class Sessions:
 
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""
-        return {str(link.auth_identifier) for session in list(self._open.values()) for link in session.info.links()}
+        return {
+            str(link.auth_identifier)
+            for session in list(self._open.values())
+            for link in session.info.links()
+        }
 
     def _start_all(self, declaration: _Declaration) -> None:
-        """Declares in the current session, and starts the threads; raises a TransportError if there is no session."""
+        """Declares in the current session, and starts the threads; raises a TransportError if there
+        is no session.
+        """
         session = self._open.get(declaration.name)
         if session is None:
-            raise TransportError("The transport is closed." if self.closed.is_set() else "There is no such flow.")
+            raise TransportError(
+                "The transport is closed." if self.closed.is_set() else "There is no such flow."
+            )
         declaration.entity = declaration.declare(session)
         for work in declaration.works:
             self.start(work, declaration.entity.handler)
 
 
-def follow_revocations(sessions: Sessions, credentials: Credentials, known: frozenset[str], period: float) -> None:
-    """Reopens a listener's sessions whenever the list of revoked certificates changes, until they are closed.
+def follow_revocations(
+    sessions: Sessions, credentials: Credentials, known: frozenset[str], period: float
+) -> None:
+    """Reopens a listener's sessions whenever the list of revoked certificates changes, until they
+    are closed.
 
     Args:
       sessions: sessions of the listener.
@@ -336,7 +403,9 @@ def follow_revocations(sessions: Sessions, credentials: Credentials, known: froz
             listed = credentials.revoked()
             if listed == known:
                 continue
-            _log.warning("The list of revoked certificates has changed: all connections are reopened.")
+            _log.warning(
+                "The list of revoked certificates has changed: all connections are reopened."
+            )
             sessions.reopen()
             known = listed
         except CongraspError as error:  # retried at the next check
@@ -392,11 +461,13 @@ def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
     return decode(payload.to_bytes(), max_bytes=max_message)
 
 
-def watch_tokens(samples: Any, on_change: Callable[[str, bool], None], closed: threading.Event) -> None:
+def watch_tokens(
+    samples: Any, on_change: Callable[[str, bool], None], closed: threading.Event
+) -> None:
     """Reports liveliness tokens until the session closes; runs in a separate thread.
 
-    When the session is reopened, all known tokens are reported as gone first; otherwise peers that left meanwhile would
-    not be noticed.
+    When the session is reopened, all known tokens are reported as gone first; otherwise peers that
+    left meanwhile would not be noticed.
     """
     shown: set[str] = set()
 

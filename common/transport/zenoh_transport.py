@@ -1,8 +1,9 @@
 """Transport over Zenoh.
 
-One process listens (the learner or a policy server); the others connect to it, and it forwards between them. Each flow
-has a separate session and thus a separate TCP connection: on one shared link, a rollout of some megabytes would delay a
-ticket, and a slow recorder would delay both. Flow number i uses the port i above the given one.
+One process listens (the learner or a policy server); the others connect to it, and it forwards
+between them. Each flow has a separate session and thus a separate TCP connection: on one shared
+link, a rollout of some megabytes would delay a ticket, and a slow recorder would delay both. Flow
+number i uses the port i above the given one.
 
 Long replies are fetched in chunks (`Outbox`). Everything is received through channels drained by
 daemon threads; a callback would keep the process from exiting.
@@ -30,11 +31,22 @@ from congrasp.common.transport.base import Admission, Answerer, Damage, Subscrip
 from congrasp.common.transport.keys import FLOWS, Flow, account, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
-from congrasp.common.transport.zenoh_session import STAMP, Sessions, first_line, listen_to, received, watch_tokens
+from congrasp.common.transport.zenoh_session import (
+    STAMP,
+    Sessions,
+    first_line,
+    listen_to,
+    received,
+    watch_tokens,
+)
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 _SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a chunk
-_FAST, _SLOW = 0.1, 0.4  # seconds of a chunk below which the next is longer, and above which it is shorter
+# Seconds of a chunk below which the next is longer, and above which it is shorter
+_FAST, _SLOW = (
+    0.1,
+    0.4,
+)
 TIMEOUT = 1.0
 """Seconds until a chunk counts as lost."""
 _PAUSE = 0.05  # seconds to wait after a chunk that was lost or deferred
@@ -54,7 +66,9 @@ class Pace:
         self._length = _FIRST
 
     def wish(self) -> bytes | None:
-        """Attachment of a query that requests a longer first chunk; None before the first long reply."""
+        """Attachment of a query that requests a longer first chunk; None before the first long
+        reply.
+        """
         return _WISH.pack(self._length) if self._length > _FIRST else None
 
     def lost(self) -> None:
@@ -66,7 +80,9 @@ class Pace:
         return _REQUEST.pack(token, offset, self._length)
 
     def note(self, seconds: float, *, came: bool) -> None:
-        """Records the duration of a chunk and whether it arrived; a deferred one changes nothing."""
+        """Records the duration of a chunk and whether it arrived; a deferred one changes
+        nothing.
+        """
         if seconds > _SLOW:
             self._length = max(_SHORTEST, self._length // 2)
         elif came and seconds < _FAST:
@@ -76,10 +92,11 @@ class Pace:
 class Outbox:
     """Long replies in chunks, fetched one after another by the client at the speed of its link.
 
-    The first chunk is short, or as long as requested by a client that has received chunks of that length before. A
-    reply no longer than that is complete. Otherwise its attachment holds a token and the total length, and the client
-    queries the rest under the same key, by token, offset and length. No message is therefore longer than the client's
-    link transfers in a moment, and a slow or stopped client costs the server nothing but dropped chunks.
+    The first chunk is short, or as long as requested by a client that has received chunks of that
+    length before. A reply no longer than that is complete. Otherwise its attachment holds a token
+    and the total length, and the client queries the rest under the same key, by token, offset and
+    length. No message is therefore longer than the client's link transfers in a moment, and a slow
+    or stopped client costs the server nothing but dropped chunks.
 
     A payload sent repeatedly is stored once, and only the last used ones are kept.
     """
@@ -92,13 +109,17 @@ class Outbox:
         self._kept: OrderedDict[bytes, bytes] = OrderedDict()
 
     @contextlib.contextmanager
-    def first(self, payload: bytes, attachment: bytes, account: str) -> Iterator[tuple[bytes, bytes | None]]:
-        """Context of sending a reply: yields its first chunk and the chunk's attachment, None if the reply is complete.
+    def first(
+        self, payload: bytes, attachment: bytes, account: str
+    ) -> Iterator[tuple[bytes, bytes | None]]:
+        """Context of sending a reply: yields its first chunk and the chunk's attachment, None if
+        the reply is complete.
 
         Args:
           payload: the whole reply.
           attachment: attachment of the query.
-          account: account of the client. Its first chunk is short while others are being sent to it.
+          account: account of the client. Its first chunk is short while others are being sent to
+          it.
         """
         longest = min(_WISH.unpack(attachment)[0], _LONGEST) if len(attachment) == _WISH.size else 0
         if len(payload) <= _FIRST or longest <= _FIRST:
@@ -108,7 +129,9 @@ class Outbox:
             yield self._cut(payload, longest if mine else _FIRST)
 
     def _cut(self, payload: bytes, longest: int) -> tuple[bytes, bytes | None]:
-        """Returns the first chunk of a reply and its attachment; stores the reply if that is not all of it."""
+        """Returns the first chunk of a reply and its attachment; stores the reply if that is not
+        all of it.
+        """
         if len(payload) <= longest:
             return payload, None
         with self._lock:
@@ -182,7 +205,9 @@ def fetch(head: bytes, first: bytes, ask: Ask, pace: Pace, *, most: int, timeout
             time.sleep(max(0.0, min(_PAUSE, deadline - ended)))
             continue
         if not piece or have + len(piece) > size:
-            raise TransportError("The rest of a reply is no longer available.", "Send the query again.")
+            raise TransportError(
+                "The rest of a reply is no longer available.", "Send the query again."
+            )
         parts.append(piece)
         have, deadline = have + len(piece), ended + timeout
     return b"".join(parts)
@@ -205,7 +230,7 @@ class _Reply(NamedTuple):
 class ZenohTransport(Transport):
     """A `Transport` over Zenoh sessions."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         *,
         connect: Sequence[str] = (),
@@ -220,21 +245,24 @@ class ZenohTransport(Transport):
         """Opens the sessions.
 
         Args:
-          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that responds is used, and
+          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that responds
+          is used, and
             reconnected whenever it returns.
           listen: endpoints to listen on instead.
-          flows: flows to open; flow i uses the port i above the endpoint's, so the flows of both ends must start alike.
-          max_message: limit of a message's length in bytes; `zenoh_session.LONGEST` has lower limits for some flows.
-          wait: seconds to wait for a listener at `connect`.
-          credentials: credentials for mutual TLS; a listener restricts each role to its rights in
+          flows: flows to open; flow i uses the port i above the endpoint's, so the flows of both
+          ends must start alike. max_message: limit of a message's length in bytes;
+          `zenoh_session.LONGEST` has lower limits for some flows. wait: seconds to wait for a
+          listener at `connect`. credentials: credentials for mutual TLS; a listener restricts each
+          role to its rights in
             `common.transport.security`. None uses plain TCP.
-          longest_rollout: longest rollout accepted by a listener, in bytes; by default `max_message`.
-          revocation_seconds: period of the checks for revoked certificates. A listener then reopens all connections; a
+          longest_rollout: longest rollout accepted by a listener, in bytes; by default
+          `max_message`. revocation_seconds: period of the checks for revoked certificates. A
+          listener then reopens all connections; a
             connecting transport closes if its listener's certificate is revoked.
 
         Raises:
-          CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
-          TransportError: no listener responds.
+          CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are
+          not accepted. TransportError: no listener responds.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
@@ -246,7 +274,10 @@ class ZenohTransport(Transport):
         self._counts_lock = threading.Lock()
         self._outbox, self._pace, self._sessions = Outbox(), Pace(), Sessions()
         self._finalizer = weakref.finalize(self, self._sessions.close)
-        deadline, known = time.monotonic() + wait, credentials.revoked() if credentials else frozenset()
+        deadline, known = (
+            time.monotonic() + wait,
+            credentials.revoked() if credentials else frozenset(),
+        )
 
         def opened(name: Flow, where: list[str]) -> zenoh.Session:
             longest = longest_rollout if name == "bulk" and longest_rollout else max_message
@@ -262,7 +293,9 @@ class ZenohTransport(Transport):
             self.close()
             raise
         if credentials:
-            self._sessions.watch_revocations(credentials, revocation_seconds, known if listen else None)
+            self._sessions.watch_revocations(
+                credentials, revocation_seconds, known if listen else None
+            )
 
     def serve(
         self,
@@ -278,7 +311,9 @@ class ZenohTransport(Transport):
         hooks = on_damage or (lambda *_: None), admission or (lambda _: None)
         server = _Server(handler, *hooks, self._max_message, self._outbox)
         works = [functools.partial(_serve, server=server)] * workers
-        self._sessions.declare(flow(key), lambda session: session.declare_queryable(key, FifoChannel(depth)), *works)
+        self._sessions.declare(
+            flow(key), lambda session: session.declare_queryable(key, FifoChannel(depth)), *works
+        )
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
         """See `Transport.query`."""
@@ -293,7 +328,9 @@ class ZenohTransport(Transport):
         reply = self._first(key, self._encode(request), timeout)
         whole = reply.payload
         if reply.head:
-            whole = fetch(reply.head, whole, ask, self._pace, most=self._max_message, timeout=timeout)
+            whole = fetch(
+                reply.head, whole, ask, self._pace, most=self._max_message, timeout=timeout
+            )
         return decode(whole, max_bytes=self._max_message)
 
     def _first(self, key: str, payload: bytes, timeout: float) -> _Reply:
@@ -315,7 +352,9 @@ class ZenohTransport(Transport):
                 return reply
         return self._ask(key, payload, None, timeout)
 
-    def _ask(self, key: str, payload: bytes | None, attachment: bytes | None, timeout: float) -> _Reply:
+    def _ask(
+        self, key: str, payload: bytes | None, attachment: bytes | None, timeout: float
+    ) -> _Reply:
         """Sends one query; raises like `query`."""
         refused: zenoh.ReplyError | None = None
         try:
@@ -340,12 +379,18 @@ class ZenohTransport(Transport):
         if message == b"Timeout":
             raise TransportError(f"No answer for {key} within {timeout:g} s.")
         if refused is not None:
-            raise error_of(str(refused.encoding).partition(";")[2], message.decode(errors="replace"))
+            raise error_of(
+                str(refused.encoding).partition(";")[2], message.decode(errors="replace")
+            )
         revoked = f", or has revoked the certificate {self._identity}" if self._identity else ""
-        raise TransportError(f"No response for {key}.", f"The process that serves it may have ended{revoked}.")
+        raise TransportError(
+            f"No response for {key}.", f"The process that serves it may have ended{revoked}."
+        )
 
     def publish(self, key: str, message: Message) -> None:
-        """See `Transport.publish`; does nothing once closed, or while the sessions are being reopened."""
+        """See `Transport.publish`; does nothing once closed, or while the sessions are being
+        reopened.
+        """
         payload = self._encode(message)
         name = flow(key)
         with self._counts_lock:
@@ -375,7 +420,9 @@ class ZenohTransport(Transport):
             self._sessions.declare(
                 flow(key_expression),
                 lambda session: session.declare_subscriber(key_expression, FifoChannel(_QUEUE)),
-                functools.partial(listen_to, subscription=subscription, max_message=self._max_message),
+                functools.partial(
+                    listen_to, subscription=subscription, max_message=self._max_message
+                ),
             )
         )
         return subscription
@@ -388,7 +435,9 @@ class ZenohTransport(Transport):
         """See `Transport.watch_alive`."""
 
         def declare(session: zenoh.Session) -> Any:
-            return session.liveliness().declare_subscriber(key_expression, FifoChannel(_QUEUE), history=True)
+            return session.liveliness().declare_subscriber(
+                key_expression, FifoChannel(_QUEUE), history=True
+            )
 
         watch = functools.partial(watch_tokens, on_change=on_change, closed=self._sessions.closed)
         self._sessions.declare(flow(key_expression), declare, watch)
@@ -437,9 +486,15 @@ def _serve(queries: Any, server: _Server) -> None:
         key = str(query.key_expr)
         wanted = query.attachment.to_bytes() if query.attachment else b""
         if not is_request(wanted):
-            _reply(query, key, functools.partial(_answer, query, key, server), server.outbox, wanted)
+            _reply(
+                query, key, functools.partial(_answer, query, key, server), server.outbox, wanted
+            )
         else:
-            with contextlib.suppress(zenoh.ZError, CongraspError), query, server.outbox.turn(account(key)) as mine:
+            with (
+                contextlib.suppress(zenoh.ZError, CongraspError),
+                query,
+                server.outbox.turn(account(key)) as mine,
+            ):
                 if mine and server.admission(key) is None:
                     query.reply(key, server.outbox.piece(wanted), attachment=wanted)
 
@@ -449,7 +504,9 @@ def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
     if (rejected := server.admission(key)) is not None:
         return rejected
     try:
-        request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=server.max_message)
+        request = decode(
+            query.payload.to_bytes() if query.payload else b"", max_bytes=server.max_message
+        )
     except CongraspError as error:
         server.on_damage(key, error)
         raise
@@ -457,9 +514,14 @@ def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
 
 
 def _reply(
-    query: Any, key: str, outcome: Callable[[], Message | Future[Message]], outbox: Outbox, attachment: bytes
+    query: Any,
+    key: str,
+    outcome: Callable[[], Message | Future[Message]],
+    outbox: Outbox,
+    attachment: bytes,
 ) -> None:
-    """Replies to a query with the result of a function once it is available, or with message and code of its error.
+    """Replies to a query with the result of a function once it is available, or with message and
+    code of its error.
 
     The message is the error's payload, and the code the schema of its encoding.
     """
@@ -467,7 +529,9 @@ def _reply(
     try:
         result = outcome()
         if isinstance(result, Future):
-            result.add_done_callback(lambda done: _reply(query, key, done.result, outbox, attachment))
+            result.add_done_callback(
+                lambda done: _reply(query, key, done.result, outbox, attachment)
+            )
             return
         payload = encode(result)
     except CongraspError as error:

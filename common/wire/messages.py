@@ -1,12 +1,12 @@
 """Specification of each kind of message, and its validation.
 
-A spec names arrays with their dtypes and shapes. A shape consists of numbers and of symbols such as T; a symbol has one
-size throughout a message. Floating-point values must be finite.
+A spec names arrays with their dtypes and shapes. A shape consists of numbers and of symbols such as
+T; a symbol has one size throughout a message. Floating-point values must be finite.
 
-The arrays of a rollout are defined once for all producers and consumers. Actors can record `RECORDABLE`; the learner's
-algorithm selects the arrays it learns from, and the learner sends that selection to the actors. These specs and a run's
-sizes (`RolloutForm`) determine what is sent, what is admitted, the layout of a batch, and the axis along which it is
-sharded over ranks.
+The arrays of a rollout are defined once for all producers and consumers. Actors can record
+`RECORDABLE`; the learner's algorithm selects the arrays it learns from, and the learner sends that
+selection to the actors. These specs and a run's sizes (`RolloutForm`) determine what is sent, what
+is admitted, the layout of a batch, and the axis along which it is sharded over ranks.
 """
 
 import dataclasses
@@ -24,7 +24,9 @@ WORLDS = "B"
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")
 LONGEST_TEXT = 4096
-"""Limit of a text in the metadata, in characters; the text of a hand has a separate limit (`common.hands.files`)."""
+"""Limit of a text in the metadata, in characters; the text of a hand has a separate limit
+(`common.hands.files`).
+"""
 REAL = ("float32", "float64")
 _INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or NaN
 _BLOCK = 1 << 16
@@ -51,8 +53,8 @@ class ArraySpec:
 
 
 Schema = Mapping[str, ArraySpec]
-"""Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action sizes, P privileged
-inputs of the critic, and S inputs of a teacher (`common.task.privileged`)."""
+"""Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action
+sizes, P privileged inputs of the critic, and S inputs of a teacher (`common.task.privileged`)."""
 
 
 RECORDED: Schema = {
@@ -145,10 +147,19 @@ _EPISODES = {"episode/*": ArraySpec(F32, ("E",)), "term/*": ArraySpec(F32, ("E",
 ROLLOUT = MessageSpec(
     "rollout",
     {**RECORDABLE, **_EPISODES},
-    {"actor": str, "incarnation": str, "sequence": int, "version": int, "run_id": str, "schema": str, "steps": int},
+    {
+        "actor": str,
+        "incarnation": str,
+        "sequence": int,
+        "version": int,
+        "run_id": str,
+        "schema": str,
+        "steps": int,
+    },
 )
-"""Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the critic and S of a
-teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from."""
+"""Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the
+critic and S of a teacher, E finished episodes. Of the per-step arrays it holds those that the run's
+algorithm learns from."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -165,7 +176,15 @@ BUNDLE = MessageSpec(
         "value/m2": ArraySpec(REAL, ()),
         "value/count": ArraySpec(REAL, ()),
     },
-    {"version": int, "run_id": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
+    {
+        "version": int,
+        "run_id": str,
+        "schema": str,
+        "hand": str,
+        "layout": list,
+        "action_size": int,
+        "format": int,
+    },
 )
 """Learner to all: weights and normalisers of one version."""
 
@@ -200,7 +219,15 @@ EPISODE = MessageSpec(
         "surface_avoid": ArraySpec(("bool",), ("N",)),
         "arm/*": ArraySpec((*REAL, *_INDEX, "bool"), None),
     },
-    {"hand": str, "object": str, "control_dt": float, "version": int, "actor": str, "success": bool, "metrics": dict},
+    {
+        "hand": str,
+        "object": str,
+        "control_dt": float,
+        "version": int,
+        "actor": str,
+        "success": bool,
+        "metrics": dict,
+    },
 )
 """Actor to subscribers: one world for T steps, for drawing."""
 
@@ -213,25 +240,28 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
     """Validates a message of a known kind.
 
     Args:
-      message: the message; device arrays are not checked for finite values, since they never left this process.
-      spec: specification of the kind.
+      message: the message; device arrays are not checked for finite values, since they never left
+      this process. spec: specification of the kind.
       **sizes: sizes of symbols known beforehand.
 
     Returns:
       The sizes of all symbols.
 
     Raises:
-      CongraspError: the message is invalid; the text names the array or the entry, and the violated rule.
+      CongraspError: the message is invalid; the text names the array or the entry, and the violated
+      rule.
     """
     for name, kind in spec.meta.items():
         value = message.meta.get(name)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise CongraspError(
-                f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not {_type_name(kind)}."
+                f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not "
+                f"{_type_name(kind)}."
             )
         if isinstance(value, str) and name != "hand" and len(value) > LONGEST_TEXT:
             raise CongraspError(
-                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters; the limit is {LONGEST_TEXT}."
+                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters; the limit is "
+                f"{LONGEST_TEXT}."
             )
         if isinstance(value, int) and abs(value) > _COUNTS:
             raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is too large for a count.")
@@ -257,7 +287,10 @@ def _check(what: str, array: Any, spec: ArraySpec, known: dict[str, int]) -> Non
             for symbol, size in zip(spec.shape, array.shape, strict=True)
         )
         if not fits:
-            rule = ", ".join(f"{s}={known[s]}" if isinstance(s, str) and s in known else str(s) for s in spec.shape)
+            rule = ", ".join(
+                f"{s}={known[s]}" if isinstance(s, str) and s in known else str(s)
+                for s in spec.shape
+            )
             raise CongraspError(f"{what} has shape {tuple(array.shape)}, not ({rule}).")
     if isinstance(array, np.ndarray) and not is_finite(array):
         raise CongraspError(f"{what} has values that are not finite.")
@@ -268,7 +301,10 @@ def is_finite(array: np.ndarray) -> bool:
     if array.dtype != np.float16:
         return bool(np.isfinite(array).all())
     bits = array.reshape(-1).view(np.uint16)
-    return all((bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF for start in range(0, len(bits), _BLOCK))
+    return all(
+        (bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF
+        for start in range(0, len(bits), _BLOCK)
+    )
 
 
 def _type_name(kind: type | tuple[type, ...]) -> str:
@@ -297,7 +333,9 @@ class RolloutHeader(NamedTuple):
         return self.actor, self.incarnation
 
 
-def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None = None) -> RolloutHeader:
+def validate_rollout(
+    message: Message, form: RolloutForm, *, schema: str | None = None
+) -> RolloutHeader:
     """Validates a rollout.
 
     Args:
@@ -306,9 +344,12 @@ def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None 
       schema: required policy schema; None for any.
 
     Raises:
-      CongraspError: the rollout is invalid; the text names the array or the entry, and the violated rule.
+      CongraspError: the rollout is invalid; the text names the array or the entry, and the violated
+      rule.
     """
-    validate(message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes)
+    validate(
+        message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes
+    )
     header = RolloutHeader(*(message.meta[name] for name in ROLLOUT.meta))
     check_name("actor", header.actor)
     check_name("incarnation", header.incarnation)
@@ -316,11 +357,13 @@ def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None 
         raise CongraspError("The rollout's meta entries 'sequence' and 'version' must be counts.")
     if header.steps != form.steps * form.worlds:
         raise CongraspError(
-            f"The rollout's meta entry 'steps' is {header.steps}, not T*B = {form.steps}*{form.worlds}."
+            f"The rollout's meta entry 'steps' is {header.steps}, not T*B = "
+            f"{form.steps}*{form.worlds}."
         )
     if schema is not None and header.schema != schema:
         raise CongraspError(
-            f"The rollout was made with the policy schema {ascii(header.schema)[:40]}, not {schema}.",
+            f"The rollout was made with the policy schema {ascii(header.schema)[:40]}, not "
+            f"{schema}.",
             "Restart the actor with the learner's version of congrasp.",
         )
     return header
@@ -334,10 +377,13 @@ def validate_bundle(message: Message, *, schema: str | None = None) -> None:
       schema: required policy schema; None for any.
 
     Raises:
-      CongraspError: the bundle is invalid; the text names the array or the entry, and the violated rule.
+      CongraspError: the bundle is invalid; the text names the array or the entry, and the violated
+      rule.
     """
     validate(message, BUNDLE)
     if not any(name.startswith("actor/") for name in message.arrays):
         raise CongraspError("The bundle has no arrays of an actor.")
     if schema is not None and message.meta["schema"] != schema:
-        raise CongraspError(f"The bundle has the policy schema {ascii(message.meta['schema'])[:40]}, not {schema}.")
+        raise CongraspError(
+            f"The bundle has the policy schema {ascii(message.meta['schema'])[:40]}, not {schema}."
+        )

@@ -23,5 +23,7 @@ def make_algorithm(spec: PolicySpec, config: RunConfig) -> Algorithm:
       CongraspError: there is no such algorithm.
     """
     if config.algorithm not in ALGORITHMS:
-        raise CongraspError(f"There is no algorithm '{config.algorithm}'.", f"Choose from: {', '.join(ALGORITHMS)}.")
+        raise CongraspError(
+            f"There is no algorithm '{config.algorithm}'.", f"Choose from: {', '.join(ALGORITHMS)}."
+        )
     return ALGORITHMS[config.algorithm](spec, config)

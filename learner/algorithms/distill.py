@@ -1,10 +1,11 @@
 """Distillation of a policy into one with other observations, on the states that the student visits.
 
-The student acts, and the teacher, which observes the full state, labels each state with its action (DAgger:
-Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
-regressed on the action that gives the teacher's targets (`common.task.privileged`), in units of the teacher's standard
-deviation: up to a constant the KL divergence from the student to the teacher, whose standard deviation the student
-keeps. The critic learns nothing.
+The student acts, and the teacher, which observes the full state, labels each state with its action
+(DAgger: Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old
+states). The student's mean is regressed on the action that gives the teacher's targets
+(`common.task.privileged`), in units of the teacher's standard deviation: up to a constant the KL
+divergence from the student to the teacher, whose standard deviation the student keeps. The critic
+learns nothing.
 """
 
 import functools
@@ -40,7 +41,13 @@ from congrasp.learner.algorithms.protocol import (
     partition_specs,
     random_policy,
 )
-from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import (
+    REPLICATED,
+    Collectives,
+    shard,
+    shard_map,
+    unreplicate,
+)
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
 _SPECS = partition_specs(_SCHEMA)
@@ -78,7 +85,8 @@ class Distillation:
           config: the run; its `distill` names the teacher.
 
         Raises:
-          CongraspError: no teacher is named, its file cannot be read, or its observations or actions differ from this
+          CongraspError: no teacher is named, its file cannot be read, or its observations or
+          actions differ from this
             task's.
         """
         teacher = read_teacher(config.distill.teacher)
@@ -105,28 +113,44 @@ class Distillation:
     ) -> tuple[TrainState, dict[str, float]]:
         """Runs epochs of minibatches over a batch; see `Algorithm.update`.
 
-        The normaliser is frozen during the update and includes the batch afterwards; the first update already
-        normalises by its batch.
+        The normaliser is frozen during the update and includes the batch afterwards; the first
+        update already normalises by its batch.
 
         Raises:
-          NonFiniteUpdate: a term is not finite; the error names the first one and holds the state before the update.
-          CongraspError: there are more minibatches than transitions.
+          NonFiniteUpdate: a term is not finite; the error names the first one and holds the state
+          before the update. CongraspError: there are more minibatches than transitions.
         """
         config = self._config
         transitions = batch["observation"].shape[0] * batch["observation"].shape[1]
         if transitions < config.minibatches:
             raise CongraspError(
-                f"A batch of {transitions} transitions cannot be split into {config.minibatches} minibatches.",
+                f"A batch of {transitions} transitions cannot be split into {config.minibatches} "
+                f"minibatches.",
                 "Use fewer --distill.minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in _SCHEMA}, mesh, _SPECS)
-        moments = of_ranks(jax.device_get(unreplicate(gathered_moments(arrays["observation"], mesh=mesh), mesh)))
+        moments = of_ranks(
+            jax.device_get(unreplicate(gathered_moments(arrays["observation"], mesh=mesh), mesh))
+        )
         frozen = state.observation if state.observation.count else normalizer.merge(*moments)
         rate = config.learning_rate * max(1.0 - state.version / max(self._updates, 1), _LAST_RATE)
-        given = _Given(normalizer.observation_affine(frozen, self._spec.layout), self._teacher, jnp.float32(rate))
+        given = _Given(
+            normalizer.observation_affine(frozen, self._spec.layout),
+            self._teacher,
+            jnp.float32(rate),
+        )
         learnt, given = shard(((state.params["actor"], state.optimizer, state.key), given), mesh)
         learnt, metrics = unreplicate(
-            _optimise(learnt, arrays, given, layouts=self._layouts, body=self._body, config=config, mesh=mesh), mesh
+            _optimise(
+                learnt,
+                arrays,
+                given,
+                layouts=self._layouts,
+                body=self._body,
+                config=config,
+                mesh=mesh,
+            ),
+            mesh,
         )
         metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
         for name, source in _CHECKED.items():
@@ -151,26 +175,37 @@ def read_teacher(named: str) -> PolicyBundle:
       CongraspError: no teacher is named, or there is no such policy.
     """
     if not named:
-        raise CongraspError("Distillation needs a teacher.", "Name a hand or a policy file with --teacher.")
+        raise CongraspError(
+            "Distillation needs a teacher.", "Name a hand or a policy file with --teacher."
+        )
     return bundles.load(named_policy(named))
 
 
 def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
-    """Raises `CongraspError` unless the teacher's observations and actions are those of this task."""
+    """Raises `CongraspError` unless the teacher's observations and actions are those of this
+    task.
+    """
     what = f"The teacher, a policy for the hand '{teacher.spec.hand_name}',"
     if teacher.spec.hand != spec.hand:
         raise CongraspError(
-            f"{what} cannot teach the hand '{spec.hand_name}'.", "Name a teacher of the same hand with --teacher."
+            f"{what} cannot teach the hand '{spec.hand_name}'.",
+            "Name a teacher of the same hand with --teacher.",
         )
     if teacher.task.observation != "full" or teacher.spec.layout != full_layout(task):
         raise CongraspError(
             f"{what} does not observe what this task shows.",
-            "Take the task from the teacher: 'congrasp train --teacher', without other --task.… settings of its own.",
+            "Take the task from the teacher: 'congrasp train --teacher', without other --task.… "
+            "settings of its own.",
         )
-    for name in ("control", "control_dt", "dynamic_center"):  # the time is observed as a share of the episode
+    for name in (
+        "control",
+        "control_dt",
+        "dynamic_center",
+    ):  # the time is observed as a share of the episode
         if getattr(teacher.task, name) != getattr(task, name):
             raise CongraspError(
-                f"{what} learnt with another '{name}' than this task's.", f"Leave out --task.{name.replace('_', '-')}."
+                f"{what} learnt with another '{name}' than this task's.",
+                f"Leave out --task.{name.replace('_', '-')}.",
             )
 
 
@@ -190,8 +225,12 @@ def _optimise(
     config: DistillConfig,
     mesh: Mesh | None,
 ) -> tuple[Learnt, dict[str, Array]]:
-    """Runs epochs over the batch for a student and a teacher of these layouts; returns the learnt state and metrics."""
-    program = functools.partial(_program, collectives=Collectives(mesh), layouts=layouts, body=body, config=config)
+    """Runs epochs over the batch for a student and a teacher of these layouts; returns the learnt
+    state and metrics.
+    """
+    program = functools.partial(
+        _program, collectives=Collectives(mesh), layouts=layouts, body=body, config=config
+    )
     return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, given)
 
 
@@ -220,7 +259,9 @@ def _program(
         mean, log_std = network.policy({"actor": actor}, layouts[0], seen, exact=False)
         return jnp.mean(network.kl_divergence(mean, log_std, labels[rows], log_std))
 
-    def step(carry: tuple[Params, Any], rows: Array) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
+    def step(
+        carry: tuple[Params, Any], rows: Array
+    ) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
         actor, optimizer = carry
         found, gradient = collectives.mean(jax.value_and_grad(loss)(actor, rows))
         gradient = {**gradient, "log_std": jnp.zeros_like(actor["log_std"])}
@@ -228,7 +269,9 @@ def _program(
         actor = optax.apply_updates(actor, jax.tree.map(lambda x: -given.rate * x, steps))
         return (actor, optimizer), (found, optax.tree.norm(gradient))
 
-    def epoch(carry: tuple[Params, Any], key: Array) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
+    def epoch(
+        carry: tuple[Params, Any], key: Array
+    ) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
         order = jax.random.permutation(key, len(labels))[: size * config.minibatches]
         return jax.lax.scan(step, carry, order.reshape(config.minibatches, size))
 
@@ -236,7 +279,8 @@ def _program(
     keys = jax.random.split(collectives.own_key(epochs_key), config.epochs)
     (actor, optimizer), (found, norms) = jax.lax.scan(epoch, (actor, optimizer), keys)
     metrics = {
-        "imitation_kl": jnp.mean(found[0]),  # of the first pass: later ones have trained on these states
+        # Of the first pass: later ones have trained on these states
+        "imitation_kl": jnp.mean(found[0]),
         "actor_grad_norm": jnp.mean(norms),
         "action_std": jnp.mean(jnp.exp(actor["log_std"])),
     }

@@ -1,13 +1,13 @@
 """Decoupled proximal policy optimisation (Hilton et al. 2021, arXiv 2110.00641).
 
-Three policies are involved: the behaviour policy acted, possibly some versions ago; the proximal policy is the
-learner's at the start of the update; the current one is being optimised. The trust region is around the proximal
-policy, so that old data do not consume it before learning begins; an importance weight corrects for the behaviour
-policy. With the proximal policy equal to the behaviour policy the weight is exactly one and the objective is that of
-plain PPO.
+Three policies are involved: the behaviour policy acted, possibly some versions ago; the proximal
+policy is the learner's at the start of the update; the current one is being optimised. The trust
+region is around the proximal policy, so that old data do not consume it before learning begins; an
+importance weight corrects for the behaviour policy. With the proximal policy equal to the behaviour
+policy the weight is exactly one and the objective is that of plain PPO.
 
-A batch is evaluated once in an update by the proximal policy and the critic; minibatches of the samples then minimise
-the objective.
+A batch is evaluated once in an update by the proximal policy and the critic; minibatches of the
+samples then minimise the objective.
 """
 
 from typing import Any, NamedTuple
@@ -27,14 +27,18 @@ _TOGETHER = 1 << 15
 
 
 class Sample(NamedTuple):
-    """Transitions of a minibatch, with quantities that stay fixed during an update; leading axis M."""
+    """Transitions of a minibatch, with quantities that stay fixed during an update; leading axis
+    M.
+    """
 
     observation: Array
     """(M, D) normalised."""
     action: Array
     """(M, A)."""
     log_proximal: Array
-    """(M,) log probability of the action under the proximal policy, computed as `objective` does."""
+    """(M,) log probability of the action under the proximal policy, computed as `objective`
+    does.
+    """
     mean_proximal: Array
     """(M, A) mean of the proximal policy, computed as `objective` does."""
     weight: Array
@@ -68,7 +72,9 @@ class Terms(NamedTuple):
     clip_fraction: Array
     """Share of the samples whose ratio lies outside the clip range."""
     clip_fraction_rising: Array
-    """Share of the samples with a positive advantage and a ratio above the range: the clip holds their probability."""
+    """Share of the samples with a positive advantage and a ratio above the range: the clip holds
+    their probability.
+    """
     clip_fraction_falling: Array
     """Share of the samples with a negative advantage and a ratio below the range."""
     clip_fraction_stale: Array
@@ -76,28 +82,42 @@ class Terms(NamedTuple):
 
 
 def importance_weight(log_proximal: Array, log_behaviour: Array, maximum: Array | float) -> Array:
-    """Returns min(pi_proximal / pi_behaviour, maximum), computed in log space to avoid overflow; no gradient."""
-    return jnp.exp(jax.lax.stop_gradient(jnp.minimum(log_proximal - log_behaviour, jnp.log(maximum))))
+    """Returns min(pi_proximal / pi_behaviour, maximum), computed in log space to avoid overflow; no
+    gradient.
+    """
+    return jnp.exp(
+        jax.lax.stop_gradient(jnp.minimum(log_proximal - log_behaviour, jnp.log(maximum)))
+    )
 
 
 def surrogate(log_ratio: Array, advantage: Array, weight: Array, clip: Array | float) -> Array:
-    """Loss -w min(r A, clip(r, 1 - eps, 1 + eps) A) of each sample, with r = pi / pi_proximal = exp(`log_ratio`)."""
+    """Loss -w min(r A, clip(r, 1 - eps, 1 + eps) A) of each sample, with r = pi / pi_proximal =
+    exp(`log_ratio`).
+    """
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     return -weight * jnp.minimum(ratio * advantage, clipped * advantage)
 
 
 def objective(
-    params: Params, layout: Layout, log_std_proximal: Array, sample: Sample, coefficients: Coefficients
+    params: Params,
+    layout: Layout,
+    log_std_proximal: Array,
+    sample: Sample,
+    coefficients: Coefficients,
 ) -> tuple[Array, Terms]:
-    """Scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
+    """Scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over
+    the minibatch.
+    """
     mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
     ratio, clip = jnp.exp(log_ratio), coefficients.clip
     outside = jnp.abs(ratio - 1.0) > clip
     error = network.value(params, layout, sample.observation, sample.privileged) - sample.target
     terms = Terms(
-        policy_loss=jnp.mean(surrogate(log_ratio, sample.advantage, sample.weight, coefficients.clip)),
+        policy_loss=jnp.mean(
+            surrogate(log_ratio, sample.advantage, sample.weight, coefficients.clip)
+        ),
         value_loss=jnp.mean(error * error),
         entropy=network.entropy(log_std),
         kl=jnp.mean(network.kl_divergence(sample.mean_proximal, log_std_proximal, mean, log_std)),
@@ -106,7 +126,11 @@ def objective(
         clip_fraction_falling=jnp.mean((sample.advantage < 0.0) & (ratio < 1.0 - clip)),
         clip_fraction_stale=jnp.sum(outside & sample.stale) / jnp.maximum(jnp.sum(sample.stale), 1),
     )
-    total = terms.policy_loss + coefficients.value * terms.value_loss - coefficients.entropy * terms.entropy
+    total = (
+        terms.policy_loss
+        + coefficients.value * terms.value_loss
+        - coefficients.entropy * terms.entropy
+    )
     return total, terms
 
 
@@ -128,7 +152,9 @@ class Evaluation(NamedTuple):
     """A batch evaluated by the proximal policy and the critic; leading axes (T, B)."""
 
     samples: Sample
-    """Inputs of the networks, not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
+    """Inputs of the networks, not normalised yet: gathering a minibatch's rows in half precision is
+    cheaper.
+    """
     log_weight: Array
     """Log of proximal over behaviour probability."""
     weight: Array
@@ -156,11 +182,16 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
 
     def values(normalised: Array, privileged: Array | None) -> Array:
         inputs = normalised_inputs(given.privileged, privileged)
-        return network.value(params, layout, normalised, inputs) / given.returns.scale + given.returns.shift
+        return (
+            network.value(params, layout, normalised, inputs) / given.returns.scale
+            + given.returns.shift
+        )
 
     def evaluated(observation: Array, privileged: Array | None) -> tuple[Array, Array, Array]:
         seen = normalizer.apply(given.observations, observation)
-        exact, fast = (network.policy(params, layout, seen, exact=exact)[0] for exact in (True, False))
+        exact, fast = (
+            network.policy(params, layout, seen, exact=exact)[0] for exact in (True, False)
+        )
         return exact, fast, values(seen, privileged)
 
     # Not all steps at once: the features of the points of 327,680 clouds are 40 GiB.
@@ -179,7 +210,9 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
     samples = Sample(
         observation=batch["observation"],
         action=action,
-        log_proximal=jnp.where(hyper["decoupled"], network.log_probability(mean, log_std, action), behaviour),
+        log_proximal=jnp.where(
+            hyper["decoupled"], network.log_probability(mean, log_std, action), behaviour
+        ),
         mean_proximal=mean,
         weight=jnp.where(hyper["decoupled"], weight, 1.0),
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
@@ -199,15 +232,20 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
     )
 
 
-def batch_metrics(given: Inputs, evaluation: Evaluation, collectives: Collectives) -> dict[str, Array]:
+def batch_metrics(
+    given: Inputs, evaluation: Evaluation, collectives: Collectives
+) -> dict[str, Array]:
     """Scalars about a batch and the age of its policy, over all ranks."""
     variance = collectives.variance(evaluation.returns)
     residual = collectives.variance(evaluation.returns - evaluation.value)
     truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
     fresh = ~evaluation.samples.stale
-    gap, share = collectives.mean((jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh)))
+    gap, share = collectives.mean(
+        (jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh))
+    )
     return {
-        # Actor and learner evaluate the same version in different programs: this is rounding, not lag.
+        # Actor and learner evaluate the same version in different programs: this is rounding, not
+        # lag.
         "log_probability_gap": gap / jnp.maximum(share, 1e-9),
         "importance_max": collectives.max(jnp.max(evaluation.weight)),
         "explained_variance": 1.0 - residual / (variance + 1e-8),
@@ -227,8 +265,12 @@ def batch_metrics(given: Inputs, evaluation: Evaluation, collectives: Collective
     }
 
 
-def _truncation_metrics(given: Inputs, evaluation: Evaluation, collectives: Collectives) -> dict[str, Array]:
-    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch without any."""
+def _truncation_metrics(
+    given: Inputs, evaluation: Evaluation, collectives: Collectives
+) -> dict[str, Array]:
+    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch
+    without any.
+    """
     truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
     cut = evaluation.truncated_error
     bootstrapped = cut + given.hyper["gamma"] * evaluation.value
@@ -236,4 +278,7 @@ def _truncation_metrics(given: Inputs, evaluation: Evaluation, collectives: Coll
     share, means = collectives.mean(
         (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})
     )
-    return {"truncated": share, **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()}}
+    return {
+        "truncated": share,
+        **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()},
+    }

@@ -1,14 +1,17 @@
-"""Decoupled PPO (`learner.algorithms.losses`) with generalised advantages and a KL-adaptive learning rate.
+"""Decoupled PPO (`learner.algorithms.losses`) with generalised advantages and a KL-adaptive
+learning rate.
 
-The batch keeps its axis of worlds: arrays are (T, B, ...) with the worlds of all rollouts concatenated, on the device
-where they were created. Everything between the batch and the new weights is one compiled program; hyperparameters are
-traced, so that changing them needs no recompilation. The optimiser's moments are donated to it. The weights are not,
-since the bundle published with them may still be in use in this process. The host keeps the running statistics
+The batch keeps its axis of worlds: arrays are (T, B, ...) with the worlds of all rollouts
+concatenated, on the device where they were created. Everything between the batch and the new
+weights is one compiled program; hyperparameters are traced, so that changing them needs no
+recompilation. The optimiser's moments are donated to it. The weights are not, since the bundle
+published with them may still be in use in this process. The host keeps the running statistics
 (`common.policy.normalizer`) and the counters, and receives only scalars.
 
-Several processes, each with its batch, compute one update over a mesh of their devices. Gradients, statistics of
-advantages and metrics are averaged inside the program, once in each minibatch, and moments are gathered in rank order,
-so that weights and statistics are bitwise identical on all ranks.
+Several processes, each with its batch, compute one update over a mesh of their devices. Gradients,
+statistics of advantages and metrics are averaged inside the program, once in each minibatch, and
+moments are gathered in rank order, so that weights and statistics are bitwise identical on all
+ranks.
 """
 
 import functools
@@ -39,10 +42,19 @@ from congrasp.learner.algorithms.protocol import (
     partition_specs,
     random_policy,
 )
-from congrasp.learner.distributed.collectives import AXIS, REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import (
+    AXIS,
+    REPLICATED,
+    Collectives,
+    shard,
+    shard_map,
+    unreplicate,
+)
 
 _SPECS = {**partition_specs(RECORDABLE), "lag": PartitionSpec(AXIS)}
-_CHECKED_INPUTS = tuple(name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",))
+_CHECKED_INPUTS = tuple(
+    name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",)
+)
 _CHECKED = (
     *_CHECKED_INPUTS,
     "value",
@@ -56,9 +68,12 @@ _CHECKED = (
 _NORMALISED = ("observation", "privileged")
 """Arrays of a batch with running statistics, which have the same names in a `TrainState`."""
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
-_UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; the target is about a hundredth of one
+# Nats between the policies before and after an update; the target is about a hundredth of one
+_UNREASONABLE_KL = 10.0
 _RATE_FACTOR = 1.5
-_TRAINED_RATE = 0.1  # at the whole initial rate, a trained policy moved by 120 KL targets in its first update
+_TRAINED_RATE = (
+    0.1  # at the whole initial rate, a trained policy moved by 120 KL targets in its first update
+)
 _TRUSTED_KL = 4.0  # KL targets; a minibatch with a larger divergence does not update the policy
 
 Learnt = tuple[Params, Any, Array]
@@ -70,7 +85,9 @@ class PPO:
     """Decoupled PPO, an `Algorithm`."""
 
     def __init__(self, spec: PolicySpec, config: PPOConfig, updates: int = 0):
-        """Creates the algorithm for a policy's networks, in a run of `updates` updates (`PPOConfig.settling`)."""
+        """Creates the algorithm for a policy's networks, in a run of `updates` updates
+        (`PPOConfig.settling`).
+        """
         self._spec, self._config, self._updates = spec, config, updates
         self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
 
@@ -96,33 +113,45 @@ class PPO:
     ) -> tuple[TrainState, dict[str, float]]:
         """Runs epochs of minibatches over a batch; see `Algorithm.update`.
 
-        If the policy is already several KL targets from the proximal one, only the critic learns: a policy with small
-        standard deviations, such as an initial policy, thus survives a learning rate that is too large for it.
+        If the policy is already several KL targets from the proximal one, only the critic learns: a
+        policy with small standard deviations, such as an initial policy, thus survives a learning
+        rate that is too large for it.
 
-        The normalisers are frozen during the update and include the batch afterwards; the first update already
-        normalises by its batch. The critic's output layer is adapted to the new value statistics so that its estimates
-        do not change (van Hasselt et al. 2016, arXiv 1602.07714). Rewards are passed unscaled.
+        The normalisers are frozen during the update and include the batch afterwards; the first
+        update already normalises by its batch. The critic's output layer is adapted to the new
+        value statistics so that its estimates do not change (van Hasselt et al. 2016, arXiv
+        1602.07714). Rewards are passed unscaled.
 
         Raises:
-          NonFiniteUpdate: a term is not finite, or the policy left its trust region by far; the error names the first
+          NonFiniteUpdate: a term is not finite, or the policy left its trust region by far; the
+          error names the first
             term and holds the state before the update.
           CongraspError: there are more minibatches than transitions.
         """
         config = self._config
         if batch["reward"].size < config.minibatches:
             raise CongraspError(
-                f"A batch of {batch['reward'].size} transitions cannot be split into {config.minibatches} minibatches.",
+                f"A batch of {batch['reward'].size} transitions cannot be split into "
+                f"{config.minibatches} minibatches.",
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
         lag = batch.get("lag", np.zeros(batch["reward"].shape[1], np.int32))
         arrays = {**{name: batch[name] for name in self.batch_schema}, "lag": lag}
         arrays = shard(arrays, mesh, _specs(arrays))
-        moments = {name: gathered_moments(arrays[name], mesh=mesh) for name in _NORMALISED if name in arrays}
-        frozen = {name: _first(getattr(state, name), found, mesh) for name, found in moments.items()}
+        moments = {
+            name: gathered_moments(arrays[name], mesh=mesh)
+            for name in _NORMALISED
+            if name in arrays
+        }
+        frozen = {
+            name: _first(getattr(state, name), found, mesh) for name, found in moments.items()
+        }
         given = losses.Inputs(
             batch=arrays,
             observations=normalizer.observation_affine(frozen["observation"], self._spec.layout),
-            privileged=normalizer.privileged_affine(frozen["privileged"]) if "privileged" in frozen else None,
+            privileged=normalizer.privileged_affine(frozen["privileged"])
+            if "privileged" in frozen
+            else None,
             returns=normalizer.value_affine(state.value),
             hyper=self._hyperparameters(state.version),
         )
@@ -134,7 +163,9 @@ class PPO:
             minibatches=config.minibatches,
             mesh=mesh,
         )
-        learnt, moments, returns, failure, scalars = unreplicate((learnt, moments, returns, failure, scalars), mesh)
+        learnt, moments, returns, failure, scalars = unreplicate(
+            (learnt, moments, returns, failure, scalars), mesh
+        )
         moments, returns, failure, scalars = jax.device_get((moments, returns, failure, scalars))
         state = TrainState(*learnt, *state[_ON_DEVICE:])
         if failure != _FINE:
@@ -142,18 +173,27 @@ class PPO:
             raise NonFiniteUpdate(_CHECKED[failure], source, state)
         value = normalizer.merge(state.value, *of_ranks(returns))
         state = state._replace(
-            params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
+            params=_preserve_values(
+                state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)
+            ),
             value=value,
             version=state.version + 1,
             transitions=state.transitions + arrays["reward"].size,
-            **{name: normalizer.merge(getattr(state, name), *of_ranks(found)) for name, found in moments.items()},
+            **{
+                name: normalizer.merge(getattr(state, name), *of_ranks(found))
+                for name, found in moments.items()
+            },
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
 
     def _hyperparameters(self, version: int) -> dict[str, Any]:
         """Hyperparameters of the update of a version that are arguments of the compiled program."""
         config = self._config
-        fixed = {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
+        fixed = {
+            name: value
+            for name, value in vars(config).items()
+            if isinstance(value, float | tuple | bool)
+        }
         return fixed | {
             "kl_target": config.kl_target_at(version, self._updates),
             "noise_kept": config.noise_kept_at(version, self._updates),
@@ -162,8 +202,12 @@ class PPO:
 
 
 @optax.inject_hyperparams
-def _optimizer(learning_rate: Array | float, max_grad_norm: Array | float) -> optax.GradientTransformation:
-    """Adam on clipped gradients; each network separately, so that a large gradient does not shrink the other's."""
+def _optimizer(
+    learning_rate: Array | float, max_grad_norm: Array | float
+) -> optax.GradientTransformation:
+    """Adam on clipped gradients; each network separately, so that a large gradient does not shrink
+    the other's.
+    """
     clip = optax.clip_by_global_norm(max_grad_norm)
     clips = optax.partition({"actor": clip, "critic": clip}, {"actor": "actor", "critic": "critic"})
     return optax.chain(clips, optax.adam(learning_rate, eps=1e-5))
@@ -181,11 +225,17 @@ def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
 
 def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> Statistics:
     """Returns the statistics, or those of the batch while there are no samples yet."""
-    return statistics if statistics.count else normalizer.merge(*of_ranks(unreplicate(moments, mesh)))
+    return (
+        statistics if statistics.count else normalizer.merge(*of_ranks(unreplicate(moments, mesh)))
+    )
 
 
-@functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches", "mesh"), donate_argnames="optimizer")
-def _optimise(
+@functools.partial(
+    jax.jit,
+    static_argnames=("layout", "epochs", "minibatches", "mesh"),
+    donate_argnames="optimizer",
+)
+def _optimise(  # noqa: PLR0913
     params: Params,
     optimizer: Any,
     key: Array,
@@ -196,16 +246,28 @@ def _optimise(
     minibatches: int,
     mesh: Mesh | None,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
-    """Runs epochs over the batch; returns the learnt state, moments of the returns, the failed term, and metrics."""
+    """Runs epochs over the batch; returns the learnt state, moments of the returns, the failed
+    term, and metrics.
+    """
     program = functools.partial(
-        _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
+        _program,
+        collectives=Collectives(mesh),
+        layout=layout,
+        epochs=epochs,
+        minibatches=minibatches,
     )
     specs = REPLICATED, losses.Inputs._make([_specs(given.batch), *[REPLICATED] * 4])
     return shard_map(mesh, program, specs)((params, optimizer, key), given)
 
 
 def _program(
-    learnt: Learnt, given: losses.Inputs, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
+    learnt: Learnt,
+    given: losses.Inputs,
+    *,
+    collectives: Collectives,
+    layout: Layout,
+    epochs: int,
+    minibatches: int,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """Body of `_optimise` for one rank."""
     (params, optimizer, key), hyper = learnt, given.hyper
@@ -231,16 +293,27 @@ def _program(
     failure = jnp.where((failure == _FINE) & (kl > _UNREASONABLE_KL), len(_CHECKED) - 1, failure)
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
-    metrics |= {"kl": kl, "learning_rate": learning_rate, "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"]))}
+    metrics |= {
+        "kl": kl,
+        "learning_rate": learning_rate,
+        "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
+    }
     metrics |= losses.batch_metrics(given, evaluation, collectives)
     moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
     params, optimizer = jax.tree.map(
-        lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
+        lambda new, old: jnp.where(failure == _FINE, new, old),
+        (moved, moved_optimizer),
+        (params, optimizer),
     )
-    return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
+    return (
+        (params, optimizer, key),
+        collectives.gather(normalizer.moments(evaluation.returns)),
+        failure,
+        metrics,
+    )
 
 
-def _epochs(
+def _epochs(  # noqa: PLR0913
     params: Params,
     optimizer: Any,
     failure: Array,
@@ -252,7 +325,8 @@ def _epochs(
     layout: Layout,
     minibatches: int,
 ) -> tuple[Params, Any, Array, tuple[losses.Terms, dict[str, Array]]]:
-    """Runs shuffled minibatches, each sample at most once an epoch; the remainder of the division is skipped.
+    """Runs shuffled minibatches, each sample at most once an epoch; the remainder of the division
+    is skipped.
 
     The observations of `samples` are not normalised yet.
     """
@@ -283,7 +357,10 @@ def _epochs(
         )
         steps, optimizer = transform.update(gradients, optimizer, params)
         trusted = terms.kl <= _TRUSTED_KL * hyper["kl_target"]
-        steps = {**steps, "actor": jax.tree.map(lambda leaf: jnp.where(trusted, leaf, 0.0), steps["actor"])}
+        steps = {
+            **steps,
+            "actor": jax.tree.map(lambda leaf: jnp.where(trusted, leaf, 0.0), steps["actor"]),
+        }
         return (optax.apply_updates(params, steps), optimizer, failure), (terms, norms)
 
     def epoch(carry: tuple[Params, Any, Array], key: Array):
@@ -295,19 +372,26 @@ def _epochs(
 
 
 def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
-    """Returns `failure` if it names a term, else `offset` plus the index of the first term that is not finite."""
+    """Returns `failure` if it names a term, else `offset` plus the index of the first term that is
+    not finite.
+    """
     bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
     found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
     return jnp.where(failure == _FINE, found, failure)
 
 
 def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Params:
-    """Bounds log std of the parameters: at least log l, at most log f + k max(log std_0 - log f, 0).
+    """Bounds log std of the parameters: at least log l, at most log f + k max(log std_0 - log f,
+    0).
 
-    l is `PPOConfig.least_std_at`, f `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0 the deviation before
-    the update. Only one of the two bounds is set at a time.
+    l is `PPOConfig.least_std_at`, f `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0
+    the deviation before the update. Only one of the two bounds is set at a time.
     """
-    final, kept, log_std = jnp.log(hyper["final_std"]), hyper["noise_kept"], params["actor"]["log_std"]
+    final, kept, log_std = (
+        jnp.log(hyper["final_std"]),
+        hyper["noise_kept"],
+        params["actor"]["log_std"],
+    )
     ceiling = final + kept * jnp.maximum(log_std_before - final, 0.0)
     log_std = jnp.where(kept <= 1.0, jnp.minimum(log_std, ceiling), log_std)
     log_std = jnp.maximum(log_std, jnp.log(hyper["least_std"]))  # log 0 is no floor
@@ -315,15 +399,21 @@ def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Par
 
 
 def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
-    """Returns the next learning rate from the mean KL to the proximal policy over the last epoch."""
+    """Returns the next learning rate from the mean KL to the proximal policy over the last
+    epoch.
+    """
     target = hyper["kl_target"]
-    factor = jnp.where(kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0))
+    factor = jnp.where(
+        kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0)
+    )
     return jnp.clip(rate * factor, *hyper["learning_rate_range"])
 
 
 @jax.jit
 def _preserve_values(params: Params, before: Affine, after: Affine) -> Params:
-    """Adapts the critic's output layer so that its estimates stay the same under another normalisation."""
+    """Adapts the critic's output layer so that its estimates stay the same under another
+    normalisation.
+    """
     output = params["critic"]["output"]
     ratio = after.scale / before.scale
     moved = {

@@ -1,8 +1,9 @@
-"""Interface of an algorithm to the learner: four members on which everything else depends, and its batches.
+"""Interface of an algorithm to the learner: four members on which everything else depends, and its
+batches.
 
-The learner's process, its hub, checkpoints and ranks use algorithms only through `Algorithm`, and find them by name
-(`learner.algorithms.ALGORITHMS`). A batch consists of rollouts concatenated along their axis of worlds, along which
-ranks shard it.
+The learner's process, its hub, checkpoints and ranks use algorithms only through `Algorithm`, and
+find them by name (`learner.algorithms.ALGORITHMS`). A batch consists of rollouts concatenated along
+their axis of worlds, along which ranks shard it.
 """
 
 import functools
@@ -37,13 +38,17 @@ class LearnedPolicy(NamedTuple):
     value: Statistics
     """Statistics of returns (), on the host."""
     privileged: Statistics | None = None
-    """Statistics of the critic's privileged inputs (P,), on the host; None without inputs or samples."""
+    """Statistics of the critic's privileged inputs (P,), on the host; None without inputs or
+    samples.
+    """
 
 
 def random_policy(seed: int, spec: PolicySpec) -> LearnedPolicy:
     """Returns networks with random weights, and empty normalisers."""
     params = network.init(seed, spec.layout, spec.action_size, spec.network, spec.privileged_size)
-    return LearnedPolicy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
+    return LearnedPolicy(
+        params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty()
+    )
 
 
 class TrainState(NamedTuple):
@@ -73,17 +78,22 @@ class TrainState(NamedTuple):
 
 
 class Algorithm(Protocol):
-    """Algorithm that learns a policy from rollouts. All ranks of a run call the same methods in the same order."""
+    """Algorithm that learns a policy from rollouts. All ranks of a run call the same methods in the
+    same order.
+    """
 
     @property
     def batch_schema(self) -> Schema:
         """Arrays of a rollout used for learning, a subset of `common.wire.messages.RECORDABLE`.
 
-        They determine what actors send, what the hub admits, warm-up batches, and how a batch is sharded over ranks.
+        They determine what actors send, what the hub admits, warm-up batches, and how a batch is
+        sharded over ranks.
         """
 
     def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
-        """Returns the state before the first update, with the `initial` policy or random weights."""
+        """Returns the state before the first update, with the `initial` policy or random
+        weights.
+        """
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
@@ -92,13 +102,16 @@ class Algorithm(Protocol):
 
         Args:
           state: the training state; the arrays of its `optimizer` must not be used again.
-          batch: the arrays of `batch_schema`, with the rollouts of this process along the axis B; possibly `lag` (B,)
+          batch: the arrays of `batch_schema`, with the rollouts of this process along the axis B;
+          possibly `lag` (B,)
             int32, versions between the policy that acted and the current one, 0 by default.
-          mesh: mesh of the ranks' devices along `collectives.AXIS`. Each rank calls this with the same state and a
+          mesh: mesh of the ranks' devices along `collectives.AXIS`. Each rank calls this with the
+          same state and a
             batch of the same shape, and gets the same result. None for a single process.
 
         Raises:
-          NonFiniteUpdate: a term is not finite; the error names the first one, and the batch is dropped.
+          NonFiniteUpdate: a term is not finite; the error names the first one, and the batch is
+          dropped.
         """
 
     def policy(self, state: TrainState) -> LearnedPolicy:

@@ -1,7 +1,8 @@
-"""Data parallelism: arrays over a mesh of the learner processes' devices, and reductions over them inside a program.
+"""Data parallelism: arrays over a mesh of the learner processes' devices, and reductions over them
+inside a program.
 
-Each process holds different worlds and a replica of everything else. A single process has no mesh (None), and the same
-code then has no overhead.
+Each process holds different worlds and a replica of everything else. A single process has no mesh
+(None), and the same code then has no overhead.
 """
 
 from collections.abc import Callable
@@ -21,29 +22,46 @@ REPLICATED = PartitionSpec()
 
 
 def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
-    """Returns arrays over the whole mesh from this process's part; `specs` are those of `jax.shard_map`.
+    """Returns arrays over the whole mesh from this process's part; `specs` are those of
+    `jax.shard_map`.
 
-    Without a mesh they are committed to this process's device, since uncommitted ones would cause recompilation.
+    Without a mesh they are committed to this process's device, since uncommitted ones would cause
+    recompilation.
     """
     if mesh is None:
         return jax.device_put(tree, jax.local_devices()[0])
-    devices = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
+    devices = [
+        device for device in mesh.devices.flat if device.process_index == jax.process_index()
+    ]
 
     def place(spec: PartitionSpec, array: Array) -> Array:
         axis = spec.index(AXIS) if AXIS in spec else None
-        parts = [array] * len(devices) if axis is None or len(devices) == 1 else jnp.split(array, len(devices), axis)
-        shape = tuple(size * (mesh.size // len(devices) if i == axis else 1) for i, size in enumerate(np.shape(array)))
+        parts = (
+            [array] * len(devices)
+            if axis is None or len(devices) == 1
+            else jnp.split(array, len(devices), axis)
+        )
+        shape = tuple(
+            size * (mesh.size // len(devices) if i == axis else 1)
+            for i, size in enumerate(np.shape(array))
+        )
         placed = [jax.device_put(part, device) for part, device in zip(parts, devices, strict=True)]
         return jax.make_array_from_single_device_arrays(shape, NamedSharding(mesh, spec), placed)
 
-    return jax.tree.map(lambda spec, part: jax.tree.map(lambda x: place(spec, x), part), specs, tree)
+    return jax.tree.map(
+        lambda spec, part: jax.tree.map(lambda x: place(spec, x), part), specs, tree
+    )
 
 
 def shard_map(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
-    """Returns a program that every process runs on its part, for `jax.jit`; results are the same on all of them."""
+    """Returns a program that every process runs on its part, for `jax.jit`; results are the same on
+    all of them.
+    """
     if mesh is None:
         return program
-    return jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=REPLICATED, check_vma=False)
+    return jax.shard_map(
+        program, mesh=mesh, in_specs=in_specs, out_specs=REPLICATED, check_vma=False
+    )
 
 
 def unreplicate(tree: Any, mesh: Mesh | None) -> Any:

@@ -1,9 +1,11 @@
-"""Ranks: the learner processes of one run, their agreement in rounds, and the mesh of their devices.
+"""Ranks: the learner processes of one run, their agreement in rounds, and the mesh of their
+devices.
 
-Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks exchange messages over
-plain TCP through rank 0: an update begins when all of them have a batch, they end together, and they receive each
-other's metrics. A rank that dies or stops responding ends the others with one line, even inside a collective. The two
-ports of the coordinator have no authentication, like JAX's own: keep them inside the cluster.
+Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks
+exchange messages over plain TCP through rank 0: an update begins when all of them have a batch,
+they end together, and they receive each other's metrics. A rank that dies or stops responding ends
+the others with one line, even inside a collective. The two ports of the coordinator have no
+authentication, like JAX's own: keep them inside the cluster.
 """
 
 import collections
@@ -31,11 +33,12 @@ _PAUSE = 0.1  # s, between two attempts to reach the coordinator
 
 
 def relay(host: str, port: int) -> int:
-    """Forwards connections to a free port of the loopback interface, for as long as the process lives.
+    """Forwards connections to a free port of the loopback interface, for as long as the process
+    lives.
 
-    JAX aborts a process (SIGABRT, pages of text) as soon as its connection to the coordinator ends. Through the relay,
-    in the process itself, that connection outlives rank 0: the links of `Ranks` notice its end at once, and end the
-    process in order.
+    JAX aborts a process (SIGABRT, pages of text) as soon as its connection to the coordinator ends.
+    Through the relay, in the process itself, that connection outlives rank 0: the links of `Ranks`
+    notice its end at once, and end the process in order.
 
     Args:
       host: host of the coordinator.
@@ -53,11 +56,15 @@ def _accept(server: socket.socket, address: tuple[str, int]) -> None:
     """Accepts connections."""
     while True:
         near, _ = server.accept()
-        threading.Thread(target=_forward, args=(near, address), daemon=True, name="relay-out").start()
+        threading.Thread(
+            target=_forward, args=(near, address), daemon=True, name="relay-out"
+        ).start()
 
 
 def _forward(near: socket.socket, address: tuple[str, int]) -> None:
-    """Forwards one connection until this end closes it; the other end's closing is not passed on."""
+    """Forwards one connection until this end closes it; the other end's closing is not passed
+    on.
+    """
     while True:
         with contextlib.suppress(OSError):
             far = socket.create_connection(address)
@@ -83,7 +90,8 @@ ROUND_SECONDS = 300.0
 """Deadline of an update, or of an exchange between live ranks, in seconds."""
 _SILENCE_SECONDS = 20.0
 _HEARTBEAT_SECONDS = 2.0
-_RELAY_SECONDS = 2.0  # time that rank 0 stays alive, so that JAX does not abort the others before they print the reason
+# Time that rank 0 stays alive, so that JAX does not abort the others before they print the reason
+_RELAY_SECONDS = 2.0
 _LENGTH = struct.Struct("!Q")
 _META = "meta"
 
@@ -105,7 +113,11 @@ class _Link:
     def __init__(self, connection: socket.socket):
         connection.settimeout(_SILENCE_SECONDS)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self._file, self._lock = connection, connection.makefile("rb"), threading.Lock()
+        self._socket, self._file, self._lock = (
+            connection,
+            connection.makefile("rb"),
+            threading.Lock(),
+        )
 
     def send(self, message: Message) -> None:
         # Meta data as an array: a header's length is limited.
@@ -136,13 +148,14 @@ class _Link:
 class Ranks:
     """This process among the learner's ranks; by default the only one.
 
-    They agree in rounds. Each posts an entry, and all receive the list of entries, in rank order, once all are posted,
-    or at once after an urgent one (missing entries are then None).
+    They agree in rounds. Each posts an entry, and all receive the list of entries, in rank order,
+    once all are posted, or at once after an urgent one (missing entries are then None).
 
     Attributes:
       rank: number of this process.
       count: number of ranks.
-      mesh: a device of every rank along `learner.distributed.collectives.AXIS`; None if this process is alone.
+      mesh: a device of every rank along `learner.distributed.collectives.AXIS`; None if this
+      process is alone.
     """
 
     def __init__(
@@ -164,33 +177,42 @@ class Ranks:
         self._leaving = threading.Event()
         self._lost = threading.Event()
         for peer, link in self._links.items():
-            threading.Thread(target=self._listen, args=(peer, link), daemon=True, name=f"rank-{peer}").start()
+            threading.Thread(
+                target=self._listen, args=(peer, link), daemon=True, name=f"rank-{peer}"
+            ).start()
         if self._links:
             threading.Thread(target=self._beat, daemon=True, name="rank-heartbeat").start()
 
     @classmethod
     @stage("join of the ranks")
-    def join(cls, rank: int, count: int, coordinator: str, on_lost: Callable[[str], object] = end_process) -> "Ranks":
+    def join(
+        cls, rank: int, count: int, coordinator: str, on_lost: Callable[[str], object] = end_process
+    ) -> "Ranks":
         """Joins the other ranks; must be called before anything else initialises JAX.
 
         Args:
           rank: number of this process.
           count: number of ranks.
-          coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the ranks).
-          on_lost: called with the reason when another rank is lost; it should not return.
+          coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the
+          ranks). on_lost: called with the reason when another rank is lost; it should not return.
 
         Raises:
           CongraspError: the rank, the count or the address is invalid, or the port is in use.
           TransportError: not all ranks joined in time.
         """
         if not 0 <= rank < count:
-            raise CongraspError(f"There is no rank {rank} of {count}.", "Ranks are numbered from 0.")
+            raise CongraspError(
+                f"There is no rank {rank} of {count}.", "Ranks are numbered from 0."
+            )
         if count == 1:
             return cls()
         host, _, port = coordinator.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65535:
-            raise CongraspError(f"'{coordinator}' is no address of rank 0.", "Give --coordinator HOST:PORT.")
-        # All interfaces unless it is the loopback: rank 0 may not resolve the name by which others reach it.
+            raise CongraspError(
+                f"'{coordinator}' is no address of rank 0.", "Give --coordinator HOST:PORT."
+            )
+        # All interfaces unless it is the loopback: rank 0 may not resolve the name by which others
+        # reach it.
         bind = host if host in ("localhost", "127.0.0.1") else ""
         deadline = time.monotonic() + JOIN_SECONDS
         if rank == 0:
@@ -214,39 +236,60 @@ class Ranks:
         return ranks
 
     def post(
-        self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None, *, urgent: bool = False
+        self,
+        entry: Mapping[str, Any],
+        arrays: Mapping[str, np.ndarray] | None = None,
+        *,
+        urgent: bool = False,
     ) -> None:
-        """Posts this rank's entry (JSON) to the round; a second one replaces it, a late one is ignored."""
+        """Posts this rank's entry (JSON) to the round; a second one replaces it, a late one is
+        ignored.
+        """
         frame = Message(arrays or {}, {"round": self._round, "urgent": urgent, "entry": entry})
         if self.rank == 0:
             self._collect(0, frame)
         else:
-            with contextlib.suppress(OSError):  # the thread that listens to the link notices its end
+            with contextlib.suppress(
+                OSError
+            ):  # the thread that listens to the link notices its end
                 self._links[0].send(frame)
 
     def poll(self, timeout: float) -> Message | None:
-        """Returns the round's decision: `entries` in its metadata and the arrays of rank 0; None on a timeout."""
+        """Returns the round's decision: `entries` in its metadata and the arrays of rank 0; None on
+        a timeout.
+        """
         with self._changed:
             if not self._changed.wait_for(lambda: self._decisions, timeout):
                 return None
             self._round += 1
             return self._decisions.popleft()
 
-    def exchange(self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> Message:
-        """Runs a whole round: every rank calls this, and all receive all entries and the arrays of rank 0."""
+    def exchange(
+        self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
+    ) -> Message:
+        """Runs a whole round: every rank calls this, and all receive all entries and the arrays of
+        rank 0.
+        """
         self.post(entry, arrays)
         decision = self.poll(ROUND_SECONDS)
         if decision is None:
-            raise TransportError(f"The {self.count} ranks did not come together within {ROUND_SECONDS:.0f} s.")
+            raise TransportError(
+                f"The {self.count} ranks did not come together within {ROUND_SECONDS:.0f} s."
+            )
         return decision
 
     @contextlib.contextmanager
     def watchdog(self) -> Iterator[None]:
-        """Context with a deadline for code with collectives, which would otherwise wait forever for a missing rank."""
+        """Context with a deadline for code with collectives, which would otherwise wait forever for
+        a missing rank.
+        """
         if self.count == 1:
             yield
             return
-        text = f"The ranks did not get through an update within {ROUND_SECONDS:.0f} s; rank {self.rank} stops."
+        text = (
+            f"The ranks did not get through an update within {ROUND_SECONDS:.0f} s; rank "
+            f"{self.rank} stops."
+        )
         timer = threading.Timer(ROUND_SECONDS, self._on_lost, (text,))
         timer.daemon = True
         timer.start()
@@ -256,7 +299,9 @@ class Ranks:
             timer.cancel()
 
     def close(self) -> None:
-        """Leaves the run cleanly: all ranks call this, after which the end of another rank is not a failure."""
+        """Leaves the run cleanly: all ranks call this, after which the end of another rank is not a
+        failure.
+        """
         if self.count == 1 or self._leaving.is_set():
             return
         self.exchange({"bye": True})
@@ -264,11 +309,15 @@ class Ranks:
         jax.distributed.shutdown()
 
     def fail(self, error: BaseException) -> None:
-        """Reports to the others why this rank ends, unless all leave cleanly or the cause is another rank's end."""
+        """Reports to the others why this rank ends, unless all leave cleanly or the cause is
+        another rank's end.
+        """
         if self.count == 1 or self._leaving.is_set():
             return
         if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
-            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone, which is being reported right now
+            # A collective broke because a peer is gone, which is being reported right
+            # now
+            time.sleep(_SILENCE_SECONDS)
         self._leaving.set()
         reason = str(error) or type(error).__name__
         for link in self._links.values():
@@ -283,7 +332,10 @@ class Ranks:
             self._entries[rank] = frame
             if len(self._entries) < self.count and not frame.meta["urgent"]:
                 return
-            entries = [self._entries[r].meta["entry"] if r in self._entries else None for r in range(self.count)]
+            entries = [
+                self._entries[r].meta["entry"] if r in self._entries else None
+                for r in range(self.count)
+            ]
             arrays = self._entries[0].arrays if 0 in self._entries else {}
             decision = Message(arrays, {"round": self._deciding, "entries": entries})
             self._deciding += 1
@@ -326,7 +378,10 @@ class Ranks:
                 link.send(Message(meta={"lost": what}))
         if self.rank == 0:
             time.sleep(_RELAY_SECONDS)
-        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot continue alone: start all ranks with --resume.")
+        self._on_lost(
+            f"{what.rstrip('.')}. Rank {self.rank} cannot continue alone: start all ranks with "
+            f"--resume."
+        )
 
     def _beat(self) -> None:
         while not self._leaving.wait(_HEARTBEAT_SECONDS):
@@ -337,7 +392,9 @@ class Ranks:
 
 def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Link]:
     """On rank 0: accepts the links of all others."""
-    with os_errors_as(f"Rank 0 cannot listen at port {port}", "Choose another --coordinator HOST:PORT."):
+    with os_errors_as(
+        f"Rank 0 cannot listen at port {port}", "Choose another --coordinator HOST:PORT."
+    ):
         server = socket.create_server((bind, port))
     links: dict[int, _Link] = {}
     with server:
@@ -350,14 +407,20 @@ def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Lin
                 if time.monotonic() < deadline:
                     continue
                 missing = sorted(set(range(1, count)) - links.keys())
-                raise TransportError(f"Ranks {missing} of {count} did not come within {JOIN_SECONDS:.0f} s.") from None
+                raise TransportError(
+                    f"Ranks {missing} of {count} did not come within {JOIN_SECONDS:.0f} s."
+                ) from None
             except (OSError, CongraspError, KeyError, ValueError):
                 continue
             if hello.get("ranks") == count and hello.get("rank") in range(1, count):
                 links[hello["rank"]] = link
             else:
                 with contextlib.suppress(OSError):
-                    link.send(Message(meta={"lost": f"Rank 0 expects {count} ranks, and no {dict(hello)}"}))
+                    link.send(
+                        Message(
+                            meta={"lost": f"Rank 0 expects {count} ranks, and no {dict(hello)}"}
+                        )
+                    )
                 link.close()
     return links
 
@@ -372,11 +435,15 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
         except OSError as error:
             if time.monotonic() > deadline:
                 raise TransportError(
-                    f"Rank 0 does not answer at {host}:{port}: {error}.", "Name its host and port with --coordinator."
+                    f"Rank 0 does not answer at {host}:{port}: {error}.",
+                    "Name its host and port with --coordinator.",
                 ) from None
             time.sleep(0.5)
 
 
 def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
     """Returns the first rank whose entry ends training, and its reason."""
-    return next(((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")), None)
+    return next(
+        ((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")),
+        None,
+    )

@@ -1,11 +1,13 @@
-"""Validates the values of rollouts: every number is compared with the task's range, and names are a closed set.
+"""Validates the values of rollouts: every number is compared with the task's range, and names are a
+closed set.
 
-Values within these ranges are trusted. An actor whose rollout is refused must back off, longer each time
-(`learner.hub.limits.PutOff`).
+Values within these ranges are trusted. An actor whose rollout is refused must back off, longer each
+time (`learner.hub.limits.PutOff`).
 
-The ranges are computed by evaluating the task. Engines end environments that exceed `MAX_SPEED` or `MAX_DISTANCE`
-(`common.ranges`). Observation and reward terms are evaluated in random states up to these limits, where every clipped
-term reaches its bound. The ranges of external constraints and terms therefore follow as well.
+The ranges are computed by evaluating the task. Engines end environments that exceed `MAX_SPEED` or
+`MAX_DISTANCE` (`common.ranges`). Observation and reward terms are evaluated in random states up to
+these limits, where every clipped term reaches its bound. The ranges of external constraints and
+terms therefore follow as well.
 """
 
 import collections
@@ -39,8 +41,8 @@ from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.limits import PutOff
 
 _DENSITY = (-100.0, 10.0)
-"""Bounds of the log probability of each action, nats: the lower is reached 14 standard deviations from the mean, the
-upper at the mean with a standard deviation of 2e-5."""
+"""Bounds of the log probability of each action, nats: the lower is reached 14 standard deviations
+from the mean, the upper at the mean with a standard deviation of 2e-5."""
 _ACTIONS = 256  # used if a rollout has a log probability but no action
 _ROWS = 128
 _NAMES = 1024  # actors for which refused rollouts are counted
@@ -57,7 +59,9 @@ class Ranges(NamedTuple):
     action: float
     """Action, in its units: targets are clipped far below."""
     episodes: dict[str, tuple[float, float]]
-    """Least and largest value of each metric of an episode, by its name on the wire; other names are refused."""
+    """Least and largest value of each metric of an episode, by its name on the wire; other names
+    are refused.
+    """
     teacher_observation: np.ndarray = np.zeros(0)
     """(S,)."""
     privileged: np.ndarray = np.zeros(0)
@@ -68,7 +72,9 @@ class Admission:
     """Compares the values of rollouts with a task's ranges, and defers offenders; thread-safe."""
 
     def __init__(self, ranges: Callable[[], Ranges] | None = None):
-        """Gets the ranges from a function at the first rollout, whose reply waits for it; None accepts any values."""
+        """Gets the ranges from a function at the first rollout, whose reply waits for it; None
+        accepts any values.
+        """
         self._ranges = ranges
         self._lock = threading.Lock()
         self._put_off = PutOff()
@@ -77,19 +83,25 @@ class Admission:
         """Number of requests of deferred actors."""
 
     def check(self, message: Message) -> None:
-        """Checks the values of a rollout of valid form; device arrays, which never left this process, are not checked.
+        """Checks the values of a rollout of valid form; device arrays, which never left this
+        process, are not checked.
 
         Raises:
-          CongraspError: a value is out of range, or the task has no such metric; the message names it.
+          CongraspError: a value is out of range, or the task has no such metric; the message names
+          it.
         """
-        arrays = {name: array for name, array in message.arrays.items() if isinstance(array, np.ndarray)}
+        arrays = {
+            name: array for name, array in message.arrays.items() if isinstance(array, np.ndarray)
+        }
         if not arrays or self._ranges is None:
             return
         ranges = self._ranges()
         for name, array in arrays.items():
             if name.startswith(("episode/", "term/")):
                 if name not in ranges.episodes:
-                    raise CongraspError(f"The rollout names {ascii(name)[:60]}, which is not a metric of the task.")
+                    raise CongraspError(
+                        f"The rollout names {ascii(name)[:60]}, which is not a metric of the task."
+                    )
                 _within(name, array, *ranges.episodes[name])
             elif name in ("observation", "last_observation"):
                 _check_observations(name, array, ranges.observation)
@@ -137,7 +149,9 @@ def _within(name: str, array: np.ndarray, least: float, most: float) -> None:
 
 
 def _check_observations(name: str, array: np.ndarray, most: np.ndarray) -> None:
-    """Raises a `CongraspError` for an entry of observations (..., D) whose magnitude exceeds its bound (D,)."""
+    """Raises a `CongraspError` for an entry of observations (..., D) whose magnitude exceeds its
+    bound (D,).
+    """
     for rows, bounds in _magnitudes(array, most):
         if (rows > bounds).any():
             entry = int((rows > bounds).any(0).argmax())
@@ -146,7 +160,9 @@ def _check_observations(name: str, array: np.ndarray, most: np.ndarray) -> None:
 
 
 def _magnitudes(array: np.ndarray, most: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields blocks of rows (n, D) and bounds (D,), ordered like magnitudes; half precision by its bits."""
+    """Yields blocks of rows (n, D) and bounds (D,), ordered like magnitudes; half precision by its
+    bits.
+    """
     flat = array.reshape(-1, array.shape[-1])
     if array.dtype != np.float16:
         yield np.abs(flat), most.astype(array.dtype)
@@ -159,7 +175,8 @@ def _magnitudes(array: np.ndarray, most: np.ndarray) -> Iterator[tuple[np.ndarra
 def _outside(name: str, value: Any, least: float, most: float) -> CongraspError:
     """Error for a number that the task cannot produce."""
     return CongraspError(
-        f"The rollout's array '{name}' holds {value:.4g}; the task's are within {least:.4g} and {most:.4g}."
+        f"The rollout's array '{name}' holds {value:.4g}; the task's are within {least:.4g} and "
+        f"{most:.4g}."
     )
 
 
@@ -181,9 +198,15 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         evaluate = jax.jit(functools.partial(_evaluate, hand, task))
         *observed, terms = jax.device_get(evaluate(*_extremes(hand, task)))
-    weights = [task.reward, curriculum.reward] if curriculum.ramp[1] > curriculum.ramp[0] else [task.reward]
+    weights = (
+        [task.reward, curriculum.reward]
+        if curriculum.ramp[1] > curriculum.ramp[0]
+        else [task.reward]
+    )
     most = {
-        name: _SLACK * float(np.abs(values).max()) * max(abs(getattr(each, name)) for each in weights)
+        name: _SLACK
+        * float(np.abs(values).max())
+        * max(abs(getattr(each, name)) for each in weights)
         for name, values in terms.items()
     }
     reward = sum(most.values())
@@ -191,7 +214,10 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     episodes = dict.fromkeys(episode_fields(task), (-_LARGEST, _LARGEST))
     episodes |= {f"term/{name}": (-bound * steps, bound * steps) for name, bound in most.items()}
     episodes |= {f"episode/{name}": (0.0, _LARGEST) for name in FORCES}
-    episodes |= {"episode/return": (-reward * steps, reward * steps), "episode/length": (0.0, float(steps))}
+    episodes |= {
+        "episode/return": (-reward * steps, reward * steps),
+        "episode/length": (0.0, float(steps)),
+    }
     episodes |= {
         name: (0.0, 1.0)
         for name in episodes
@@ -211,17 +237,27 @@ def _evaluate(
     readings: Readings,
     parameters: Parameters,
 ) -> tuple[Any, Any, Any, Any]:
-    """Evaluates observations (B, D), (B, S) of a teacher and (B, P) of the critic, and unweighted reward terms."""
+    """Evaluates observations (B, D), (B, S) of a teacher and (B, P) of the critic, and unweighted
+    reward terms.
+    """
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
     own = scene._replace(task=task, readings=readings, cloud=surface)
-    return observe(own), observe_for_teacher(scene, own, task.control), privileged.observe(own, parameters), terms
+    return (
+        observe(own),
+        observe_for_teacher(scene, own, task.control),
+        privileged.observe(own, parameters),
+        terms,
+    )
 
 
-def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:
-    """Random states up to the engines' limits, with random surfaces and goals in which everything is active.
+def _extremes(
+    hand: Hand, task: TaskConfig
+) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:
+    """Random states up to the engines' limits, with random surfaces and goals in which everything
+    is active.
 
     The readings before a state belong to other states.
     """
@@ -231,7 +267,9 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
     within, unit = functools.partial(_inside, rng), functools.partial(_unit, rng)
 
     def joints() -> np.ndarray:
-        return rng.uniform(hand.lower - _BEYOND, hand.upper + _BEYOND, (_STATES, fingers)).astype(np.float32)
+        return rng.uniform(hand.lower - _BEYOND, hand.upper + _BEYOND, (_STATES, fingers)).astype(
+            np.float32
+        )
 
     reach = rng.choice([0.1, MAX_DISTANCE], (_STATES, 1))  # hand and object touch, or are far apart
     start = within(3)
@@ -256,7 +294,9 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         object_position_initial=start,
         object_quaternion_initial=unit(4),
         wrist_load=within(6, most=MAX_SPEED),
-        time=rng.integers(0, task.approach_steps + task.hold_steps_max + 1, _STATES).astype(np.float32),
+        time=rng.integers(0, task.approach_steps + task.hold_steps_max + 1, _STATES).astype(
+            np.float32
+        ),
         table=rng.random(_STATES) < 0.5,
     )
     count = task.surface_points
@@ -273,7 +313,9 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         gain_scale=rng.uniform(*task.gain_range, _STATES),
         stationary=rng.random(_STATES) < 0.5,
         hold=rng.integers(0, max(task.hold_steps, task.hold_steps_max) + 1, _STATES),
-        sensors=draw_sensors(task.sensing, task.control_dt, jax.random.key(0), _STATES) if task.sensed else None,
+        sensors=draw_sensors(task.sensing, task.control_dt, jax.random.key(0), _STATES)
+        if task.sensed
+        else None,
     )
     return jax.tree.map(jnp.asarray, (state, surface, goal, readings, parameters))
 
@@ -292,11 +334,20 @@ def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
             else:
                 made[name] = _unit(rng, *shape)
         values[constraint.name] = constraint.goal(**made)
-    return Goal(values, {block: np.ones(_STATES, bool) for constraint in known(task) for block in constraint.blocks})
+    return Goal(
+        values,
+        {
+            block: np.ones(_STATES, bool)
+            for constraint in known(task)
+            for block in constraint.blocks
+        },
+    )
 
 
 def _inside(rng: np.random.Generator, *shape: int, most: Any = 1.0) -> np.ndarray:
-    """Numbers (B, *shape) up to a magnitude; some at the bounds and some in the middle, where terms differ."""
+    """Numbers (B, *shape) up to a magnitude; some at the bounds and some in the middle, where terms
+    differ.
+    """
     drawn = rng.uniform(-1.0, 1.0, (_STATES, *shape))
     towards = rng.choice([0.1, 1.0, 8.0], (_STATES, *[1] * len(shape)))
     return np.asarray(most * np.sign(drawn) * np.abs(drawn) ** towards, np.float32)

@@ -1,4 +1,6 @@
-"""Learner side of the link: receives rollouts, grants tickets, serves weights, and reports the run's status."""
+"""Learner side of the link: receives rollouts, grants tickets, serves weights, and reports the
+run's status.
+"""
 
 import collections
 import threading
@@ -9,7 +11,13 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import below, check_name, parse_alive
 from congrasp.common.wire.codec import Message, SharedMessage
-from congrasp.common.wire.messages import TICKET, RolloutHeader, validate, validate_bundle, validate_rollout
+from congrasp.common.wire.messages import (
+    TICKET,
+    RolloutHeader,
+    validate,
+    validate_bundle,
+    validate_rollout,
+)
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.limits import DAMAGED, Events, Members, RateLimit, sender
 from congrasp.learner.hub.queue import RolloutQueue
@@ -17,7 +25,8 @@ from congrasp.learner.hub.staleness import Owner
 
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
-_PIECES = 40.0  # chunks of weights, of at most four mebibytes, per second for the owners of one certificate
+# Chunks of weights, of at most four mebibytes, per second for the owners of one certificate
+_PIECES = 40.0
 
 
 class LearnerHub:
@@ -49,7 +58,10 @@ class LearnerHub:
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self.trouble = ""
         """Reason why the run cannot be saved, and what its end would cost; part of the status."""
-        self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
+        self._rate_limit, self._pull_limit = (
+            RateLimit(),
+            RateLimit(per_second=_PIECES, most=4 * _PIECES),
+        )
         self._serve()
 
     def publish_weights(self, bundle: Message, version: int) -> None:
@@ -64,7 +76,9 @@ class LearnerHub:
         """
         validate_bundle(bundle, schema=self._rollouts.schema)
         if (bundle.meta["version"], bundle.meta["run_id"]) != (version, self._rollouts.run_id):
-            raise CongraspError(f"The bundle is not version {version} of run id {self._rollouts.run_id}.")
+            raise CongraspError(
+                f"The bundle is not version {version} of run id {self._rollouts.run_id}."
+            )
         self._bundle = SharedMessage(bundle.arrays, bundle.meta)
         self._rollouts.publish(version)
         self._announce()
@@ -79,7 +93,11 @@ class LearnerHub:
         with self._lock:
             now = time.monotonic()
             self._forget_arrivals(now)
-            arrivals, members, unlisted = list(self._arrivals), self._members.listed(), self._members.unlisted
+            arrivals, members, unlisted = (
+                list(self._arrivals),
+                self._members.listed(),
+                self._members.unlisted,
+            )
         span = min(_RATE_SECONDS, max(1.0, now - arrivals[0][0])) if arrivals else _RATE_SECONDS
         roles: list[dict[str, Any]] = []
         arrived = collections.defaultdict[Owner, list[int]](list)
@@ -91,7 +109,9 @@ class LearnerHub:
                 owner = alive.id, alive.incarnation
                 known = self._rollouts.decided(owner)
                 entry |= {"rollouts": known.rollouts, "version": known.version} if known else {}
-                entry |= {"lag": self._staleness.lag(known.version)} if known and known.rollouts else {}
+                entry |= (
+                    {"lag": self._staleness.lag(known.version)} if known and known.rollouts else {}
+                )
                 entry |= {**self._admission.counts(alive.id), **_rates(arrived[owner], span)}
             roles.append(entry)
         rollouts = self._rollouts.status()
@@ -114,9 +134,17 @@ class LearnerHub:
         transport = self._transport
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject)
+        transport.serve(
+            self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject
+        )
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
-        transport.serve(below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._reject_puller)
+        transport.serve(
+            below(self.keys.weights),
+            self._on_weights,
+            workers=4,
+            depth=16,
+            admission=self._reject_puller,
+        )
         transport.serve(
             self.keys.rollouts,
             charging(self._on_rollout),
@@ -126,7 +154,9 @@ class LearnerHub:
             admission=self._reject,
         )
         transport.watch_alive(self.keys.everyone, self._on_alive)
-        transport.declare_alive(self.keys.alive("learner", self._events.name, self._rollouts.session_id))
+        transport.declare_alive(
+            self.keys.alive("learner", self._events.name, self._rollouts.session_id)
+        )
 
     def _state(self) -> dict[str, Any]:
         rollouts = self._rollouts
@@ -144,7 +174,12 @@ class LearnerHub:
     def _on_config(self, key: str, request: Message) -> Message:
         arrays = list(self._rollouts.form.arrays)
         return Message(
-            meta={**self._state(), "config": self._config, "schema": self._rollouts.schema, "arrays": arrays}
+            meta={
+                **self._state(),
+                "config": self._config,
+                "schema": self._rollouts.schema,
+                "arrays": arrays,
+            }
         )
 
     def _on_ticket(self, key: str, request: Message) -> Message:
@@ -176,7 +211,9 @@ class LearnerHub:
         except CongraspError as error:
             self._staleness.refuse_damaged((sender(key), str(meta.get("incarnation"))), ticket)
             self._admission.refuse(sender(key))
-            self._events.add("warning", f"A rollout of {sender(key)} was refused: {error}", kind="refused")
+            self._events.add(
+                "warning", f"A rollout of {sender(key)} was refused: {error}", kind="refused"
+            )
             return self._answer("refused", str(error))
         verdict = self._rollouts.admit(header, ticket, message)
         if verdict.outcome == "accepted":
@@ -192,25 +229,33 @@ class LearnerHub:
             self._forget_arrivals(now)
 
     def _answer(self, outcome: str, why: str = "") -> Message:
-        return Message(meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS})
+        return Message(
+            meta={**self._state(), "outcome": outcome, "why": why, "retry_after": _RETRY_SECONDS}
+        )
 
     def _forget_arrivals(self, now: float) -> None:
         while self._arrivals and self._arrivals[0][0] < now - _RATE_SECONDS:
             self._arrivals.popleft()
 
     def _reject(self, key: str) -> Message | None:
-        """Returns the reply to a deferred or rate-limited actor, before its request is decoded; None for others."""
+        """Returns the reply to a deferred or rate-limited actor, before its request is decoded;
+        None for others.
+        """
         if seconds := self._admission.retry_after(sender(key)):
             retry = self._answer("retry", "A rollout of yours was refused: try again later.")
             return Message(meta={**retry.meta, "granted": False, "retry_after": seconds})
         if self._rate_limit.admits(key):
             return None
-        self._events.add("warning", f"Too many useless requests of {sender(key)}: rejected.", kind="rejected")
+        self._events.add(
+            "warning", f"Too many useless requests of {sender(key)}: rejected.", kind="rejected"
+        )
         retry = self._answer("retry", "Too many of your requests were useless.")
         return Message(meta={**retry.meta, "granted": False})
 
     def _reject_puller(self, key: str) -> Message | None:
-        """Returns the reply to a peer beyond the rate limit of weights; None for others, which are charged."""
+        """Returns the reply to a peer beyond the rate limit of weights; None for others, which are
+        charged.
+        """
         if not self._pull_limit.admits(key):
             return Message(meta=self._state())
         self._pull_limit.charge(key, 0)
@@ -245,4 +290,6 @@ def _rates(steps: list[int], seconds: float) -> dict[str, float]:
 
 def _check_sender(key: str, actor: str) -> None:
     if sender(key) != actor:
-        raise CongraspError(f"A message of the actor {ascii(actor)[:70]} came under the key {ascii(key)[:140]}.")
+        raise CongraspError(
+            f"A message of the actor {ascii(actor)[:70]} came under the key {ascii(key)[:140]}."
+        )

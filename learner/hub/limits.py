@@ -1,8 +1,10 @@
-"""Limits for the owners of each certificate: rate of useless work, backoff of offenders, listed tokens, events.
+"""Limits for the owners of each certificate: rate of useless work, backoff of offenders, listed
+tokens, events.
 
-A request that helps training is free: a granted ticket, an accepted rollout. All others (denied, refused, stale,
-duplicate) cost tokens by size. An actor without tokens gets the reply to retry later before its request is decoded, so
-that a flood costs the learner little and other actors nothing. The rate limit is a token bucket for each certificate.
+A request that helps training is free: a granted ticket, an accepted rollout. All others (denied,
+refused, stale, duplicate) cost tokens by size. An actor without tokens gets the reply to retry
+later before its request is decoded, so that a flood costs the learner little and other actors
+nothing. The rate limit is a token bucket for each certificate.
 """
 
 import collections
@@ -134,7 +136,8 @@ def sender(key: str) -> str:
 
 
 class Events:
-    """Publishes the events of a learner; at most one a second of a kind that untrusted peers can trigger.
+    """Publishes the events of a learner; at most one a second of a kind that untrusted peers can
+    trigger.
 
     Attributes:
       keys: keys of the run.
@@ -148,7 +151,9 @@ class Events:
         name: str = "0",
         on_event: Callable[[str, str], None] = lambda level, text: None,
     ):
-        """Publishes as the learner `name` of a run; `on_event` is called with level and text, and must not block."""
+        """Publishes as the learner `name` of a run; `on_event` is called with level and text, and
+        must not block.
+        """
         self.keys, self.name = Keys(run), name
         self._transport, self._on_event = transport, on_event
         self._last: dict[str, float] = {}
@@ -188,7 +193,9 @@ class Members:
         return False
 
     def listed(self) -> list[Alive]:
-        """Listed members, in order; if there are too many, the first of each certificate precedes all second ones."""
+        """Listed members, in order; if there are too many, the first of each certificate precedes
+        all second ones.
+        """
         ranks = (enumerate(sorted(known)) for _, known in sorted(self._known.items()))
         first = sorted(itertools.chain.from_iterable(ranks), key=lambda ranked: ranked[0])
         return sorted(who for _, who in first[:_LISTED])

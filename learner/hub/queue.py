@@ -1,12 +1,13 @@
 """Accepted rollouts of a learner: deduplication, queue, and recovery after a kill.
 
-A rollout is identified by (actor, incarnation, sequence). It is acknowledged once it is queued and on disk, and an
-acknowledged one is never accepted twice, however often its actor sends it.
+A rollout is identified by (actor, incarnation, sequence). It is acknowledged once it is queued and
+on disk, and an acknowledged one is never accepted twice, however often its actor sends it.
 
-The part of a checkpoint (`RolloutQueue.durable`) is consistent with its weights: resuming from it undoes later
-decisions together with the updates that used them. Their rollouts in the write-ahead log are accepted again before the
-first new rollout. The rest appears as gaps in actors' sequences, counted as `missing`; so do overtaken rollouts until
-they arrive. All others are counted once: as consumed, dropped, queued or stale.
+The part of a checkpoint (`RolloutQueue.durable`) is consistent with its weights: resuming from it
+undoes later decisions together with the updates that used them. Their rollouts in the write-ahead
+log are accepted again before the first new rollout. The rest appears as gaps in actors' sequences,
+counted as `missing`; so do overtaken rollouts until they arrive. All others are counted once: as
+consumed, dropped, queued or stale.
 """
 
 import collections
@@ -27,12 +28,16 @@ from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
 
 _INCARNATIONS = 1024  # incarnations whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
-_FAR = 1 << 10  # most sequence numbers below `next` that a checkpoint lists one by one, from the first queued one on
+# Most sequence numbers below `next` that a checkpoint lists one by one, from the first queued one
+# on
+_FAR = 1 << 10
 
 
 @dataclasses.dataclass
 class Sequences:
-    """Decided sequence numbers of an incarnation: all below `next` except the skipped ones, and `ahead`."""
+    """Decided sequence numbers of an incarnation: all below `next` except the skipped ones, and
+    `ahead`.
+    """
 
     next: int = 0
     ahead: set[int] = dataclasses.field(default_factory=set)
@@ -74,7 +79,9 @@ class Sequences:
         return self.skipped + self._made(ahead)
 
     def _made(self, gap: int) -> int:
-        """Size of a gap in the sequence numbers, limited by tickets, since an actor may invent numbers."""
+        """Size of a gap in the sequence numbers, limited by tickets, since an actor may invent
+        numbers.
+        """
         return max(0, min(gap, self.granted + _WINDOW - self.skipped))
 
 
@@ -91,8 +98,13 @@ class SequenceTable:
         sequences = self._known.setdefault(owner, Sequences())
         self._known.move_to_end(owner)
         if len(self._known) > _INCARNATIONS:
-            # A certificate with many incarnations displaces only its own, so that it cannot displace those of others.
-            mine = (of for of in self._known if of != owner and certificate(of[0]) == certificate(owner[0]))
+            # A certificate with many incarnations displaces only its own, so that it cannot
+            # displace those of others.
+            mine = (
+                of
+                for of in self._known
+                if of != owner and certificate(of[0]) == certificate(owner[0])
+            )
             self._forgotten_missing += self._known.pop(next(mine, next(iter(self._known)))).missing
         return sequences
 
@@ -106,20 +118,27 @@ class SequenceTable:
         return self._forgotten_missing + sum(each.missing for each in self._known.values())
 
     def durable(self, waiting: Collection[tuple[Owner, int]]) -> dict[str, Any]:
-        """Returns the part to be stored in a checkpoint, as JSON; rollouts queued for an update count as undecided."""
+        """Returns the part to be stored in a checkpoint, as JSON; rollouts queued for an update
+        count as undecided.
+        """
         rows = []
         for owner, known in self._known.items():
             queued = {sequence for of, sequence in waiting if of == owner}
-            start = max(min(queued | {known.next}), known.next - _FAR)  # an actor may make its numbers up
+            # An actor may make its numbers up
+            start = max(min(queued | {known.next}), known.next - _FAR)
             decided = set(range(start, known.next)) | known.ahead
-            rows.append([*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped])
+            rows.append(
+                [*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped]
+            )
         return {"forgotten_missing": self._forgotten_missing, "sequences": rows}
 
     def restore(self, durable: Mapping[str, Any]) -> None:
         """Restores the result of `durable`."""
         self._forgotten_missing = durable["forgotten_missing"]
         for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
-            self._known[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped, skipped)
+            self._known[actor, incarnation] = Sequences(
+                start, set(ahead), set(refused), skipped, skipped
+            )
 
 
 class Verdict(NamedTuple):
@@ -142,7 +161,7 @@ class RolloutQueue:
       finished: True once the run is over; all further rollouts are stale.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         run_id: str,
         form: RolloutForm,
@@ -169,7 +188,12 @@ class RolloutQueue:
         Raises:
           CongraspError: the durable state belongs to another run.
         """
-        self.run_id, self.form, self.schema, self.session_id = run_id, form, schema, secrets.token_hex(4)
+        self.run_id, self.form, self.schema, self.session_id = (
+            run_id,
+            form,
+            schema,
+            secrets.token_hex(4),
+        )
         self.staleness, self.finished = staleness, False
         self._events, self._limit, self._audit, self._log = events, limit, audit, log
         self._changed = threading.Condition()
@@ -183,13 +207,17 @@ class RolloutQueue:
             staleness.restore(durable["counters"], durable["version"])
             self._sequences.restore(durable)
         version = staleness.version
-        self._recovered = Recovered([], []) if log is None else log.recover(version, run_id, form, schema)
+        self._recovered = (
+            Recovered([], []) if log is None else log.recover(version, run_id, form, schema)
+        )
         if audit is not None:
             session = self.session_id, run_id, version, staleness.max_staleness
             staleness.note_undone(audit.begin(*session, kept=log is not None and log.write))
 
     def publish(self, version: int) -> None:
-        """Makes `version` the current one; the first time, it queues the rollouts of earlier sessions."""
+        """Makes `version` the current one; the first time, it queues the rollouts of earlier
+        sessions.
+        """
         with self._changed:
             self.staleness.publish(version)
             if not self._started:
@@ -208,7 +236,9 @@ class RolloutQueue:
         return granted
 
     def admit(self, header: RolloutHeader, ticket: str, message: Message) -> Verdict:
-        """Decides on a valid rollout; an accepted one is on disk on return, if a resume could use it."""
+        """Decides on a valid rollout; an accepted one is on disk on return, if a resume could use
+        it.
+        """
         if header.run_id != self.run_id:
             self.staleness.refuse_stale(header.owner, ticket)
             return Verdict("stale", f"The rollout has run id {header.run_id}, not {self.run_id}.")
@@ -220,10 +250,14 @@ class RolloutQueue:
         written = self._write_ahead(header, message)
         with self._changed:
             self._being_written.remove((header.owner, header.sequence))
-        return verdict if written or not self._closed else Verdict("retry", "The learner is stopping.")
+        return (
+            verdict if written or not self._closed else Verdict("retry", "The learner is stopping.")
+        )
 
     def has_batch(self, count: int, timeout: float) -> bool:
-        """Waits at most `timeout` seconds; returns True if `next_batch` would return a batch. Takes nothing."""
+        """Waits at most `timeout` seconds; returns True if `next_batch` would return a batch. Takes
+        nothing.
+        """
         deadline = time.monotonic() + timeout
         with self._changed:
             while True:
@@ -236,7 +270,9 @@ class RolloutQueue:
                 self._changed.wait(rest)
 
     def next_batch(self, count: int, timeout: float) -> list[Message] | None:
-        """Returns the `count` fresh rollouts of the oldest policies; None if there are fewer after `timeout` s."""
+        """Returns the `count` fresh rollouts of the oldest policies; None if there are fewer after
+        `timeout` s.
+        """
         with self._changed:
             if not self.has_batch(count, timeout):
                 return None
@@ -247,14 +283,17 @@ class RolloutQueue:
         messages = [message for _, message in batch]
         if self._audit is not None:
             self._audit.used(
-                self.staleness.version, [self.staleness.lag(header.version) for header, _ in batch], messages
+                self.staleness.version,
+                [self.staleness.lag(header.version) for header, _ in batch],
+                messages,
             )
         return messages
 
     def close(self) -> None:
         """Stops accepting rollouts, while the transport still replies, and records the unused ones.
 
-        A rollout that is being written at that time is included, and acknowledged once it is written.
+        A rollout that is being written at that time is included, and acknowledged once it is
+        written.
         """
         with self._changed:
             self._closed = True
@@ -274,7 +313,9 @@ class RolloutQueue:
         return self._sequences.get(owner)
 
     def durable(self) -> dict[str, Any]:
-        """Returns the part of a checkpoint, as JSON; call it between two updates, when no batch is in use."""
+        """Returns the part of a checkpoint, as JSON; call it between two updates, when no batch is
+        in use.
+        """
         with self._changed:
             if self._log is not None:
                 self._log.begin_checkpoint(self.staleness.version)
@@ -290,7 +331,9 @@ class RolloutQueue:
             }
 
     def note_saved(self) -> None:
-        """Records that a checkpoint holds the last result of `durable`, and removes what it covers."""
+        """Records that a checkpoint holds the last result of `durable`, and removes what it
+        covers.
+        """
         if self._log is not None:
             self._log.end_checkpoint()
         if self._audit is not None:
@@ -305,7 +348,9 @@ class RolloutQueue:
             self._log.discard(identities)
 
     def _write_ahead(self, header: RolloutHeader, message: Message) -> bool:
-        """Writes an accepted rollout to disk if a resume could use it; records a failure of the disk."""
+        """Writes an accepted rollout to disk if a resume could use it; records a failure of the
+        disk.
+        """
         if self._log is None or self._log.add(header, message):
             return True
         with self._changed:
@@ -314,7 +359,9 @@ class RolloutQueue:
         return False
 
     def _take_up(self, recovered: Recovered) -> None:
-        """Queues rollouts acknowledged by earlier sessions since the checkpoint; the caller holds the lock."""
+        """Queues rollouts acknowledged by earlier sessions since the checkpoint; the caller holds
+        the lock.
+        """
         taken: list[Identity] = []
         stale: list[Identity] = []
         for header, message in recovered.rollouts:
@@ -330,15 +377,20 @@ class RolloutQueue:
             self._audit.recovered(taken, stale, recovered.damaged)
         if taken or stale:
             self._events.add(
-                "info", f"Recovered {len(taken)} accepted rollouts of earlier sessions; {len(stale)} are too old."
+                "info",
+                f"Recovered {len(taken)} accepted rollouts of earlier sessions; {len(stale)} are "
+                f"too old.",
             )
         if recovered.damaged:
             self._events.add(
-                "error", f"{len(recovered.damaged)} accepted rollouts are damaged on disk and were ignored."
+                "error",
+                f"{len(recovered.damaged)} accepted rollouts are damaged on disk and were ignored.",
             )
 
     def _decide(self, header: RolloutHeader, ticket: str, message: Message) -> Verdict:
-        """Decides on a rollout of this run, and queues an accepted one; the caller holds the lock."""
+        """Decides on a rollout of this run, and queues an accepted one; the caller holds the
+        lock.
+        """
         if not self._started:
             return Verdict("retry", "The learner is starting.")
         if self._closed:
@@ -363,8 +415,13 @@ class RolloutQueue:
             return Verdict("retry", "No more rollouts are needed at this version.")
         sequences.add(header, accepted=verdict == "accepted")
         if verdict == "stale":
-            why = f"The rollout has version {header.version}, but the learner is at {self.staleness.version}."
-            self._events.add("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
+            why = (
+                f"The rollout has version {header.version}, but the learner is at "
+                f"{self.staleness.version}."
+            )
+            self._events.add(
+                "info", f"A rollout of {header.actor} was refused. {why}", kind="stale"
+            )
             return Verdict("stale", why)
         self._queue.append((header, message))
         self._changed.notify_all()
@@ -375,12 +432,15 @@ class RolloutQueue:
         stale = [header for header, _ in self._queue if self.staleness.is_stale(header.version)]
         if not stale:
             return
-        self._queue = collections.deque(entry for entry in self._queue if not self.staleness.is_stale(entry[0].version))
+        self._queue = collections.deque(
+            entry for entry in self._queue if not self.staleness.is_stale(entry[0].version)
+        )
         for header in stale:
             self.staleness.take(header.version)
         if self._audit is not None:
             self._audit.dropped((*header.owner, header.sequence) for header in stale)
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._events.add(
-            "warning", f"Dropped as too old at version {self.staleness.version}: {len(stale)} of {actors}."
+            "warning",
+            f"Dropped as too old at version {self.staleness.version}: {len(stale)} of {actors}.",
         )

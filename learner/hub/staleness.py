@@ -4,17 +4,20 @@ An actor requests a ticket before it produces a rollout. A ticket is granted whi
 
     accepted + awaited < (max_staleness + version + 1) * batch
 
-(AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates, `accepted` the rollouts
-used by an update or queued for one, and `awaited` the outstanding tickets that hold a place. No rollout is therefore
-produced in vain, unless its actor is slow. A rollout that arrives more than `max_staleness` versions after its policy
-is refused, and dropped if it becomes that old in the queue.
+(AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates,
+`accepted` the rollouts used by an update or queued for one, and `awaited` the outstanding tickets
+that hold a place. No rollout is therefore produced in vain, unless its actor is slow. A rollout
+that arrives more than `max_staleness` versions after its policy is refused, and dropped if it
+becomes that old in the queue.
 
-A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Its grant, its deadline and
-the time for which it holds a place also depend on the owner's earlier rollouts (`TicketBudget`).
+A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Its
+grant, its deadline and the time for which it holds a place also depend on the owner's earlier
+rollouts (`TicketBudget`).
 
-The lag of a rollout is the number of updates between its policy and the current one. A learner that resumes from a
-checkpoint gives its policy a new version; earlier versions are measured from the checkpoint's: rollouts of that policy
-keep their lag, those of policies lost with the killed learner do not.
+The lag of a rollout is the number of updates between its policy and the current one. A learner that
+resumes from a checkpoint gives its policy a new version; earlier versions are measured from the
+checkpoint's: rollouts of that policy keep their lag, those of policies lost with the killed learner
+do not.
 """
 
 import collections
@@ -40,16 +43,19 @@ _LEAST = 5.0  # least duration of a ticket, s
 class TicketBudget:
     """Shares, places and expiry of tickets, from each actor's deliveries. Not thread-safe.
 
-    A certificate's share of the tickets equals its share of the latest rollouts. Without any rollouts it may hold so
-    many that a whole batch is left to the others. A ticket expires after a few times the usual duration of its actor's
-    rollouts. A certificate whose tickets expire must back off, longer each time.
+    A certificate's share of the tickets equals its share of the latest rollouts. Without any
+    rollouts it may hold so many that a whole batch is left to the others. A ticket expires after a
+    few times the usual duration of its actor's rollouts. A certificate whose tickets expire must
+    back off, longer each time.
 
-    A ticket holds a place in a batch only while its rollout is due by the run's usual duration: not if its actor
-    usually takes twice as long, and never for four times as long. A later rollout is accepted if it is still fresh. A
-    slow or failing actor therefore blocks no other.
+    A ticket holds a place in a batch only while its rollout is due by the run's usual duration: not
+    if its actor usually takes twice as long, and never for four times as long. A later rollout is
+    accepted if it is still fresh. A slow or failing actor therefore blocks no other.
     """
 
-    def __init__(self, slots: int, batch: int, seconds: float, clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self, slots: int, batch: int, seconds: float, clock: Callable[[], float] = time.monotonic
+    ):
         """Starts without deliveries.
 
         Args:
@@ -61,7 +67,9 @@ class TicketBudget:
         self._slots, self._least = slots, max(1, slots - batch, slots // 2)
         self._seconds = seconds
         self._delivered: collections.deque[tuple[str, float]] = collections.deque(maxlen=_RECENT)
-        self._needed: collections.OrderedDict[str, collections.deque[float]] = collections.OrderedDict()
+        self._needed: collections.OrderedDict[str, collections.deque[float]] = (
+            collections.OrderedDict()
+        )
         self._usual = math.inf
         self._late = PutOff(clock)
 
@@ -75,7 +83,9 @@ class TicketBudget:
     def holds_place(self, actor: str, seconds: float) -> bool:
         """True if a ticket granted to an actor `seconds` ago holds a place."""
         own = self._needed.get(actor)
-        return seconds <= _LATE * self._usual and (not own or statistics.median(own) <= _SLOW * self._usual)
+        return seconds <= _LATE * self._usual and (
+            not own or statistics.median(own) <= _SLOW * self._usual
+        )
 
     def lasts(self, actor: str) -> float:
         """Seconds until a ticket granted to the actor now expires."""
@@ -123,7 +133,8 @@ class Ticket(NamedTuple):
 class Counters:
     """Outcomes of tickets and rollouts.
 
-    Invariants: `granted = running + redeemed + returned + expired` and `accepted = consumed + dropped + queued`.
+    Invariants: `granted = running + redeemed + returned + expired` and `accepted = consumed +
+    dropped + queued`.
     """
 
     granted: int = 0
@@ -184,7 +195,9 @@ class StalenessManager:
         self._clock = clock
         self._lock = threading.RLock()
         self._tickets: dict[tuple[Owner, str], Ticket] = {}
-        self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = collections.OrderedDict()
+        self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = (
+            collections.OrderedDict()
+        )
         self.version = 0
         self._in_update = 0
         # Versions at the last resume: that of the checkpoint, and the new one of its policy.
@@ -200,19 +213,31 @@ class StalenessManager:
     def capacity(self) -> int:
         """Number of tickets that could be granted now."""
         with self._lock:
-            # Every version counts for one batch, so that a resumed run, or an update of another size, leaves no debt.
+            # Every version counts for one batch, so that a resumed run, or an update of another
+            # size, leaves no debt.
             accepted = self.version * self._batch + self._in_update + self.queued
-            return (self.max_staleness + self.version + 1) * self._batch - accepted - self._awaited()
+            return (
+                (self.max_staleness + self.version + 1) * self._batch - accepted - self._awaited()
+            )
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
-        """Grants a ticket, or returns None if there is none now; repeating the id returns the same ticket."""
+        """Grants a ticket, or returns None if there is none now; repeating the id returns the same
+        ticket.
+        """
         with self._lock:
             self._expire()
             if held := self._tickets.get((owner, ticket_id)):
                 return held
             mine = sum(ticket.owner == owner for ticket in self._tickets.values())
-            shared = sum(certificate(ticket.owner[0]) == certificate(owner[0]) for ticket in self._tickets.values())
-            if mine >= self._per_owner or not self._budget.admits(owner[0], shared) or self.capacity <= 0:
+            shared = sum(
+                certificate(ticket.owner[0]) == certificate(owner[0])
+                for ticket in self._tickets.values()
+            )
+            if (
+                mine >= self._per_owner
+                or not self._budget.admits(owner[0], shared)
+                or self.capacity <= 0
+            ):
                 return None
             now = self._clock()
             ticket = Ticket(owner, ticket_id, self.version, now, now + self._budget.lasts(owner[0]))
@@ -241,17 +266,20 @@ class StalenessManager:
             self._counters.returned += len(mine)
             return len(mine)
 
-    def arrive(self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False) -> Verdict:
+    def arrive(
+        self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False
+    ) -> Verdict:
         """Decides on a valid rollout that arrived for the first time.
 
-        Its ticket ends unless the verdict is `full`: the rollout and its owner have no ticket (any more), and there is
-        no capacity. It may be sent again later.
+        Its ticket ends unless the verdict is `full`: the rollout and its owner have no ticket (any
+        more), and there is no capacity. It may be sent again later.
 
         Args:
           owner: actor and incarnation of the rollout.
           ticket_id: ticket of the rollout.
           version: policy version of the rollout.
-          beyond_capacity: admits it without a ticket or capacity, because it had been admitted before.
+          beyond_capacity: admits it without a ticket or capacity, because it had been admitted
+          before.
         """
         with self._lock:
             self._expire()
@@ -260,9 +288,14 @@ class StalenessManager:
                     self._budget.measure(owner[0], self._clock() - ticket.granted)
                 self.refuse_stale(owner, ticket_id)
                 return "stale"
-            if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
-                # Its ticket may belong to an earlier session: any current one of its owner is used instead. Otherwise
-                # an actor with one upload at a time would hold the place for which its rollout waits.
+            if (
+                (owner, ticket_id) not in self._tickets
+                and self.capacity <= 0
+                and not beyond_capacity
+            ):
+                # Its ticket may belong to an earlier session: any current one of its owner is used
+                # instead. Otherwise an actor with one upload at a time would hold the place for
+                # which its rollout waits.
                 ticket_id = next((other for of, other in self._tickets if of == owner), "")
                 if not ticket_id:
                     return "full"
@@ -309,7 +342,9 @@ class StalenessManager:
         return self.lag(version) > self.max_staleness
 
     def take(self, version: int) -> bool:
-        """Passes an accepted rollout to the coming update; returns False if it has become too old, and drops it."""
+        """Passes an accepted rollout to the coming update; returns False if it has become too old,
+        and drops it.
+        """
         with self._lock:
             if self.is_stale(version):
                 self._counters.dropped += 1
@@ -330,11 +365,17 @@ class StalenessManager:
         """All counters, with outstanding tickets, queued rollouts and the current capacity."""
         with self._lock:
             self._expire()
-            gauges = {"running": len(self._tickets), "queued": self.queued, "capacity": self.capacity}
+            gauges = {
+                "running": len(self._tickets),
+                "queued": self.queued,
+                "capacity": self.capacity,
+            }
             return dataclasses.asdict(self._counters) | gauges
 
     def durable(self) -> dict[str, int]:
-        """Counters for a checkpoint, without outstanding tickets, which do not survive the process."""
+        """Counters for a checkpoint, without outstanding tickets, which do not survive the
+        process.
+        """
         with self._lock:
             self._expire()
             counts = dataclasses.asdict(self._counters)
@@ -344,7 +385,9 @@ class StalenessManager:
             }
 
     def restore(self, durable: Mapping[str, int], version: int) -> None:
-        """Restores counters and version of a checkpoint, without tickets; `publish` assigns the new version."""
+        """Restores counters and version of a checkpoint, without tickets; `publish` assigns the new
+        version.
+        """
         with self._lock:
             self._counters = Counters(**durable)
             self._tickets.clear()
@@ -360,7 +403,9 @@ class StalenessManager:
         """Number of tickets that hold a place."""
         self._expire()
         now = self._clock()
-        return sum(self._budget.holds_place(t.owner[0], now - t.granted) for t in self._tickets.values())
+        return sum(
+            self._budget.holds_place(t.owner[0], now - t.granted) for t in self._tickets.values()
+        )
 
     def _known(self, owner: Owner, ticket_id: str) -> Ticket | None:
         """Returns an outstanding ticket, or an expired one, which is then forgotten."""

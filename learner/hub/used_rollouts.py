@@ -1,15 +1,22 @@
 """The learner's journal: rollouts used by updates, dropped, and undone by resumes.
 
-Every session of the learner begins with a line that gives the checkpoint's version. Earlier updates of that version or
-later ones were lost with their process: the rollouts that they used are undone. The next line lists which of these, and
-of the queued ones, the session recovers.
+Every session of the learner begins with a line that gives the checkpoint's version. Earlier updates
+of that version or later ones were lost with their process: the rollouts that they used are undone.
+The next line lists which of these, and of the queued ones, the session recovers.
 """
 
 import pathlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-from congrasp.common.io.journal import AUDIT, Journal, JournalLines, has_fields, is_rows, read_journal
+from congrasp.common.io.journal import (
+    AUDIT,
+    Journal,
+    JournalLines,
+    has_fields,
+    is_rows,
+    read_journal,
+)
 from congrasp.common.wire.codec import Message, checksum
 from congrasp.learner.hub.write_ahead import Identity
 
@@ -31,12 +38,16 @@ class Used(NamedTuple):
 class AuditLog:
     """Writes the journal of one learner."""
 
-    def __init__(self, run_dir: pathlib.Path, name: str, log_error: Callable[[str], None] = lambda text: None):
+    def __init__(
+        self, run_dir: pathlib.Path, name: str, log_error: Callable[[str], None] = lambda text: None
+    ):
         """Opens the journal of the learner called `name`, appending to an existing one."""
         self._path = journal_path(run_dir, name)
         self._journal = Journal(self._path, log_error)
 
-    def begin(self, session_id: str, run_id: str, version: int, max_staleness: int, *, kept: bool) -> int:
+    def begin(
+        self, session_id: str, run_id: str, version: int, max_staleness: int, *, kept: bool
+    ) -> int:
         """Records the start of a session from a checkpoint of `version`, or 0.
 
         Args:
@@ -50,16 +61,26 @@ class AuditLog:
           The number of rollouts lost by undoing updates.
         """
         self._journal.write(
-            session_id=session_id, run_id=run_id, version=version, max_staleness=max_staleness, kept=kept
+            session_id=session_id,
+            run_id=run_id,
+            version=version,
+            max_staleness=max_staleness,
+            kept=kept,
         )
         return len(replay(read_uses(self._path).intact)[1])
 
-    def recovered(self, taken: Sequence[Identity], stale: Sequence[Identity], damaged: Sequence[Identity]) -> None:
-        """Records rollouts of earlier sessions that are queued again, too old, or damaged on disk."""
+    def recovered(
+        self, taken: Sequence[Identity], stale: Sequence[Identity], damaged: Sequence[Identity]
+    ) -> None:
+        """Records rollouts of earlier sessions that are queued again, too old, or damaged on
+        disk.
+        """
         self._journal.write(taken=taken, dropped=stale, spoilt=damaged)
 
     def unwritten(self, identities: Sequence[Identity]) -> None:
-        """Records rollouts that were accepted although the disk refused them: they do not survive this session."""
+        """Records rollouts that were accepted although the disk refused them: they do not survive
+        this session.
+        """
         self._journal.write(unwritten=identities)
 
     def saved(self, version: int) -> None:
@@ -68,7 +89,10 @@ class AuditLog:
 
     def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
         """Records rollouts passed to the update that follows `version`."""
-        rows = [[*_identity(message), lag, checksum(message)] for lag, message in zip(lags, messages, strict=True)]
+        rows = [
+            [*_identity(message), lag, checksum(message)]
+            for lag, message in zip(lags, messages, strict=True)
+        ]
         self._journal.write(version=version, used=rows)
 
     def dropped(self, identities: Iterable[Identity]) -> None:
@@ -98,11 +122,15 @@ def _is_entry(entry: dict[str, Any]) -> bool:
     if "used" in entry:
         return has_fields(entry, version=int) and is_rows(entry["used"], str, str, int, int, str)
     rows = [entry[name] for name in _ROWS if name in entry]
-    return all(is_rows(each, str, str, int) for each in rows) and (bool(rows) or has_fields(entry, saved=int))
+    return all(is_rows(each, str, str, int) for each in rows) and (
+        bool(rows) or has_fields(entry, saved=int)
+    )
 
 
 def journalled_version(run_dir: pathlib.Path) -> int:
-    """Newest version that a run may have published, by its journals; -1 if there are none. A use leads to one more."""
+    """Newest version that a run may have published, by its journals; -1 if there are none. A use
+    leads to one more.
+    """
     versions = [-1]
     for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):
         versions += [e["version"] + ("used" in e) for e in read_uses(path).intact if "version" in e]

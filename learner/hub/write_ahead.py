@@ -1,12 +1,14 @@
-"""Write-ahead log of accepted rollouts, so that an acknowledgement survives the death of both processes.
+"""Write-ahead log of accepted rollouts, so that an acknowledgement survives the death of both
+processes.
 
-A rollout is written before it is acknowledged: the message as received, with its checksums, in a file that is renamed
-once it is complete. It is removed when a checkpoint holds its outcome. Only rollouts that a resume could use are
-written: those whose policy is at most `max_staleness` versions from that of the newest checkpoint, or of the one being
-written. The folder therefore holds at most the rollouts admitted within `2 max_staleness + 1` versions, and those
-queued at a checkpoint.
+A rollout is written before it is acknowledged: the message as received, with its checksums, in a
+file that is renamed once it is complete. It is removed when a checkpoint holds its outcome. Only
+rollouts that a resume could use are written: those whose policy is at most `max_staleness` versions
+from that of the newest checkpoint, or of the one being written. The folder therefore holds at most
+the rollouts admitted within `2 max_staleness + 1` versions, and those queued at a checkpoint.
 
-Files survive the death of all processes. They are not flushed to disk, so a power failure may lose them.
+Files survive the death of all processes. They are not flushed to disk, so a power failure may lose
+them.
 """
 
 import contextlib
@@ -129,18 +131,23 @@ class WriteAheadLog:
                 return True
         if is_new:
             self._log_error(
-                f"Accepted rollouts cannot be written to {self._folder} ({why}). Until they can, they do not "
+                f"Accepted rollouts cannot be written to {self._folder} ({why}). Until they can, "
+                f"they do not "
                 "survive the learner."
             )
         return False
 
     def begin_checkpoint(self, version: int) -> None:
-        """Records that a checkpoint of this version is about to be written; rollouts for a resume from it are kept."""
+        """Records that a checkpoint of this version is about to be written; rollouts for a resume
+        from it are kept.
+        """
         with self._lock:
             self._next = version
 
     def cover(self, waiting: Iterable[Identity]) -> None:
-        """Records which rollouts the coming checkpoint covers: all stored ones except those still queued."""
+        """Records which rollouts the coming checkpoint covers: all stored ones except those still
+        queued.
+        """
         with self._lock:
             self._decided = self._files.keys() - set(waiting)
 
@@ -152,7 +159,9 @@ class WriteAheadLog:
     def discard(self, identities: Iterable[Identity]) -> None:
         """Removes rollouts that must not be recovered."""
         with self._lock:
-            paths = [self._files.pop(identity) for identity in identities if identity in self._files]
+            paths = [
+                self._files.pop(identity) for identity in identities if identity in self._files
+            ]
         _remove(paths)
 
 

@@ -58,7 +58,9 @@ def arm_file(name: str) -> pathlib.Path:
     try:
         import mujoco_menagerie
     except ImportError:
-        raise MissingPackageError(f"There is no file {name}. A robot's name", "mujoco_menagerie") from None
+        raise MissingPackageError(
+            f"There is no file {name}. A robot's name", "mujoco_menagerie"
+        ) from None
     names = mujoco_menagerie.names()
     found = [name] if name in names else [other for other in names if name in other.split("_")]
     if len(found) != 1:
@@ -76,7 +78,9 @@ def arm_file(name: str) -> pathlib.Path:
 
 def _bare_entry(names: tuple[str, ...]) -> str:
     """Entry of a robot without scene, hand and MJX variant, if there is one."""
-    return min(names, key=lambda name: ("scene" in name, "mjx" in name, "nohand" not in name, len(name)))
+    return min(
+        names, key=lambda name: ("scene" in name, "mjx" in name, "nohand" not in name, len(name))
+    )
 
 
 def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
@@ -88,7 +92,8 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
       speed: speed limits of the joints, one or N numbers; those of a URDF, or `SPEED`, if empty.
 
     Raises:
-      CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges nor slides, or the
+      CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges
+      nor slides, or the
         speed limits are invalid.
     """
     with confined(write_arm, path, {"flange": flange, "speed": speed}) as (answer, folder):
@@ -99,7 +104,9 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
 
 
 def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[str, Any]:
-    """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and arrays."""
+    """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and
+    arrays.
+    """
     file = pathlib.Path(path)
     spec, _ = robot_spec(file, [])
     for i, body in enumerate(spec.bodies):
@@ -118,7 +125,9 @@ def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[
         )
     names = tuple(model.joint(j).name for j in joints)
     limited = model.jnt_limited[joints].astype(bool)
-    lower, upper = (np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf)))
+    lower, upper = (
+        np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf))
+    )
     postures = model.key_qpos[:, model.jnt_qposadr[joints]]
     _strip(spec, model, body)
     np.savez(
@@ -143,8 +152,12 @@ def _above(model: mujoco.MjModel, body: int) -> list[int]:
     return chain
 
 
-def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> tuple[int, np.ndarray, np.ndarray]:
-    """The body that carries the hand, and position (3,) and quaternion (4,) of the flange in its frame."""
+def _flange(
+    model: mujoco.MjModel, path: pathlib.Path, name: str
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """The body that carries the hand, and position (3,) and quaternion (4,) of the flange in its
+    frame.
+    """
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(model.nbody)]
     chosen = name or next((site for site in _SITES if site in sites), "")
@@ -154,14 +167,17 @@ def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> tuple[int, 
     if chosen in bodies:
         return bodies.index(chosen), np.zeros(3), np.array([1.0, 0, 0, 0])
     if chosen:
-        raise CongraspError(f"{path} has no site or body '{chosen}'.", f"It ends with {', '.join(bodies[-4:])}.")
+        raise CongraspError(
+            f"{path} has no site or body '{chosen}'.", f"It ends with {', '.join(bodies[-4:])}."
+        )
     return _last_body(model)
 
 
 def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
     """The end of the chain of joints, before a gripper: see `_flange`.
 
-    A gripper is a body without a joint whose children move apart; where it begins with a joint, it stays.
+    A gripper is a body without a joint whose children move apart; where it begins with a joint, it
+    stays.
     """
     children: list[list[int]] = [[] for _ in range(model.nbody)]
     for child in range(1, model.nbody):
@@ -183,7 +199,9 @@ def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
-    """Removes all movable parts beyond the flange and everything but kinematics; no file is needed afterwards."""
+    """Removes all movable parts beyond the flange and everything but kinematics; no file is needed
+    afterwards.
+    """
     groups = (spec.keys, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs)
     for group in (*groups, spec.skins, spec.flexes, spec.textures, spec.plugins):
         for element in list(group):
@@ -203,7 +221,11 @@ def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
     for body in range(flange + 1, model.nbody):
         if int(model.body_parentid[body]) in below:
             below.add(body)
-    moving = {b for b in below - {flange} if any(model.body_jntnum[x] for x in below if b in _above(model, x))}
+    moving = {
+        b
+        for b in below - {flange}
+        if any(model.body_jntnum[x] for x in below if b in _above(model, x))
+    }
     for body in moving:
         if int(model.body_parentid[body]) == flange:
             spec.delete(spec.body(model.body(body).name))
@@ -216,7 +238,9 @@ def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarra
     if text:
         given = numbers_in(text)
         if len(given) not in (1, len(joints)) or not (given > 0).all():
-            raise CongraspError(f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}.")
+            raise CongraspError(
+                f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}."
+            )
         return np.broadcast_to(given, len(joints))
     stated = {}
     text = robot_text(path)

@@ -15,7 +15,14 @@ from congrasp.common.io.inputs import numbers_in
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm
-from congrasp.services.arm.robot import Infeasible, Pose, Robot, build_robot, default_mount, moved_arm
+from congrasp.services.arm.robot import (
+    Infeasible,
+    Pose,
+    Robot,
+    build_robot,
+    default_mount,
+    moved_arm,
+)
 from congrasp.services.export.frames import NOT_LINKS
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record.episode import MovedArm
@@ -32,7 +39,11 @@ POSITION, ANGLE = 0.005, float(np.radians(2.0))
 _STARTS, _TRACKED = 24, 5  # random postures to start from, distinct solutions that are followed
 _SMOOTHING = 0.02  # standard deviation of the filter that removes contact tremor from the path, s
 _ITERATIONS = 80  # from each
-_POSTURE, _PULL = 2e-3, 0.02  # weight of the middle of the ranges against 1 m, share of the way to it in a step
+# Weight of the middle of the ranges against 1 m, share of the way to it in a step
+_POSTURE, _PULL = (
+    2e-3,
+    0.02,
+)
 _SAME = 0.05  # rad between two postures, below which they count as one
 _AT_END = 2e-3  # rad from the end of a range
 _TURN = np.pi  # rad to either side, of joints whose range is larger
@@ -40,7 +51,9 @@ _TURN = np.pi  # rad to either side, of joints whose range is larger
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """T poses of the wrist, of the object and of the table in the frame of the arm's base, a control step apart."""
+    """T poses of the wrist, of the object and of the table in the frame of the arm's base, a
+    control step apart.
+    """
 
     position: np.ndarray
     """(T, 3) m."""
@@ -75,7 +88,8 @@ class Track:
 
 
 def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
-    """Computes the joints along a path, from the first start that reaches its end; those far from joint limits first.
+    """Computes the joints along a path, from the first start that reaches its end; those far from
+    joint limits first.
 
     Args:
       robot: arm, hand and scene.
@@ -103,7 +117,8 @@ def _smooth(path: Path) -> tuple[np.ndarray, np.ndarray]:
     quaternion[1:] *= np.cumprod(np.where(same, 1.0, -1.0))[:, None]
     steps = _SMOOTHING / path.dt
     position, turns = (
-        gaussian_filter1d(values, steps, axis=0, mode="nearest") for values in (path.position, quaternion)
+        gaussian_filter1d(values, steps, axis=0, mode="nearest")
+        for values in (path.position, quaternion)
     )
     return position, turns / np.linalg.norm(turns, axis=-1, keepdims=True)
 
@@ -116,7 +131,9 @@ class _Solver:
         self.robot, self.path = robot, path
         self.target = _smooth(path)
         self.lower, self.upper = np.maximum(arm.lower, -_TURN), np.minimum(arm.upper, _TURN)
-        self.wrist = mink.FrameTask(robot.palm, "body", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-6)
+        self.wrist = mink.FrameTask(
+            robot.palm, "body", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-6
+        )
         cost = np.zeros(model.nv)
         cost[robot.joints] = _POSTURE
         self.posture = mink.PostureTask(model, cost, gain=_PULL)
@@ -142,16 +159,21 @@ class _Solver:
     def aim(self, t: int) -> None:
         """Sets the pose of step t as the wrist's target."""
         position, quaternion = self.target
-        self.wrist.set_target(mink.SE3.from_rotation_and_translation(mink.SO3(quaternion[t]), position[t]))
+        self.wrist.set_target(
+            mink.SE3.from_rotation_and_translation(mink.SO3(quaternion[t]), position[t])
+        )
 
     def errors(self, position: np.ndarray, turn: Rotation) -> tuple[float, float]:
         """Deviation of the wrist from a pose, m and rad."""
         data = self.configuration.data
         now = Rotation.from_matrix(data.xmat[self.body].reshape(3, 3))
-        return float(np.linalg.norm(data.xpos[self.body] - position)), float((now.inv() * turn).magnitude())
+        return float(np.linalg.norm(data.xpos[self.body] - position)), float(
+            (now.inv() * turn).magnitude()
+        )
 
     def starts(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Distinct postures (N,) at the path's first pose without collisions, those farthest from limits first.
+        """Distinct postures (N,) at the path's first pose without collisions, those farthest from
+        limits first.
 
         Raises:
           Infeasible: there is no such posture.
@@ -168,7 +190,9 @@ class _Solver:
             elif touching := self._collision(q, 0):
                 nearest = min(nearest, (0.0, touching))
             elif all(np.abs(q - other).max() > _SAME for _, other in found):
-                room = np.minimum(q - arm.lower, arm.upper - q) / np.maximum(self.upper - self.lower, 1e-9)
+                room = np.minimum(q - arm.lower, arm.upper - q) / np.maximum(
+                    self.upper - self.lower, 1e-9
+                )
                 found.append((float(room.min()), q))
                 if len(found) == _TRACKED:
                     break
@@ -183,7 +207,12 @@ class _Solver:
         settled = 0
         for _ in range(_ITERATIONS):
             velocity = mink.solve_ik(
-                self.configuration, [self.wrist, self.posture], 1.0, "daqp", damping=1e-9, limits=[self.range]
+                self.configuration,
+                [self.wrist, self.posture],
+                1.0,
+                "daqp",
+                damping=1e-9,
+                limits=[self.range],
             )
             self.configuration.integrate_inplace(np.clip(velocity, -0.5, 0.5), 1.0)
             settled = settled + 1 if np.abs(velocity).max() < 1e-2 else 0
@@ -193,7 +222,9 @@ class _Solver:
         return self.configuration.q[self.robot.joints].copy(), self.errors(position, turn)
 
     def track(self, start: np.ndarray) -> tuple[int, str, Track | None]:
-        """Follows the path from a posture; returns the number of steps, the violated limit, and a complete track."""
+        """Follows the path from a posture; returns the number of steps, the violated limit, and a
+        complete track.
+        """
         path, robot = self.path, self.robot
         q = np.zeros((len(path.position), len(start)))
         q[0] = start
@@ -220,7 +251,11 @@ class _Solver:
         speed = np.diff(q, axis=0) / path.dt
         acceleration = np.abs(np.diff(speed, axis=0)).max(0) / path.dt
         if (acceleration > ACCELERATION).any():
-            return len(q), f"the acceleration of {robot.arm.joints[int(acceleration.argmax())]}", None
+            return (
+                len(q),
+                f"the acceleration of {robot.arm.joints[int(acceleration.argmax())]}",
+                None,
+            )
         shares = np.abs(speed).max(0) / robot.arm.speed
         return len(q), "", Track(q, float(worst[0]), float(worst[1]), shares, acceleration)
 
@@ -237,14 +272,22 @@ class _Solver:
         return f"the speed of {self.robot.arm.joints[joint]}" if shares[joint] > 0.99 else ""
 
     def _slack(self, t: int) -> str:
-        """Violated limit: the path's acceleration if the arm is on the smooth path, else the reach."""
+        """Violated limit: the path's acceleration if the arm is on the smooth path, else the
+        reach.
+        """
         off = np.linalg.norm(self.configuration.data.xpos[self.body] - self.target[0][t])
         return "the acceleration of the wrist" if off < POSITION / 2 else "the reach"
 
     def _collision(self, q: np.ndarray, t: int) -> str:
         """Describes the collision at step t; empty if there is none."""
         path, data = self.path, self.scene
-        self.robot.place(data, self.whole(q, t), path.object_position[t], path.object_quaternion[t], path.table[t])
+        self.robot.place(
+            data,
+            self.whole(q, t),
+            path.object_position[t],
+            path.object_quaternion[t],
+            path.table[t],
+        )
         touching = self.robot.collision(data)
         return f"collision of {touching}" if touching else ""
 
@@ -279,7 +322,10 @@ class ArmMotion:
         """Describes the arm's distance from its limits."""
         facts = self.facts()
         off = f"{facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}°"
-        speed = f"{facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"
+        speed = (
+            f"{facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed "
+            f"limit at most"
+        )
         return f"{facts['arm']} carries the hand within {off} of its path, {speed}"
 
 
@@ -307,7 +353,10 @@ class ArmPlanner:
             self._mount = Pose(given[:3], Rotation.from_euler("xyz", given[3:], degrees=True))
         self._hand, self._seed = hand, seed
         self._robot: tuple[GraspObject, Robot] | None = None
-        self.identity = (hashlib.sha256(file.read_bytes()).hexdigest(), dataclasses.astuple(options))
+        self.identity = (
+            hashlib.sha256(file.read_bytes()).hexdigest(),
+            dataclasses.astuple(options),
+        )
 
     @property
     def name(self) -> str:
@@ -331,7 +380,9 @@ class ArmPlanner:
         start = motion.object_position[0].astype(float) * [1.0, 1.0, 0.0]
         base = dataclasses.replace(self._base, position=self._base.position + start)
         track = follow(robot, _path(motion, base), np.random.default_rng(self._seed))
-        arm = moved_arm(robot, track.q, base, self._mount, {*motion.link_names.tolist(), *NOT_LINKS})
+        arm = moved_arm(
+            robot, track.q, base, self._mount, {*motion.link_names.tolist(), *NOT_LINKS}
+        )
         return ArmMotion(arm, self._base, track)
 
 

@@ -50,10 +50,22 @@ class Robot:
     palm: str
     """Name of the body with the wrist frame."""
 
-    def place(self, data: mujoco.MjData, q: np.ndarray, position: np.ndarray, quaternion: np.ndarray, height: float):
-        """Moves everything in `data`: joints (Q,), the object's pose in the base's frame, the table's height (m)."""
+    def place(
+        self,
+        data: mujoco.MjData,
+        q: np.ndarray,
+        position: np.ndarray,
+        quaternion: np.ndarray,
+        height: float,
+    ):
+        """Moves everything in `data`: joints (Q,), the object's pose in the base's frame, the
+        table's height (m).
+        """
         data.qpos[:] = q
-        for name, at, turn in ((_OBJECT, position, quaternion), (_TABLE, [0.0, 0.0, height], [1.0, 0, 0, 0])):
+        for name, at, turn in (
+            (_OBJECT, position, quaternion),
+            (_TABLE, [0.0, 0.0, height], [1.0, 0, 0, 0]),
+        ):
             mocap = self.model.body(name).mocapid[0]
             data.mocap_pos[mocap], data.mocap_quat[mocap] = at, turn
         mujoco.mj_kinematics(self.model, data)
@@ -65,7 +77,11 @@ class Robot:
         if not len(deep):
             return ""
         scene = ("the table", "the object")  # named last
-        return " with ".join(sorted((self._called(int(g)) for g in data.contact.geom[deep[0]]), key=scene.__contains__))
+        return " with ".join(
+            sorted(
+                (self._called(int(g)) for g in data.contact.geom[deep[0]]), key=scene.__contains__
+            )
+        )
 
     def _called(self, geom: int) -> str:
         """Describes the body of a geom."""
@@ -78,14 +94,22 @@ class Robot:
     def links(self) -> list[int]:
         """Bodies of the arm, the base first."""
         names = [self.model.body(i).name for i in range(self.model.nbody)]
-        return [i for i, name in enumerate(names) if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)]
+        return [
+            i
+            for i, name in enumerate(names)
+            if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)
+        ]
 
 
 def default_mount(hand: Hand) -> Pose:
-    """The fingers along the flange's z axis, the palm towards its x axis, and the palm's near end at the flange."""
+    """The fingers along the flange's z axis, the palm towards its x axis, and the palm's near end
+    at the flange.
+    """
     turn = upright(hand)
     palm = hand.capsule_links == 0
-    ends = turn.apply(hand.capsules[palm].reshape(-1, 3))[:, 2] - np.repeat(hand.capsule_radii[palm], 2)
+    ends = turn.apply(hand.capsules[palm].reshape(-1, 3))[:, 2] - np.repeat(
+        hand.capsule_radii[palm], 2
+    )
     return Pose(np.array([0.0, 0.0, -float(ends.min())]), turn)
 
 
@@ -112,7 +136,9 @@ def build_robot(arm: Arm, hand: Hand, mount: Pose, obj: GraspObject) -> Robot:
     frame.attach_body(_hand_spec(hand).body("hand_base"), _HAND, "")
     depths |= {body.name: depths[arm.flange] for body in spec.bodies if body.name.startswith(_HAND)}
     table = spec.worldbody.add_body(name=_TABLE, mocap=True)
-    table.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(2.0, 2.0, 0.1), contype=_SCENE_BIT, conaffinity=0)
+    table.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(2.0, 2.0, 0.1), contype=_SCENE_BIT, conaffinity=0
+    )
     body = add_object(spec, obj, _OBJECT, contype=_SCENE_BIT, conaffinity=0)
     for joint in list(body.joints):
         spec.delete(joint)
@@ -151,7 +177,9 @@ def _depths(spec: mujoco.MjSpec, arm: Arm) -> dict[str, int]:
     found = {"world": 0}
     for body in spec.bodies:
         if body.name != "world":
-            found[body.name] = found[body.parent.name] + sum(joint.name in arm.joints for joint in body.joints)
+            found[body.name] = found[body.parent.name] + sum(
+                joint.name in arm.joints for joint in body.joints
+            )
     return found
 
 
@@ -159,7 +187,9 @@ _FLAT = 1e-12  # twice the area of triangles that are left out, m^2
 _BARE = 0.02  # radius of the balls that stand for the links of an arm without geometry, m
 
 
-def moved_arm(robot: Robot, q: np.ndarray, base: Pose, mount: Pose, taken: Collection[str]) -> MovedArm:
+def moved_arm(
+    robot: Robot, q: np.ndarray, base: Pose, mount: Pose, taken: Collection[str]
+) -> MovedArm:
     """Returns the arm's links along a motion.
 
     Args:
@@ -193,8 +223,11 @@ def moved_arm(robot: Robot, q: np.ndarray, base: Pose, mount: Pose, taken: Colle
         joint_limits=np.clip(np.stack([arm.lower, arm.upper], 1), -UNLIMITED, UNLIMITED),
         joint_speed=np.array(arm.speed),
         link_names=np.array([f"arm_{name}" if name in taken else name for name in names]),
-        link_parent=np.array([-1, *(index[body] for body in model.body_parentid[links[1:]].tolist())], np.int32),
-        link_position=base.rotation.apply(position.reshape(-1, 3)).reshape(position.shape) + base.position,
+        link_parent=np.array(
+            [-1, *(index[body] for body in model.body_parentid[links[1:]].tolist())], np.int32
+        ),
+        link_position=base.rotation.apply(position.reshape(-1, 3)).reshape(position.shape)
+        + base.position,
         link_quaternion=turns.as_quat(scalar_first=True).reshape(quaternion.shape),
         hand_link=np.array(index[model.body(arm.flange).id], np.int32),
         hand_position=arm.position + flange.apply(mount.position),
@@ -212,13 +245,19 @@ def _mesh_arrays(model: mujoco.MjModel, links: list[int]) -> dict[str, np.ndarra
             colour = (model.mat_rgba[material] if material >= 0 else model.geom_rgba[g])[:3]
             mesh.merge_vertices(merge_tex=True, merge_norm=True)
             mesh.apply_transform(_geom_pose(model, g))
-            found.setdefault((links.index(model.geom_bodyid[g]), tuple(colour.tolist())), []).append(mesh)
+            found.setdefault(
+                (links.index(model.geom_bodyid[g]), tuple(colour.tolist())), []
+            ).append(mesh)
     if not found:
-        found = {(i, (0.5, 0.5, 0.5)): [trimesh.creation.icosphere(1, _BARE)] for i in range(len(links))}
+        found = {
+            (i, (0.5, 0.5, 0.5)): [trimesh.creation.icosphere(1, _BARE)] for i in range(len(links))
+        }
     parts: list[Any] = [trimesh.util.concatenate(meshes) for meshes in found.values()]
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
-    faces = np.concatenate([part.faces + at for part, at in zip(parts, first, strict=False)]).astype(np.int32)
+    faces = np.concatenate(
+        [part.faces + at for part, at in zip(parts, first, strict=False)]
+    ).astype(np.int32)
     of_mesh = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts])
     a, b, c = vertices[faces].astype(float).swapaxes(0, 1)
     flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) < _FLAT

@@ -1,8 +1,10 @@
-"""Functions in a child process under limits of memory and time: for strangers' files, and for native code.
+"""Functions in a child process under limits of memory and time: for strangers' files, and for
+native code.
 
-Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources. `python -m
-congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS` is that process: FUNCTION ("module:name") is called
-with FOLDER and the options from the standard input; what it returns goes to FOLDER/answer.json.
+Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources.
+`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS` is that process:
+FUNCTION ("module:name") is called with FOLDER and the options from the standard input; what it
+returns goes to FOLDER/answer.json.
 """
 
 import importlib
@@ -53,7 +55,12 @@ def call_confined(
       ChildProcessError: it ended without an answer; the text is a reason in the past tense.
     """
     search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-    own = {"PYTHONPATH": search, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+    own = {
+        "PYTHONPATH": search,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "JAX_PLATFORMS": "cpu",
+    }
     called = f"{function.__module__}:{function.__name__}"
     command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
     given, env = json.dumps(options).encode(), {**os.environ, **own}
@@ -74,7 +81,9 @@ def call_confined(
     try:
         answer = json.loads((folder / _ANSWER).read_text())
     except (OSError, ValueError):
-        last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
+        last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [
+            f"exit code {child.returncode}"
+        ]
         raise ChildProcessError(f"failed ({last[0]})") from None
     if "error" in answer:
         raise CongraspError(answer["error"])

@@ -29,12 +29,18 @@ from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 
 _STEPS = 75
-"""Control steps of one whole episode: every repeat begins with new episodes and ends with their reset."""
+"""Control steps of one whole episode: every repeat begins with new episodes and ends with their
+reset.
+"""
 _DEFINITION = (
-    "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
-    "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
-    "steps that hold the actor's last targets. mujoco.rollout: the same steps in its own threads, whole episodes at "
-    "once, a call for each object. mujoco_warp: its kernels from the episodes' ends on, with the last targets. Ratio: "
+    "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for "
+    "native, mj_step on "
+    "the same models, start states and control targets, hence the same contacts, with as many "
+    "threads; for others, "
+    "steps that hold the actor's last targets. mujoco.rollout: the same steps in its own threads, "
+    "whole episodes at "
+    "once, a call for each object. mujoco_warp: its kernels from the episodes' ends on, with the "
+    "last targets. Ratio: "
     "the actor's control steps/s over the engine's."
 )
 
@@ -49,7 +55,9 @@ Rolled = Callable[[], np.ndarray]
 
 
 class Recorder(NativePhysics):
-    """A native engine that records its commands, so that another engine can reproduce its states."""
+    """A native engine that records its commands, so that another engine can reproduce its
+    states.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any):
         """Takes the arguments of `NativePhysics`."""
@@ -57,14 +65,20 @@ class Recorder(NativePhysics):
         self.commands: list[tuple[np.ndarray, np.ndarray]] = []
         """Targets (B, 6 + F) and tables (B,) of every control step."""
 
-    def step(self, state: Any, target: Any, table: Any, force: Any | None = None) -> tuple[NativePhysics, PhysicsState]:
+    def step(
+        self, state: Any, target: Any, table: Any, force: Any | None = None
+    ) -> tuple[NativePhysics, PhysicsState]:
         """Advances one control step, and records its commands."""
         self.commands.append((np.array(target), np.array(table)))
         return super().step(state, target, table, force)
 
 
-def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
-    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and only wait when tables move."""
+def replay(
+    physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int
+) -> None:
+    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and only wait
+    when tables move.
+    """
 
     def run(environments: np.ndarray, targets: Sequence[np.ndarray]) -> None:
         for target in targets:
@@ -81,14 +95,18 @@ def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
             list(pool.map(run, shares, itertools.repeat(targets)))
 
 
-def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> Rolled:
-    """Prepares recorded control steps as calls of `mujoco.rollout`, with threads and the loop over the steps in C.
+def rolled(
+    physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int
+) -> Rolled:
+    """Prepares recorded control steps as calls of `mujoco.rollout`, with threads and the loop over
+    the steps in C.
 
-    Each object needs a call, since the models of a call must have one size. A policy that acts in all environments
-    between two steps could therefore not use it.
+    Each object needs a call, since the models of a call must have one size. A policy that acts in
+    all environments between two steps could therefore not use it.
 
     Returns:
-      A function without arguments that makes the calls, and returns the final positions (nq,) of every environment.
+      A function without arguments that makes the calls, and returns the final positions (nq,) of
+      every environment.
     """
     given = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_EQ_ACTIVE
     given |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
@@ -106,14 +124,18 @@ def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
     controls = np.repeat(controls, substeps, 1)
     scenes = list(map(id, physics.scenes))
     groups = [np.flatnonzero(np.array(scenes) == scene) for scene in dict.fromkeys(scenes)]
-    scratch = [[mujoco.MjData(instances[rows[0]].model) for _ in range(physics.threads)] for rows in groups]
+    scratch = [
+        [mujoco.MjData(instances[rows[0]].model) for _ in range(physics.threads)] for rows in groups
+    ]
 
     def run() -> np.ndarray:
         found = np.zeros((len(instances), first.nq))
         with rollout.Rollout(nthread=physics.threads) as threads:
             for rows, data in zip(groups, scratch, strict=True):
                 models = [instances[i].model for i in rows]
-                states, _ = threads.rollout(models, data, starts[rows], controls[rows], control_spec=int(given))
+                states, _ = threads.rollout(
+                    models, data, starts[rows], controls[rows], control_spec=int(given)
+                )
                 found[rows] = states[:, -1, 1 : 1 + first.nq]  # the time is first
         return found
 
@@ -121,15 +143,28 @@ def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
 
 
 def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
-    """Prints control steps per second of actors (policy, observation, reward, reset) and of engines that only step."""
+    """Prints control steps per second of actors (policy, observation, reward, reset) and of engines
+    that only step.
+    """
     console = Console()
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
     objects = scale_objects(hand, config.task, load_pool(config.objects))
     bank = build_bank(hand, config.task, objects, 0)
     policy = untrained(config)
-    table = Table(title=f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} repeats")
-    for column in ("engine", "actor, control steps/s", "engine alone, control steps/s", "ratio of medians", "of bests"):
+    table = Table(
+        title=(
+            f"{environments} environments, {threads} thread(s), {_STEPS} control steps, {repeats} "
+            f"repeats"
+        )
+    )
+    for column in (
+        "engine",
+        "actor, control steps/s",
+        "engine alone, control steps/s",
+        "ratio of medians",
+        "of bests",
+    ):
         table.add_column(column, justify="left" if column == "engine" else "right")
     for name in names:
         if name == "native":
@@ -147,7 +182,11 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             half_precision=True,
         )
         _collect(worker, policy)
-        twin = NativePhysics(hand, config.task, objects, threads) if isinstance(physics, Recorder) else None
+        twin = (
+            NativePhysics(hand, config.task, objects, threads)
+            if isinstance(physics, Recorder)
+            else None
+        )
         bare: Callable[[], object]
         actor_seconds, bare_seconds, peer_seconds = [], [], []
         for _ in range(repeats):
@@ -164,7 +203,9 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             if name == "warp":
                 peer_seconds.append(_timed(functools.partial(physics.repeat, environments, _STEPS)))  # type: ignore[attr-defined]
             bare_seconds.append(_timed(bare))
-        table.add_row(name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds)))
+        table.add_row(
+            name, *_row(environments * _STEPS, np.array(actor_seconds), np.array(bare_seconds))
+        )
         if peer_seconds:
             peer = _row(environments * _STEPS, np.array(peer_seconds), np.array(bare_seconds))
             table.add_row(_PEERS[name], *peer)
@@ -178,7 +219,12 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
 def _row(steps: int, actor: np.ndarray, bare: np.ndarray) -> list[str]:
     """Cells of the table, from the seconds of every repeat."""
     a, b = np.median(actor), np.median(bare)
-    return [f"{steps / a:,.0f}", f"{steps / b:,.0f}", f"{b / a:.2f}", f"{bare.min() / actor.min():.2f}"]
+    return [
+        f"{steps / a:,.0f}",
+        f"{steps / b:,.0f}",
+        f"{b / a:.2f}",
+        f"{bare.min() / actor.min():.2f}",
+    ]
 
 
 def _timed(run: Callable[[], object]) -> float:

@@ -1,6 +1,8 @@
-"""Benchmarks of a training: seconds to its first update by stage, and weak scaling over learner ranks.
+"""Benchmarks of a training: seconds to its first update by stage, and weak scaling over learner
+ranks.
 
-Weak scaling is the trained steps per second of 1, 2, … ranks, each a separate process with a separate GPU.
+Weak scaling is the trained steps per second of 1, 2, … ranks, each a separate process with a
+separate GPU.
 """
 
 import collections
@@ -33,7 +35,9 @@ from congrasp.services.train.learn import until_first_update
 from congrasp.services.train.processes import Launch, Plan, engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
-"""Updates before the measurement: the first ones compile, and all environments begin with new episodes."""
+"""Updates before the measurement: the first ones compile, and all environments begin with new
+episodes.
+"""
 _LEAST_UPDATES = 3
 
 
@@ -51,17 +55,23 @@ class Stage:
     efficiency: float
     """Steps per second and rank over those of the first stage."""
     wait_seconds: float
-    """Mean time from one update to the next batch of all ranks, which waits for the rollouts of the slowest one."""
+    """Mean time from one update to the next batch of all ranks, which waits for the rollouts of the
+    slowest one.
+    """
     update_seconds: float
     """Mean time of an update with its collectives."""
     start_seconds: float
-    """Time from the start of the processes to the end of the first update: imports, compilation, connections."""
+    """Time from the start of the processes to the end of the first update: imports, compilation,
+    connections.
+    """
 
 
 class _Meter:
     """Collects a run's metrics, and stops it after `seconds` of measurement, or at the deadline."""
 
-    def __init__(self, seconds: float, deadline: float, stop: threading.Event, notify: Callable[[str], None]):
+    def __init__(
+        self, seconds: float, deadline: float, stop: threading.Event, notify: Callable[[str], None]
+    ):
         self.metrics: list[dict[str, Any]] = []
         self._seconds, self._stop, self._notify = seconds, stop, notify
         self._began = self._notified = time.monotonic()
@@ -81,7 +91,9 @@ class _Meter:
             self._stop.set()
         if now - self._notified > 10.0:
             self._notified = now
-            self._notify(f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting"))
+            self._notify(
+                f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting")
+            )
 
     def stage(self, ranks: int, first: Stage | None) -> Stage:
         """Result of the measurement; `first` is that of the first number of ranks."""
@@ -103,7 +115,13 @@ class _Meter:
 
 
 def bench_scaling(
-    config: RunConfig, ranks: Sequence[int], *, seconds: float, actors: int | None, deadline: float, out: pathlib.Path
+    config: RunConfig,
+    ranks: Sequence[int],
+    *,
+    seconds: float,
+    actors: int | None,
+    deadline: float,
+    out: pathlib.Path,
 ) -> None:
     """Measures every number of ranks in turn, prints a table, and writes JSON after each of them.
 
@@ -111,12 +129,13 @@ def bench_scaling(
       config: the run of every rank; it is trained, and deleted afterwards.
       ranks: numbers of ranks; efficiency is relative to the first.
       seconds: duration of each measurement.
-      actors: actor processes of each rank; by default none on GPUs (one runs inside each rank), otherwise one.
-      deadline: total time of one number of ranks, s.
+      actors: actor processes of each rank; by default none on GPUs (one runs inside each rank),
+      otherwise one. deadline: total time of one number of ranks, s.
       out: file for the results.
 
     Raises:
-      CongraspError: the machine has too few GPUs, a process failed permanently, or a deadline passed.
+      CongraspError: the machine has too few GPUs, a process failed permanently, or a deadline
+      passed.
     """
     if not ranks or min(ranks) < 1:
         raise CongraspError("Name numbers of ranks from 1 on.", "For example --ranks 1 2 4.")
@@ -130,9 +149,16 @@ def bench_scaling(
     for count in ranks:
         console.print(f"{count} rank(s): at most {deadline:.0f} s …")
         plan = Plan(Launch(ranks=count, metric_writers=()), actors, physics, gpus)
-        stages.append(_measure(config, plan, seconds, deadline, stages[0] if stages else None, console))
+        stages.append(
+            _measure(config, plan, seconds, deadline, stages[0] if stages else None, console)
+        )
         result = {
-            "machine": {"host": platform.node(), "cores": cores(), "jax": jax.__version__, "gpus": gpus},
+            "machine": {
+                "host": platform.node(),
+                "cores": cores(),
+                "jax": jax.__version__,
+                "gpus": gpus,
+            },
             "config": dataclasses.asdict(config),
             "actors": actors,
             "stages": [dataclasses.asdict(stage) for stage in stages],
@@ -143,7 +169,12 @@ def bench_scaling(
 
 
 def _measure(
-    config: RunConfig, plan: Plan, seconds: float, deadline: float, first: Stage | None, console: Console
+    config: RunConfig,
+    plan: Plan,
+    seconds: float,
+    deadline: float,
+    first: Stage | None,
+    console: Console,
 ) -> Stage:
     """Trains with one number of ranks until the measurement is complete."""
     ranks = plan.launch.ranks
@@ -162,13 +193,17 @@ def _measure(
         )
         if len(meter.metrics) <= _LEAST_UPDATES:
             raise TransportError(
-                f"{ranks} rank(s) made {len(meter.metrics)} update(s) to measure within {deadline:.0f} s.",
+                f"{ranks} rank(s) made {len(meter.metrics)} update(s) to measure within "
+                f"{deadline:.0f} s.",
                 f"See {run_dir}/logs, or set a longer --deadline.",
             )
     except CongraspError:
         for log in sorted((run_dir / "logs").glob("*.log")):
             console.print(
-                f"[bold]{log}[/]", *log.read_text(errors="replace").splitlines()[-15:], sep="\n", markup=False
+                f"[bold]{log}[/]",
+                *log.read_text(errors="replace").splitlines()[-15:],
+                sep="\n",
+                markup=False,
             )
         raise
     shutil.rmtree(run_dir, ignore_errors=True)
@@ -178,7 +213,12 @@ def _measure(
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
     """Prints the table of the completed stages."""
     steps = config.environments * config.rollout_steps * config.rollouts_per_update
-    table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
+    table = Table(
+        title=(
+            f"{config.environments} environments, {steps} steps an update of each rank, "
+            f"'{config.physics}'"
+        )
+    )
     for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):
         table.add_column(column, justify="right")
     for stage in stages:
@@ -198,7 +238,8 @@ _STOPPED_SECONDS = 30.0
 
 
 def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> None:
-    """Prints the stages of two starts of a training in one process, the second with the caches of the first.
+    """Prints the stages of two starts of a training in one process, the second with the caches of
+    the first.
 
     Args:
       config: configuration of the run.
@@ -210,9 +251,16 @@ def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> N
     """
     with tempfile.TemporaryDirectory() as folder:
         caches = {"XDG_CACHE_HOME": folder, "JAX_COMPILATION_CACHE_DIR": f"{folder}/jax"}
-        starts = {name: _start(config, physics, caches, deadline) for name in ("empty caches", "warm")}
+        starts = {
+            name: _start(config, physics, caches, deadline) for name in ("empty caches", "warm")
+        }
     names = list(dict.fromkeys(name for found in starts.values() for name in found))
-    table = Table(title=f"{config.name}: {config.environments} environments, {config.objects.count} objects, {physics}")
+    table = Table(
+        title=(
+            f"{config.name}: {config.environments} environments, {config.objects.count} objects, "
+            f"{physics}"
+        )
+    )
     table.add_column("seconds")
     for name in starts:
         table.add_column(name, justify="right")
@@ -221,28 +269,37 @@ def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> N
     console = Console()
     console.print(table)
     console.print(
-        "Stages of different threads overlap. Warp's kernels are in a separate cache, which is used unchanged; "
+        "Stages of different threads overlap. Warp's kernels are in a separate cache, which is "
+        "used unchanged; "
         "'congrasp warmup' fills it."
     )
 
 
-def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], deadline: float) -> dict[str, str]:
+def _start(
+    config: RunConfig, physics: PhysicsName, caches: dict[str, str], deadline: float
+) -> dict[str, str]:
     """The rows of one start, in a separate process."""
     here, there = multiprocessing.Pipe()
     before = {name: os.environ.get(name) for name in caches}
     os.environ.update(caches)
-    process = multiprocessing.get_context("spawn").Process(target=_first_update, args=(config, physics, there))
+    process = multiprocessing.get_context("spawn").Process(
+        target=_first_update, args=(config, physics, there)
+    )
     process.start()
     for name, value in before.items():
         os.environ.pop(name) if value is None else os.environ.update({name: value})
     try:
         there.close()
         if not here.poll(deadline):
-            raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Set a longer --deadline.")
+            raise CongraspError(
+                f"There was no first update in {deadline:.0f} s.", "Set a longer --deadline."
+            )
         rows: dict[str, str] = json.loads(here.recv_bytes())
         process.join(_STOPPED_SECONDS)
     except EOFError:
-        raise CongraspError("The training ended before its first update.", "See its output above.") from None
+        raise CongraspError(
+            "The training ended before its first update.", "See its output above."
+        ) from None
     finally:
         process.kill()
     return rows
@@ -262,7 +319,9 @@ def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) 
     def report() -> None:
         rows = {one.name: f"{one.ended - one.began:.2f} (at {one.began:.1f})" for one in stages()}
         rows["compiled programs"] = str(programs.total())
-        rows["compiled more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
+        rows["compiled more than once"] = ", ".join(
+            f"{name} {n}" for name, n in programs.items() if n > 1
+        )
         rows["total, from the start of the process"] = f"{since_start():.2f}"
         results.send_bytes(json.dumps(rows).encode())
 

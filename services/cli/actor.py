@@ -19,7 +19,8 @@ from congrasp.services.ops.metrics import ActorMetrics
 
 @dataclasses.dataclass(frozen=True)
 class Actor:
-    """Run one actor for a learner on this or another machine; actors may join and leave during training.
+    """Run one actor for a learner on this or another machine; actors may join and leave during
+    training.
 
     Examples:
       congrasp actor --connect tcp/127.0.0.1:7447 --run human
@@ -45,27 +46,40 @@ class Actor:
     watch: Watch = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
-    """Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on the wire."""
+    """Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on
+    the wire.
+    """
 
     def __call__(self) -> int:
         """Acts until the run ends or a signal comes."""
         from congrasp.actors.process import run_actor
         from congrasp.common.runtime.stages import imported, since_start
 
-        name, metrics = urls.name_on_wire(self.id or process_name("actor"), self.certs), ActorMetrics()
+        name, metrics = (
+            urls.name_on_wire(self.id or process_name("actor"), self.certs),
+            ActorMetrics(),
+        )
 
         def report(values: dict[str, float]) -> None:
             metrics.rollout(values)
-            log("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
+            log(
+                "info",
+                f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.",
+                values,
+            )
 
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
             ready = since_start()
             with announced(f"Waiting up to {self.patience:g} s for the learner at {self.connect}"):
-                transport = urls.connect(self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run)
+                transport = urls.connect(
+                    self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run
+                )
             with transport:
                 log("info", f"Connected to the learner at {self.connect}.")
                 imported(ready)
-                journal = Journal(self.audit, lambda text: log("error", text)) if self.audit else None
+                journal = (
+                    Journal(self.audit, lambda text: log("error", text)) if self.audit else None
+                )
                 run_actor(
                     transport,
                     run=self.run,

@@ -10,16 +10,19 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.train.presets import get_preset
 
 
-def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
-    """Measure the control steps per second of actors and of the bare engine, for each engine of the machine.
+def physics(
+    environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()
+) -> int:
+    """Measure the control steps per second of actors and of the bare engine, for each engine of the
+    machine.
 
     The bare `native` engine repeats the actor's states with nothing but `mj_step`.
 
     Args:
       environments: Number of parallel environments.
       threads: Threads of the native engine; 0 uses all cores.
-      repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
-      engines: Engines to measure; by default those that suit the machine.
+      repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio
+      of the best. engines: Engines to measure; by default those that suit the machine.
 
     Examples:
       congrasp bench physics
@@ -32,7 +35,8 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
 
 
 def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
-    """Measure the latency of a policy server in a separate process, with an untrained policy, over loopback.
+    """Measure the latency of a policy server in a separate process, with an untrained policy, over
+    loopback.
 
     The clients also use the machine; the server's processor time per answer is printed as well.
 
@@ -62,12 +66,13 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
             before = process.cpu_times()
             result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
             after = process.cpu_times()
-            result["server_cpu_ms"] = 1e3 * (sum(after[:2]) - sum(before[:2])) / repeat / states  # of user and system
+            # Of user and system
+            result["server_cpu_ms"] = 1e3 * (sum(after[:2]) - sum(before[:2])) / repeat / states
     print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 
 
-def scaling(
+def scaling(  # noqa: PLR0913
     ranks: tuple[int, ...] = (1, 2),
     seconds: float = 90.0,
     preset: str = "human",
@@ -77,10 +82,11 @@ def scaling(
     deadline: float = 600.0,
     out: pathlib.Path = pathlib.Path("scaling.json"),
 ) -> int:
-    """Measure trained steps per second of several learner ranks relative to one: weak scaling, a batch per rank.
+    """Measure trained steps per second of several learner ranks relative to one: weak scaling, a
+    batch per rank.
 
-    Starts real processes for each number of ranks in turn; starting, compiling and the first updates are not measured.
-    On GPUs every rank needs a separate one.
+    Starts real processes for each number of ranks in turn; starting, compiling and the first
+    updates are not measured. On GPUs every rank needs a separate one.
 
     Args:
       ranks: Numbers of ranks, for example 1 2 4; efficiency is against the first.
@@ -88,7 +94,8 @@ def scaling(
       preset: Named configuration of the run.
       environments: Environments in one actor; 0: those of the preset.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      actors: Actor processes of each rank; by default none on GPUs, where each rank runs one in its process, otherwise
+      actors: Actor processes of each rank; by default none on GPUs, where each rank runs one in its
+      process, otherwise
         one.
       deadline: Deadline of one number of ranks, s.
       out: File for the results as JSON.
@@ -111,10 +118,11 @@ def startup(
     physics: PhysicsName = "auto",
     deadline: float = 600.0,
 ) -> int:
-    """Measure the seconds from the start of a training to its first update, by stage, with empty and with full caches.
+    """Measure the seconds from the start of a training to its first update, by stage, with empty
+    and with full caches.
 
-    Learner and actor run in one process, as on a GPU. Warp's kernel cache is used unchanged. The machine's other caches
-    are neither used nor changed.
+    Learner and actor run in one process, as on a GPU. Warp's kernel cache is used unchanged. The
+    machine's other caches are neither used nor changed.
 
     Args:
       preset: Named configuration of the run.

@@ -1,4 +1,6 @@
-"""Certificates for mutual TLS: a private authority, and a certificate for each process that joins a run."""
+"""Certificates for mutual TLS: a private authority, and a certificate for each process that joins a
+run.
+"""
 
 import pathlib
 from typing import Annotated, Literal
@@ -14,18 +16,21 @@ Role = Literal["learner", "actor", "server", "client", "observer"]
 
 
 def init(
-    folder: Folder = pathlib.Path("certs"), run: str = "quickstart", host: tuple[str, ...] = (), force: bool = False
+    folder: Folder = pathlib.Path("certs"),
+    run: str = "quickstart",
+    host: tuple[str, ...] = (),
+    force: bool = False,
 ) -> int:
     """Create a private authority, and number 0 of every role: all that a run on one machine needs.
 
-    A certificate is valid for the run that it names. The authority's ca.key signs certificates: keep it unreadable for
-    others. Commands on this machine take --certs FOLDER.
+    A certificate is valid for the run that it names. The authority's ca.key signs certificates:
+    keep it unreadable for others. Commands on this machine take --certs FOLDER.
 
     Args:
       folder: Folder for the authority and the certificates.
       run: Name of the run.
-      host: Names and addresses of this machine, under which others will connect to its learner or policy server.
-      force: Replace an existing authority; its certificates become invalid.
+      host: Names and addresses of this machine, under which others will connect to its learner or
+      policy server. force: Replace an existing authority; its certificates become invalid.
 
     Examples:
       congrasp certs init certs --run human --host 10.0.0.5
@@ -49,13 +54,16 @@ def issue(
     days: float = 365.0,
     force: bool = False,
 ) -> int:
-    """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take --certs FOLDER.
+    """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take
+    --certs FOLDER.
 
-    Learners accept new certificates without changes. Several actors may share one, if they trust one another.
+    Learners accept new certificates without changes. Several actors may share one, if they trust
+    one another.
 
     Args:
       folder: Folder of the authority.
-      role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or observer (status,
+      role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or
+      observer (status,
         recorder).
       run: Name of the run; by default that of the authority.
       number: Distinguishes the certificates of a role; by default the lowest free one.
@@ -74,11 +82,15 @@ def issue(
     return 0
 
 
-def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None) -> int:
-    """Revoke a certificate whose key is lost or stolen: learners and servers no longer admit its owner.
+def revoke(
+    folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None
+) -> int:
+    """Revoke a certificate whose key is lost or stolen: learners and servers no longer admit its
+    owner.
 
-    Those on this machine notice within seconds, and all their peers reconnect. If it belongs to a learner or a server,
-    its peers disconnect. Elsewhere, copy the file 'revoked' into the folders of the certificates.
+    Those on this machine notice within seconds, and all their peers reconnect. If it belongs to a
+    learner or a server, its peers disconnect. Elsewhere, copy the file 'revoked' into the folders
+    of the certificates.
 
     Args:
       folder: Folder of the authority.
@@ -97,7 +109,8 @@ def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, r
 
 
 def show(folder: Folder = pathlib.Path("certs")) -> int:
-    """Show the certificates of a folder, when they expire and which are revoked; the exit code is 1 if one has expired.
+    """Show the certificates of a folder, when they expire and which are revoked; the exit code is 1
+    if one has expired.
 
     Args:
       folder: Folder of an authority or of one certificate.
@@ -113,8 +126,12 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
     found = certificates(folder)
     for one in found:
         style = "red" if one.days <= 0 else "yellow" if one.days < 30 else ""
-        left = "revoked" if one.name in revoked else f"{one.days:.0f}" if one.days > 0 else "expired"
-        table.add_row(one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style)
+        left = (
+            "revoked" if one.name in revoked else f"{one.days:.0f}" if one.days > 0 else "expired"
+        )
+        table.add_row(
+            one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style
+        )
     Console().print(table)
     return int(any(one.days <= 0 for one in found))
 

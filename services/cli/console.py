@@ -1,4 +1,6 @@
-"""Console output of commands: tables on standard output, progress bars and errors on standard error."""
+"""Console output of commands: tables on standard output, progress bars and errors on standard
+error.
+"""
 
 import contextlib
 import functools
@@ -9,7 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError, printable
@@ -29,7 +38,9 @@ def in_range(least: float, most: float = math.inf, unit: str = "", **options: fl
 
 
 def say(*lines: object) -> None:
-    """Prints lines; what a terminal would obey is written as escapes, since names in them come from files."""
+    """Prints lines; what a terminal would obey is written as escapes, since names in them come from
+    files.
+    """
     for line in lines:
         print(printable(str(line)))
 
@@ -77,15 +88,23 @@ def bars() -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        told = contextlib.nullcontext() if console.is_terminal else announced(functools.partial(_current, progress))
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        told = (
+            contextlib.nullcontext()
+            if console.is_terminal
+            else announced(functools.partial(_current, progress))
+        )
         with told:
             yield progress
 
 
 def _current(progress: Progress) -> str:
     """The newest unfinished task and its counts."""
-    tasks = [task for task in progress.tasks if task.visible and not task.finished] or progress.tasks
+    tasks = [
+        task for task in progress.tasks if task.visible and not task.finished
+    ] or progress.tasks
     if not tasks:
         return "Starting"
     task = tasks[-1]

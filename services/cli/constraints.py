@@ -1,4 +1,6 @@
-"""Constraint sets of objects: headings, reference poses and trajectories, generated as for training, or captured."""
+"""Constraint sets of objects: headings, reference poses and trajectories, generated as for
+training, or captured.
+"""
 
 import dataclasses
 import importlib
@@ -15,7 +17,15 @@ from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.io.inputs import distinct_names
 from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.captures import IMPORTERS
-from congrasp.services.cli.console import bars, in_range, save_drawing, say, show_facts, show_table, tracked
+from congrasp.services.cli.console import (
+    bars,
+    in_range,
+    save_drawing,
+    say,
+    show_facts,
+    show_table,
+    tracked,
+)
 
 if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
@@ -31,9 +41,9 @@ REPORT = "import.json"
 class Generate:
     """Generate the constraint sets of objects, one self-describing file each.
 
-    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and wrist
-    trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them are for
-    training, and the others are held out.
+    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20
+    reference poses, and wrist trajectories that end at them, from 15 to 25 cm away, replayed
+    through the wrist's controller. 80 % of them are for training, and the others are held out.
 
     Examples:
       congrasp constraints generate mug:7 box:0
@@ -41,20 +51,26 @@ class Generate:
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7."""
+    """Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such
+    as mug:7.
+    """
     count: int = 0
     """Number of additional procedural objects."""
     families: tuple[str, ...] = ()
-    """Their families, in turn, or groups of them: basic (if none is named), household, all, scans."""
+    """Their families, in turn, or groups of them: basic (if none is named), household, all,
+    scans.
+    """
     first_seed: int = 0
     """Seed of the first of them; the others follow."""
     hand: str = "human"
     """Name of the hand, or its file."""
     references: Literal["closed", "policy"] = "closed"
-    """closed: poses that close the hand around the object; policy: final states of a policy's grasps under headings, as
-    in the paper."""
+    """closed: poses that close the hand around the object; policy: final states of a policy's
+    grasps under headings, as in the paper."""
     policy: pathlib.Path | None = None
-    """Policy file for its references; by default the hand's reference policy, which was trained without any."""
+    """Policy file for its references; by default the hand's reference policy, which was trained
+    without any.
+    """
     folder: str = "objects"
     """Folder of objects."""
     out: pathlib.Path = pathlib.Path("constraints")
@@ -70,7 +86,9 @@ class Generate:
         from congrasp.services.assets.objects.named import located, objects_of
 
         if not self.objects and self.count < 1:
-            raise CongraspError("There is no object for which to generate constraints.", "Pass objects, or --count.")
+            raise CongraspError(
+                "There is no object for which to generate constraints.", "Pass objects, or --count."
+            )
         hand = get_hand(self.hand)
         with tracked() as track:
             track("Preparing objects", None)
@@ -82,19 +100,32 @@ class Generate:
                 if obj.name != name:
                     raise CongraspError(
                         f"Several of the objects are called '{obj.name}'.",
-                        "Name each once; 'congrasp objects import A B --out DIR' gives different ones different names.",
+                        "Name each once; 'congrasp objects import A B --out DIR' gives different "
+                        "ones different names.",
                     )
-            bank = _references(hand, self.policy, found, self.seed, track) if self.references == "policy" else None
+            bank = (
+                _references(hand, self.policy, found, self.seed, track)
+                if self.references == "policy"
+                else None
+            )
             track("Generating constraints", None)
             for constraints in make_sets(hand, TaskConfig(hand=hand.name), found, self.seed, bank):
                 save(constraints, self.out)
-        what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
+        what = (
+            "The constraint set of 1 object is"
+            if len(found) == 1
+            else f"The sets of {len(found)} objects are"
+        )
         print(f"{what} in {self.out}.")
         return 0
 
 
 def _references(
-    hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
+    hand: "Hand",
+    policy: pathlib.Path | None,
+    objects: "list[GraspObject]",
+    seed: int,
+    track: "Track",
 ) -> Any:
     """Returns constraints with references from a policy's grasps; prints their number."""
     from congrasp.common.policy import bundle as bundles
@@ -110,43 +141,51 @@ def _references(
     made = Experiment(bundle, objects, seed=seed, track=track).references_of(bundle)
     whole = made.grasps[:, 0]
     print(
-        f"Grasps per object: {whole.min()} to {whole.max()}; where there is none, the hand is closed around the object."
+        f"Grasps per object: {whole.min()} to {whole.max()}; where there is none, the hand is "
+        f"closed around the object."
     )
     return made.bank
 
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Make constraint sets of captured grasps by the paper's rules, and report what was dropped and why.
+    """Make constraint sets of captured grasps by the paper's rules, and report what was dropped and
+    why.
 
-    From each sequence come a reference pose (the `human` hand's finger angles in the grasping frame) and a wrist
-    trajectory to it of 15 waypoints, and, where the object's parts are labelled, those that may be touched. Only right
-    hands are used. Objects are imported from the data set's meshes.
+    From each sequence come a reference pose (the `human` hand's finger angles in the grasping
+    frame) and a wrist trajectory to it of 15 waypoints, and, where the object's parts are labelled,
+    those that may be touched. Only right hands are used. Objects are imported from the data set's
+    meshes.
 
     Examples:
       congrasp constraints import grab GRAB/
       congrasp constraints import myohand data/ --meshes object_sim/
     """
 
-    format: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")]
+    format: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")
+    ]
     """Data set of the files."""
     path: Annotated[pathlib.Path, tyro.conf.Positional]
     """The data set's folder, or one of its files."""
     meshes: tuple[pathlib.Path, ...] = ()
     """Folders with the objects' meshes, if they are not in the data set."""
     mano: pathlib.Path | None = None
-    """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it."""
+    """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact
+    with it.
+    """
     hand: str = "human"
-    """Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist by its grasp axes,
-    with the captured headings and affordance, and closes its fingers around the object at the end."""
+    """Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist
+    by its grasp axes, with the captured headings and affordance, and closes its fingers around the
+    object at the end."""
     headings: Literal["sampled", "demonstrated"] = "sampled"
     """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Literal["auto", "parts", "contacts", "none"] = "auto"
-    """Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they are
-    labelled."""
+    """Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where
+    they are labelled."""
     beyond: float = 0.1
-    """Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not used for other
-    hands."""
+    """Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not
+    used for other hands."""
     out: pathlib.Path = pathlib.Path("constraints")
     """Folder for the sets, and for import.json, which holds the outcome of each sequence."""
     objects: pathlib.Path = pathlib.Path("objects")
@@ -161,28 +200,45 @@ class Import:
         from congrasp.services.assets.captures.sequence import Meshes
 
         if self.format not in IMPORTERS:
-            raise CongraspError(f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
+            raise CongraspError(
+                f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}."
+            )
         if not self.path.exists():
-            raise CongraspError(f"There is no file or folder {self.path}.", "Pass the data set's folder.")
+            raise CongraspError(
+                f"There is no file or folder {self.path}.", "Pass the data set's folder."
+            )
         in_range(0.0, unit="radians", beyond=self.beyond)
         check_output("--objects", self.objects, is_folder=True)
-        hand, options = get_hand(self.hand), Options(self.headings, self.affordance, self.beyond, seed=self.seed)
+        hand, options = (
+            get_hand(self.hand),
+            Options(self.headings, self.affordance, self.beyond, seed=self.seed),
+        )
         importer = importlib.import_module(IMPORTERS[self.format])
         with bars() as progress:
             task = progress.add_task("Reading", total=None)
             sequences = importer.read(self.path, Meshes(self.meshes), own_mano_model(self.mano))
             objects, sets, report = import_sets(
-                sequences, hand, options, self.format, lambda doing: progress.update(task, description=doing, advance=1)
+                sequences,
+                hand,
+                options,
+                self.format,
+                lambda doing: progress.update(task, description=doing, advance=1),
             )
         if not report.kept and not report.dropped:
             raise CongraspError(
-                f"{self.path} holds no sequence of {self.format}.", f"Pass the folder with {importer.HOLDS}."
+                f"{self.path} holds no sequence of {self.format}.",
+                f"Pass the folder with {importer.HOLDS}.",
             )
         catalogue = Catalogue(self.objects)
         for obj, made in zip(objects, sets, strict=True):
             catalogue.add(obj)
             save(made, self.out)
-        about = {"format": self.format, "path": str(self.path), "hand": hand.name, **dataclasses.asdict(options)}
+        about = {
+            "format": self.format,
+            "path": str(self.path),
+            "hand": hand.name,
+            **dataclasses.asdict(options),
+        }
         rows = {**about, "kept": report.kept, "dropped": report.dropped}
         write_atomically(self.out / REPORT, json.dumps(rows, indent=2).encode())
         _print_report(report, hand.name, self.out, self.objects)
@@ -194,40 +250,62 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
     kept, dropped = report.kept, report.dropped
     say(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
     if dropped:
-        show_table(("dropped", "why", "for example"), [(str(n), rule, example) for rule, n, example in report.rules()])
+        show_table(
+            ("dropped", "why", "for example"),
+            [(str(n), rule, example) for rule, n, example in report.rules()],
+        )
     if kept and hand != "human":
         say(
-            f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, affordance and wrist "
+            f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, "
+            f"affordance and wrist "
             "trajectory were kept; its fingers close around the object where the trajectory ends."
         )
     elif kept:
         worst = max(kept, key=lambda row: row["residual_rad"])
         mean = sum(row["residual_rad"] for row in kept) / len(kept)
         say(
-            f"Finger angles differ by {mean:.3f} rad per bone on average, at most {worst['residual_rad']:.3f} rad "
+            f"Finger angles differ by {mean:.3f} rad per bone on average, at most "
+            f"{worst['residual_rad']:.3f} rad "
             f"({worst['sequence']})."
         )
     if kept:
         if apart := [row for row in kept if row["moved_apart_rad"]]:
-            deep, moved = (max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad"))
+            deep, moved = (
+                max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad")
+            )
             mean = sum(row["moved_apart_rad"] for row in apart) / len(apart)
             say(
                 f"Fingers of {len(apart)} overlapped, by up to {1e3 * deep['overlap_m']:.1f} mm "
-                f"({deep['sequence']}). They were separated: their farthest joint by {mean:.2f} rad on average, "
+                f"({deep['sequence']}). They were separated: their farthest joint by {mean:.2f} "
+                f"rad on average, "
                 f"at most {moved['moved_apart_rad']:.2f} rad ({moved['sequence']})."
             )
         if later := [row["frames_after_touch"] for row in kept if row["frames_after_touch"]]:
             say(
-                f"In {len(later)} of {len(kept)}, thumb and fingers oppose only after the first touch; the "
+                f"In {len(later)} of {len(kept)}, thumb and fingers oppose only after the first "
+                f"touch; the "
                 f"reference is taken then, {sum(later) / len(later):.0f} frames later on average."
             )
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
-        say(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
-        for below, why in ((True, "from below, which no episode does"), (False, "too near to the table")):
-            left = [row["sequence"] for row in kept if not row["clear_of_table"] and row["from_below"] == below]
+        say(
+            f"The table leaves room for {above} of {len(kept)} in some resting pose of their "
+            f"objects."
+        )
+        for below, why in (
+            (True, "from below, which no episode does"),
+            (False, "too near to the table"),
+        ):
+            left = [
+                row["sequence"]
+                for row in kept
+                if not row["clear_of_table"] and row["from_below"] == below
+            ]
             if left:
-                say(f"No episode is drawn from {len(left)}, whose hand comes {why}: {', '.join(left)}.")
+                say(
+                    f"No episode is drawn from {len(left)}, whose hand comes {why}: "
+                    f"{', '.join(left)}."
+                )
         training = sum(row["split"] == "training" for row in kept)
         say(f"{training} sequences are for training, {len(kept) - training} held out.")
         say(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
@@ -235,7 +313,10 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
 
 
 def show(
-    file: Annotated[pathlib.Path, tyro.conf.Positional], png: pathlib.Path | None = None, rest: int = 0, seed: int = 0
+    file: Annotated[pathlib.Path, tyro.conf.Positional],
+    png: pathlib.Path | None = None,
+    rest: int = 0,
+    seed: int = 0,
 ) -> int:
     """Print the content of a constraint set, and draw some of it.
 

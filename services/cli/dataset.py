@@ -17,10 +17,12 @@ Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", 
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and rates.
+    """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and
+    rates.
 
-    Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm, pushed. A second run
-    of the same command makes the missing shards. The same policy, objects, seed, engine and batch give the same shards.
+    Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm,
+    pushed. A second run of the same command makes the missing shards. The same policy, objects,
+    seed, engine and batch give the same shards.
 
     Examples:
       congrasp dataset meshes/ --out grasps --per-object 100
@@ -28,20 +30,22 @@ class Dataset:
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the generator as
-    FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
+    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of
+    the generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
     out: pathlib.Path = pathlib.Path("dataset")
     """Folder of the dataset."""
     per_object: int = 100
-    """Episodes of each object, evenly over the constraints; those that an object does not allow are left out."""
+    """Episodes of each object, evenly over the constraints; those that an object does not allow are
+    left out.
+    """
     constraints: tuple[str, ...] = ()
-    """Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory. By default every
-    constraint of the policy, and the paper's compositions."""
+    """Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory.
+    By default every constraint of the policy, and the paper's compositions."""
     keep: tuple[Verdict, ...] = ("held",)
     """Outcomes that an episode needs to be written; all writes every episode."""
     part: str = "1/1"
-    """K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their shards together, and
-    run the command once more for the card."""
+    """K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their
+    shards together, and run the command once more for the card."""
     shard: int = 0
     """Largest number of objects in a shard; 0 chooses by --per-object."""
     policy: pathlib.Path | None = None
@@ -82,13 +86,18 @@ class Dataset:
         found, errors = find_objects(self.objects, self.folder)
         if errors or not found:
             raise CongraspError(
-                errors[0].error if errors else "No objects were named.", "Name meshes, folders or mug:0-99."
+                errors[0].error if errors else "No objects were named.",
+                "Name meshes, folders or mug:0-99.",
             )
         file = policy_file(self.policy, self.hand)
         bundle, engine = bundles.load(file), resolve_physics(self.physics)
         in_range(0, most_objects(engine), "objects", shard=self.shard)
-        asked = tuple(dict.fromkeys(self.constraints)) or tuple(known_rows(("single", "composed"), bundle.task))
-        require_known([name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task)
+        asked = tuple(dict.fromkeys(self.constraints)) or tuple(
+            known_rows(("single", "composed"), bundle.task)
+        )
+        require_known(
+            [name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task
+        )
         recipe = Recipe(
             experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),
             policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
@@ -107,9 +116,14 @@ class Dataset:
             total = min(len(found), pools.size * len(wanted)) * self.per_object
             make(recipe, shards, pools, wanted, track("Episodes", total))
         card = write_card(shards, recipe.about, {"licence": self.licence, **provenance()})
-        episodes, kept = (sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept"))
+        episodes, kept = (
+            sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept")
+        )
         made = card["shards"]["finished"]
-        print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in {self.out}.")
+        print(
+            f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in "
+            f"{self.out}."
+        )
         return 0
 
 

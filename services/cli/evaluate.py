@@ -32,11 +32,12 @@ _PICTURED = 4
 class Evaluate:
     """Evaluate policies by the paper's protocol, with the paper's figures for comparison.
 
-    An episode has as many control steps with the table as the policy was trained with, and 2 s without it. Success is
-    counted after the paper's 25 steps without the table, and again after the 2 s (held). Rates come with 95 % intervals
-    whose clusters are objects (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and
-    forces are those of successful episodes in the paper's window of 25 steps. The policy acts with its mean. Every
-    object has the same number of episodes in a row, independent of other requested rows. Reference poses and
+    An episode has as many control steps with the table as the policy was trained with, and 2 s
+    without it. Success is counted after the paper's 25 steps without the table, and again after the
+    2 s (held). Rates come with 95 % intervals whose clusters are objects (captured sequences); 'of
+    all objects' counts uncovered objects as failures. Errors and forces are those of successful
+    episodes in the paper's window of 25 steps. The policy acts with its mean. Every object has the
+    same number of episodes in a row, independent of other requested rows. Reference poses and
     trajectories are grasps of a reference policy trained without any, at most 20 of each object.
 
     Examples:
@@ -45,64 +46,75 @@ class Evaluate:
     """
 
     policy: tuple[str, ...] = ()
-    """Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a pretrained
-    one."""
+    """Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by
+    default a pretrained one."""
     table: tuple[Table, ...] = ("single",)
-    """single: one constraint a row; composed: two; cross: the rows of the paper's cross-dataset table; hands: single
-    constraints for all hands with a pretrained policy, or those of --policy; ablation: the full system and variants
-    without one of its parts, if --policy has policies of them; objects: the heading alone on any number of objects, by
-    size, mass and family; noise: poses and trajectories with errors like captured ones; sensing: the heading alone with
-    a tracker's object poses, by their noise, delay, rate and losses, by friction, by errors of gains and by late
-    targets, a student and the pretrained policy; payload: the heading alone by the objects' mass, from 0.05 to 2 kg;
-    peers: the heading alone at the masses and frictions of RobustDexGrasp and of Isaac Lab's dexsuite; all: every table
-    of one policy. Several may be named."""
+    """single: one constraint a row; composed: two; cross: the rows of the paper's cross-dataset
+    table; hands: single constraints for all hands with a pretrained policy, or those of --policy;
+    ablation: the full system and variants without one of its parts, if --policy has policies of
+    them; objects: the heading alone on any number of objects, by size, mass and family; noise:
+    poses and trajectories with errors like captured ones; sensing: the heading alone with a
+    tracker's object poses, by their noise, delay, rate and losses, by friction, by errors of gains
+    and by late targets, a student and the pretrained policy; payload: the heading alone by the
+    objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of
+    RobustDexGrasp and of Isaac Lab's dexsuite; all: every table of one policy. Several may be
+    named."""
     exam: pools.Exam = "figures"
-    """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for published figures;
-    development has seeds from 1,000,000. Training uses neither."""
+    """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for
+    published figures; development has seeds from 1,000,000. Training uses neither."""
     objects: pathlib.Path | None = None
     """Objects to grasp instead: a folder accepted or created by 'congrasp objects import'."""
     constraints: pathlib.Path | None = None
-    """Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its references are
-    used instead of the reference policy's. Objects without a set are left out."""
+    """Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import';
+    its references are used instead of the reference policy's. Objects without a set are left
+    out."""
     split: Split = "all"
-    """Split of these sets: all constraints, the 80 % for training, or the held-out ones. Objects without a heading in
-    the split are left out, and rows of poses and trajectories cover the objects that have one in the split."""
+    """Split of these sets: all constraints, the 80 % for training, or the held-out ones. Objects
+    without a heading in the split are left out, and rows of poses and trajectories cover the
+    objects that have one in the split."""
     episodes: int = 1000
     """Episodes of each row; for the table 'objects', the total."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
     pool: int = 0
-    """Number of procedural objects; 0 uses one of each family, and for the table 'objects' one per episode, at most
-    50,000."""
+    """Number of procedural objects; 0 uses one of each family, and for the table 'objects' one per
+    episode, at most 50,000."""
     batch: int = 0
     """Number of parallel worlds; 0 uses the engine's default."""
     seed: int = 0
     """Seed of constraints and episodes."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
-    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts, unless it also draws
-    --pictures."""
+    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts,
+    unless it also draws --pictures."""
     pictures: pathlib.Path | None = None
     """Also draw failures, with their causes, and successes of every constraint into this folder."""
     hand: str = "human"
     """Hand of the pretrained policy."""
     method: str | None = None
-    """ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center, no-feedforward,
-    two-phase, single-stage, student or camera. A policy of another method is refused; default: that of the policy."""
+    """ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
+    no-feedforward, two-phase, single-stage, student or camera. A policy of another method is
+    refused; default: that of the policy."""
     by: Literal["object"] | None = None
     """object: also print the rates of each object; --json always has them."""
     friction: float = 1.0
-    """Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL) simulates 3."""
+    """Sliding friction between hand and object. The published code of the paper's predecessor
+    (GraspXL) simulates 3.
+    """
 
-    def __call__(self) -> int:
+    def __call__(self) -> int:  # noqa: C901
         """Evaluates, and prints and writes the results."""
         in_range(1, episodes=self.episodes)
         in_range(0, pool=self.pool, batch=self.batch)
         in_range(0.05, 10.0, friction=self.friction)
-        lineup = line_up(self.table, read_entrants(self.policy, self.method), self.hand, self.method)
+        lineup = line_up(
+            self.table, read_entrants(self.policy, self.method), self.hand, self.method
+        )
         if self.pictures is not None and {"noise", "all"} & set(self.table):
             need_package("--pictures", "matplotlib")
         if self.constraints is not None and not self.objects:
-            raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
+            raise CongraspError(
+                "--constraints needs the sets' objects.", "Pass their folder with --objects."
+            )
         engine = resolve_physics(self.physics)
         kept = self.json and self.json.with_name(f"{self.json.name}.parts")
         divided = None
@@ -121,7 +133,11 @@ class Evaluate:
                 else:
                     given = pools.exam_pool(self.exam, self.pool)
             experiment = Experiment(
-                lineup.entrants[0][0].policy, given, episodes=self.episodes, track=track, **self._settings(engine)
+                lineup.entrants[0][0].policy,
+                given,
+                episodes=self.episodes,
+                track=track,
+                **self._settings(engine),
             )
             if self.constraints is not None:
                 sets = tables.captured(self.constraints, self.split, given)
@@ -134,7 +150,11 @@ class Evaluate:
             for one, wanted in lineup.entrants:
                 own = dataclasses.replace(experiment, policy=one.policy)
                 folder = kept and kept / f"{one.hand}-{one.method}"
-                results.append(tables.evaluate_tables(own, wanted, divided, folder, keep=self.pictures is not None))
+                results.append(
+                    tables.evaluate_tables(
+                        own, wanted, divided, folder, keep=self.pictures is not None
+                    )
+                )
         self._show(results, lineup, engine)
         if without:
             words = f"objects without a constraint set, or a heading in it ({self.split})"
@@ -144,19 +164,39 @@ class Evaluate:
             shutil.rmtree(kept, ignore_errors=True)
         if self.pictures is not None:
             for (one, _), found in zip(lineup.entrants, results, strict=True):
-                _draw(found, self.pictures if len(results) == 1 else self.pictures / f"{one.hand}-{one.method}")
+                _draw(
+                    found,
+                    self.pictures
+                    if len(results) == 1
+                    else self.pictures / f"{one.hand}-{one.method}",
+                )
         return 0
 
     def _settings(self, engine: str) -> dict[str, Any]:
         """Settings of all episodes."""
-        return {"physics": engine, "batch": self.batch, "seed": self.seed, "friction": self.friction}
+        return {
+            "physics": engine,
+            "batch": self.batch,
+            "seed": self.seed,
+            "friction": self.friction,
+        }
 
     def _show(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
-        """Prints the tables, the effect of the rules for headings, the references' source, and skipped rows."""
-        console, rows = Console(highlight=False, width=None if sys.stdout.isatty() else 160), _rows(results)
-        where = f"{lineup.objects(self.objects, self.exam)}, {engine_title(engine)}, friction {self.friction:g}"
+        """Prints the tables, the effect of the rules for headings, the references' source, and
+        skipped rows.
+        """
+        console, rows = (
+            Console(highlight=False, width=None if sys.stdout.isatty() else 160),
+            _rows(results),
+        )
+        where = (
+            f"{lineup.objects(self.objects, self.exam)}, {engine_title(engine)}, friction "
+            f"{self.friction:g}"
+        )
         what = f"{lineup.title}, on {where}"
-        for shown in tables_of(rows, what, lineup.missing) + ([object_table(rows)] if self.by == "object" else []):
+        for shown in tables_of(rows, what, lineup.missing) + (
+            [object_table(rows)] if self.by == "object" else []
+        ):
             console.print(shown.terminal())
         for (one, _), found in zip(lineup.entrants, results, strict=True):
             if found.heading_rules:
@@ -206,7 +246,9 @@ def _draw(found: tables.Found, pictures: pathlib.Path) -> None:
         draw_noise([result.row for result in noisy], pictures / "noise.png", title)
         save_noise_examples(noisy, pictures / "noise_examples.png")
         print(f"Curves and examples of noisy references are drawn in {pictures}.")
-    for name, sheet, _ in failure_sheets(found.experiment, found.of(Variation), _PICTURED, _PICTURED):
+    for name, sheet, _ in failure_sheets(
+        found.experiment, found.of(Variation), _PICTURED, _PICTURED
+    ):
         save_png(pictures / f"{name}.png", sheet)
         print(f"Episodes of '{name}' are drawn in {pictures}.")
 

@@ -18,8 +18,9 @@ def policy(
 ) -> int:
     """Write a policy as ONNX or StableHLO.
 
-    Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
-    hand's MuJoCo model. docs/policy-export.md and examples/onnx_grasp.py show its use.
+    Normalisation is inside; the file also holds the hand, the meaning and order of every input and
+    output, and the hand's MuJoCo model. docs/policy-export.md and examples/onnx_grasp.py show its
+    use.
 
     Args:
       policy: The policy file (.safetensors), or 'allegro-student'; the pretrained one otherwise.
@@ -45,7 +46,7 @@ def policy(
     return 0
 
 
-def motion(
+def motion(  # noqa: PLR0913
     paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
     to: Literal["glb", "usd", "bvh", "ros2", "lerobot"] = "glb",
     out: pathlib.Path | None = None,
@@ -57,14 +58,15 @@ def motion(
 ) -> int:
     """Write a grasp motion for another program.
 
-    glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a bag with joint
-    trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md describes
-    each.
+    glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a
+    bag with joint trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for
+    each motion. docs/exports.md describes each.
 
     Args:
-      paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
-      to: The format.
-      out: The file or folder to write; by default one named after the object, such as mug.glb, in the working
+      paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot
+      takes several. to: The format.
+      out: The file or folder to write; by default one named after the object, such as mug.glb, in
+      the working
         directory.
       index: Index of the recorded episode, from 0; -1 is the last.
       success: Count only episodes that succeeded.
@@ -76,10 +78,19 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.services.export.motion_file import FORMATS, at_rate, default_name, export_motions, pick_motion
+    from congrasp.services.export.motion_file import (
+        FORMATS,
+        at_rate,
+        default_name,
+        export_motions,
+        pick_motion,
+    )
 
     if not paths:
-        raise CongraspError("No motion was given.", "Pass a .npz of 'congrasp grasp', a recording or a run's folder.")
+        raise CongraspError(
+            "No motion was given.",
+            "Pass a .npz of 'congrasp grasp', a recording or a run's folder.",
+        )
     if out and not out.exists():
         check_output("--out", out, is_folder=not FORMATS[to])
     motions = [pick_motion(path, index, success=success) for path in paths]
@@ -95,7 +106,8 @@ def layout(
     out: pathlib.Path = pathlib.Path("congrasp-layout.json"),
     force: bool = False,
 ) -> int:
-    """Write a layout for Foxglove: the actors' episodes in 3-D, learning curves, rewards, contacts and events.
+    """Write a layout for Foxglove: the actors' episodes in 3-D, learning curves, rewards, contacts
+    and events.
 
     Args:
       path: The run's folder, or an MCAP file, for which the layout is made.

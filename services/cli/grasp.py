@@ -38,12 +38,13 @@ Constraints: Any = dataclasses.make_dataclass("Constraints", _OPTIONS, frozen=Tr
 class Grasp:
     """Make grasp motions for custom objects.
 
-    Every object gets a folder in --out: grasp.npz (self-describing arrays), grasp.mcap (Foxglove, Rerun), grasp.png,
-    portrait.png, object.png (before and after its import, with a hand at true scale) and result.json.
+    Every object gets a folder in --out: grasp.npz (self-describing arrays), grasp.mcap (Foxglove,
+    Rerun), grasp.png, portrait.png, object.png (before and after its import, with a hand at true
+    scale) and result.json.
 
-    Several attempts are simulated in parallel, and the best is kept: first by a hold of two seconds without the table
-    (or after the lift), then by small errors, a still object and low forces. Repeat the command to resume an
-    interrupted one.
+    Several attempts are simulated in parallel, and the best is kept: first by a hold of two seconds
+    without the table (or after the lift), then by small errors, a still object and low forces.
+    Repeat the command to resume an interrupted one.
 
     Examples:
       congrasp grasp examples/mug.obj --video
@@ -52,8 +53,8 @@ class Grasp:
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or names in
-    --folder."""
+    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator
+    (mug:7), or names in --folder."""
     out: pathlib.Path = pathlib.Path("grasps")
     """Folder for the results."""
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints()  # noqa: RUF009
@@ -67,8 +68,8 @@ class Grasp:
     overlays: bool = False
     """Draw constraints and contacts into the video; grasp.png always shows them."""
     camera: str = ""
-    """Viewpoint of pictures and video, in degrees around the table and above it: --camera "120 25"; by default the one
-    that shows fingers, contacts and object best."""
+    """Viewpoint of pictures and video, in degrees around the table and above it: --camera "120 25";
+    by default the one that shows fingers, contacts and object best."""
     pictures: bool = True
     """Write pictures."""
     policy: pathlib.Path | None = None
@@ -80,11 +81,17 @@ class Grasp:
     seed: int = 0
     """Seed of the attempts."""
     approach: float = 0.0
-    """Seconds in which the hand first comes from the side of the table; longer where an arm needs it (1 m/s)."""
+    """Seconds in which the hand first comes from the side of the table; longer where an arm needs
+    it (1 m/s).
+    """
     lift: float = 0.0
-    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the table."""
+    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the
+    table.
+    """
     rest: str = ""
-    """Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows them)."""
+    """Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows
+    them).
+    """
     folder: str = "objects"
     """Folder of objects, which can be named in place of files."""
     again: bool = False
@@ -103,7 +110,9 @@ class Grasp:
         from congrasp.services.viz.views import view_of
 
         if not self.objects:
-            raise CongraspError("There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj")
+            raise CongraspError(
+                "There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj"
+            )
         in_range(1, _MOST_ATTEMPTS, "side by side", attempts=self.attempts)
         in_range(0.0, 10.0, "seconds", approach=self.approach)
         in_range(0.0, 0.5, "metres", lift=self.lift)
@@ -129,7 +138,12 @@ class Grasp:
             for at in found:
 
                 def progress(what: str, done: int, total: int, name: str = at.name) -> None:
-                    bar.update(part, description=f"{name}: {what}", completed=done, total=total if done else None)
+                    bar.update(
+                        part,
+                        description=f"{name}: {what}",
+                        completed=done,
+                        total=total if done else None,
+                    )
 
                 results.append(grasp_object(at, grasper, settings, progress))
                 _show(results[-1])
@@ -158,7 +172,10 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
     held = sum(result.held for result in results)
     failed = sum(bool(result.error) for result in results)
     if len(results) > 1:
-        say(f"{held} of {len(results)} objects are held; {failed} could not be used. {out / SHEET} shows them.")
+        say(
+            f"{held} of {len(results)} objects are held; {failed} could not be used. {out / SHEET} "
+            f"shows them."
+        )
     if found > failed:
         say(f"Everything is in {out}.")
     return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0

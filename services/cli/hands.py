@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 
 def list_hands() -> int:
-    """List the hands: those of the package and your own, with joints, masses and available policies.
+    """List the hands: those of the package and your own, with joints, masses and available
+    policies.
 
     Examples:
       congrasp hands list
@@ -45,7 +46,11 @@ def list_hands() -> int:
             f"{sum(link.mass for link in hand.links):.2f} kg",
             f"{max(motor.torque_limit for motor in hand.motors):.1f} N.m",
             f"x {hand.object_scale:g}",
-            "none" if (file := pretrained_file(name)) is None else "own" if file.parent == folder else "pretrained",
+            "none"
+            if (file := pretrained_file(name)) is None
+            else "own"
+            if file.parent == folder
+            else "pretrained",
         )
         rows.append(row)
     show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)
@@ -57,7 +62,8 @@ def sheet(
     hands: Annotated[tuple[str, ...], tyro.conf.Positional] = ("human", "allegro", "sharpa"),
     out: pathlib.Path = pathlib.Path("hands.png"),
 ) -> int:
-    """Draw hands open, half closed and closed, with their grasp frames, with the visual meshes of their files if any.
+    """Draw hands open, half closed and closed, with their grasp frames, with the visual meshes of
+    their files if any.
 
     Args:
       hands: Names of hands, or hand files.
@@ -72,14 +78,19 @@ def sheet(
 
     found = [get_hand(name) for name in hands]
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
-    meshes = [load_meshes(file, hand) if hand.text else {} for file, hand in zip(files, found, strict=True)]
-    skins = [skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)]
+    meshes = [
+        load_meshes(file, hand) if hand.text else {}
+        for file, hand in zip(files, found, strict=True)
+    ]
+    skins = [
+        skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)
+    ]
     save_png(out, hand_sheets.hands_sheet(found, skins))
     print(out)
     return 0
 
 
-def import_hand(
+def import_hand(  # noqa: PLR0913
     file: Annotated[pathlib.Path, tyro.conf.Positional],
     name: str = "",
     palm: str = "",
@@ -91,21 +102,23 @@ def import_hand(
 ) -> int:
     """Import a hand from a URDF or MJCF file: missing values are proposed, listed and drawn.
 
-    The result is one JSON file, which every command takes as --hand, by its name or its path; the visual meshes are
-    stored next to it. Check the picture, and correct the file where a proposal is wrong: poses, fingertips, gains,
-    couplings and capsules are all in it.
+    The result is one JSON file, which every command takes as --hand, by its name or its path; the
+    visual meshes are stored next to it. Check the picture, and correct the file where a proposal is
+    wrong: poses, fingertips, gains, couplings and capsules are all in it.
 
     Args:
       file: The hand's URDF or MJCF, a right or left hand of hinges.
       name: Its name; that of the file by default.
       palm: Body of the palm; by default the one from which most fingers branch.
-      thumb: The last body of the finger that opposes the others; by default one called thumb, or the one that best
+      thumb: The last body of the finger that opposes the others; by default one called thumb, or
+      the one that best
         faces the others.
-      object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
-      collision: Collision shapes in physics: own uses the file's boxes, cylinders, balls, ellipsoids and capsules, and
+      object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1
+      for a human hand's. collision: Collision shapes in physics: own uses the file's boxes,
+      cylinders, balls, ellipsoids and capsules, and
         capsules for links that collide by meshes.
-      out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
-      png: The picture; by default next to the file.
+      out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands
+      list' names it). png: The picture; by default next to the file.
 
     Examples:
       congrasp hands import hand.urdf
@@ -126,7 +139,9 @@ def import_hand(
 
 
 def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
-    """Writes a hand's file and picture, by default to the folder of custom hands, and prints a description."""
+    """Writes a hand's file and picture, by default to the folder of custom hands, and prints a
+    description.
+    """
     from congrasp.services.assets.hands.model_files import describe
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
@@ -150,11 +165,12 @@ def check(
     png: pathlib.Path | None = None,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
 ) -> int:
-    """Check whether a hand can grasp at all, before it is trained: one line for each check, with its remedy.
+    """Check whether a hand can grasp at all, before it is trained: one line for each check, with
+    its remedy.
 
-    Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a cylinder and a box, which
-    are lifted and pushed, are simulated. The picture shows the grips and every joint. The exit code is 1 if a check
-    failed; doubtful results may be intended.
+    Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a
+    cylinder and a box, which are lifted and pushed, are simulated. The picture shows the grips and
+    every joint. The exit code is 1 if a check failed; doubtful results may be intended.
 
     Args:
       hand: A hand, by its name or its file.
@@ -185,11 +201,12 @@ def check(
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
+    """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training,
+    evaluation.
 
-    On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
-    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops if the self-check fails.
-    Repeat the command to resume a stopped one.
+    On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate
+    and view take the policy as --hand NAME. Without a GPU the training is short and of an easier
+    task. It stops if the self-check fails. Repeat the command to resume a stopped one.
 
     Examples:
       congrasp hands train my_hand.urdf
@@ -197,8 +214,8 @@ class Train:
     """
 
     hand: Annotated[str, tyro.conf.Positional]
-    """The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
-    file."""
+    """The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a
+    hand's name or file."""
     name: str = ""
     """As in 'congrasp hands import', like the next three."""
     palm: str = ""
@@ -220,7 +237,9 @@ class Train:
     training: str = ""
     """Further options of 'congrasp train', as one text."""
     patience: int = 240
-    """Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'."""
+    """Minutes after which the training is stopped, to be resumed by the next 'congrasp hands
+    train'.
+    """
 
     def __call__(self) -> int:
         """Imports, checks, trains and evaluates."""
@@ -234,7 +253,8 @@ class Train:
         in_range(1, patience=self.patience)
         check_output("--out", self.out or pathlib.Path("runs", "hands"), is_folder=True)
         full = processes.accelerators()[0] != "cpu"
-        jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
+        # The stages are separate processes, each with the whole GPU memory
+        jax.config.update("jax_platforms", "cpu")
         reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
         found = get_hand(reference)
         request = Request(
@@ -264,10 +284,18 @@ def _taken(hand: str, choices: "Choices") -> str:
     proposal = import_hand(file, choices)
     name = proposal.hand.name
     if name in own_hands():
-        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it.")
+        print(
+            f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it."
+        )
     else:
         _keep(proposal, None, None)
     return name
 
 
-COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": Train}
+COMMANDS = {
+    "list": list_hands,
+    "sheet": sheet,
+    "import": import_hand,
+    "check": check,
+    "train": Train,
+}

@@ -26,31 +26,45 @@ class Options:
     hand: str | None = None
     """The hand, by its name or its file; by default the preset's."""
     listen: str = LEARNER_URL
-    """Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT."""
+    """Endpoint for the actors, which takes four ports from this one on. Other machines need
+    tls/0.0.0.0:PORT.
+    """
     certs: pathlib.Path | None = None
-    """Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each role to its rights."""
+    """Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each
+    role to its rights.
+    """
     insecure: bool = False
     """Listen beyond loopback without certificates."""
     initial: pathlib.Path | None = None
-    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
+    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors`
+    of a run.
+    """
     teacher: str | None = None
-    """A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it."""
+    """A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks
+    read it.
+    """
     resume: bool = False
-    """Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint starts again."""
+    """Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint
+    starts again.
+    """
     or_resume: bool = False
-    """Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command every time."""
+    """Begin the run, or resume it if --run-dir holds one: for supervisors that give the same
+    command every time.
+    """
     rank: int = 0
-    """Number of this process among several that train together; each needs a separate GPU (CUDA_VISIBLE_DEVICES)."""
+    """Number of this process among several that train together; each needs a separate GPU
+    (CUDA_VISIBLE_DEVICES).
+    """
     ranks: int = 1
-    """Learner processes that train together: data parallel, each with separate actors. The run is in the --run-dir of
-    rank 0; rank r listens 4 r ports above --listen."""
+    """Learner processes that train together: data parallel, each with separate actors. The run is
+    in the --run-dir of rank 0; rank r listens 4 r ports above --listen."""
     coordinator: str = "127.0.0.1:7440"
     """Host and port of rank 0; this port and the next must be free there."""
     inside: bool = False
     """Also run an actor in this process, so that its rollouts never leave the device."""
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",)
-    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there, for `wandb
-    sync`), wandb (needs an account); without a name, none."""
+    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files
+    there, for `wandb sync`), wandb (needs an account); without a name, none."""
 
     def prepare(self, config: RunConfig) -> None:
         """Creates the directory of the run, or stores the configuration with which it continues."""
@@ -64,10 +78,11 @@ class Options:
 
 
 def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
-    """Run only the learner; actors on this or other machines connect to it with `congrasp actor --connect`.
+    """Run only the learner; actors on this or other machines connect to it with `congrasp actor
+    --connect`.
 
-    A new run takes its configuration from the preset and the command line; a directory with a run keeps its
-    configuration, except for --updates, --ppo.… and others that only the learner uses.
+    A new run takes its configuration from the preset and the command line; a directory with a run
+    keeps its configuration, except for --updates, --ppo.… and others that only the learner uses.
 
     Args:
       options: This process.
@@ -94,14 +109,18 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
                 certs=options.certs,
                 insecure=options.insecure,
                 run=config.name,
-                longest_rollout=longest_rollout(config) if options.ranks == 1 else None,  # others use rank 0's settings
+                longest_rollout=longest_rollout(config)
+                if options.ranks == 1
+                else None,  # others use rank 0's settings
             ) as transport,
         ):
             imported()
             if rank == 0:
                 options.prepare(config)
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
-            config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
+            config = run_config_from_json(
+                ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"]
+            )
             with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
                 learn(
                     run_dir,

@@ -1,4 +1,6 @@
-"""`congrasp COMMAND …`: finds the command's module, runs it, and turns errors into one line and an exit code."""
+"""`congrasp COMMAND …`: finds the command's module, runs it, and turns errors into one line and an
+exit code.
+"""
 
 import contextlib
 import difflib
@@ -53,7 +55,19 @@ COMMANDS = {
 _MODULES = {"audit": "ops.audit", "doctor": "ops.doctor", "status": "ops.status"}
 """Modules in `services` of commands that are not in `services.cli`."""
 
-_READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
+_READ = {
+    ".obj",
+    ".stl",
+    ".ply",
+    ".glb",
+    ".npz",
+    ".csv",
+    ".bvh",
+    ".mcap",
+    ".safetensors",
+    ".urdf",
+    ".xml",
+}
 """Suffixes of files that commands read."""
 _WRITTEN = ("--out", "--json", "--png", "--video", "--pictures", "--references")
 """Options for files and folders that a command writes, or creates if they are absent."""
@@ -65,20 +79,24 @@ UNREAD = 128 + signal.SIGPIPE
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LESS_MEMORY = (
-    "Choose fewer --environments or a smaller --batch; on a GPU, XLA_PYTHON_CLIENT_MEM_FRACTION is JAX's share of it."
+    "Choose fewer --environments or a smaller --batch; on a GPU, XLA_PYTHON_CLIENT_MEM_FRACTION is "
+    "JAX's share of it."
 )
 _NO_MEMORY = re.compile(
-    r"(?:out[ _]of[ _]memory|failed to allocate (?:request for )?\d)[^[\n]*|RESOURCE_EXHAUSTED", re.IGNORECASE
+    r"(?:out[ _]of[ _]memory|failed to allocate (?:request for )?\d)[^[\n]*|RESOURCE_EXHAUSTED",
+    re.IGNORECASE,
 )
 _PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, FileExistsError)
 _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:  # noqa: C901
     """Entry point of the `congrasp` script; ends the process with the command's exit code."""
     alone = arguments is None  # no other code uses this process
     for name in ("stdout", "stderr") if alone else ():
-        if isinstance(stream := getattr(sys, name), io.TextIOWrapper):  # characters it lacks become escapes
+        if isinstance(
+            stream := getattr(sys, name), io.TextIOWrapper
+        ):  # characters it lacks become escapes
             stream.reconfigure(errors="backslashreplace")
         elif stream is None:  # the shell closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
@@ -97,7 +115,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = UNREAD
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
-    except (RuntimeError, ValueError, AssertionError) as error:  # of libraries whose types are imported late
+    except (
+        RuntimeError,
+        ValueError,
+        AssertionError,
+    ) as error:  # of libraries whose types are imported late
         code = _fail(*_said_by(error), debug)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -105,8 +127,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the interpreter's shutdown.
-    # That also waits for other threads, such as one that builds kernels for minutes: after a failure, for nothing.
+    # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the
+    # interpreter's shutdown. That also waits for other threads, such as one that builds kernels for
+    # minutes: after a failure, for nothing.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     late = [thread for thread in others if thread.name != SIGNALS and (thread.daemon or code)]
     if code in SIGNALLED or (alone and late):
@@ -116,9 +139,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said_of(error: OSError) -> str:
-    """Describes a full disk, or an unusable path, to the user; raises other errors, which are bugs."""
+    """Describes a full disk, or an unusable path, to the user; raises other errors, which are
+    bugs.
+    """
     if error.errno in _FULL:
-        where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
+        where = (
+            f"{error.filename} could not be written"
+            if error.filename
+            else "A file could not be written"
+        )
         return f"{where}: {error.strerror}. Free space and start again."
     if error.filename and (isinstance(error, _PATH) or error.errno in _PATH_NUMBERS):
         what = f"{error.filename} cannot be used: {error.strerror}."
@@ -133,16 +162,28 @@ def _said_of(error: OSError) -> str:
 
 
 def _said_by(error: Exception) -> tuple[str, int]:
-    """Text and exit code of a library's error about memory or an environment variable; raises others, as bugs."""
+    """Text and exit code of a library's error about memory or an environment variable; raises
+    others, as bugs.
+    """
     if found := [text[0].strip(". ") for text in _NO_MEMORY.finditer(str(error))]:
-        # No bad input: a run restarts its processes, since another program may have held the memory.
+        # No bad input: a run restarts its processes, since another program may have held the
+        # memory.
         return f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1
-    unnamed = isinstance(error, AssertionError) and "JAX" in str(getattr(error, "__notes__", "")) and not str(error)
-    unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")  # none of JAX's platforms is there
+    unnamed = (
+        isinstance(error, AssertionError)
+        and "JAX" in str(getattr(error, "__notes__", ""))
+        and not str(error)
+    )
+    # None of JAX's platforms is there
+    unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")
     for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
         if name in os.environ:
             said = f" ({str(error).strip().splitlines()[0]})" if str(error).strip() else ""
-            return f"{name} is '{os.environ[name]}', which does not work here{said}. Correct or unset it.", USAGE_ERROR
+            return (
+                f"{name} is '{os.environ[name]}', which does not work here{said}. Correct or unset "
+                f"it.",
+                USAGE_ERROR,
+            )
     raise error
 
 
@@ -186,25 +227,37 @@ def _check_files(arguments: Sequence[str]) -> None:
         if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
             continue
         named = f"{option}: there" if option else "There"
-        siblings = [one.name for one in path.parent.iterdir() if one.exists()] if path.parent.is_dir() else []
+        siblings = (
+            [one.name for one in path.parent.iterdir() if one.exists()]
+            if path.parent.is_dir()
+            else []
+        )
         near = difflib.get_close_matches(path.name, siblings, 1)
         remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
         raise CongraspError(f"{named} is no file {path}.", remedy)
 
 
 def _check_outputs(call: Any) -> None:
-    """Raises a CongraspError for an output that cannot be written, or a picture of another format, before the work.
+    """Raises a CongraspError for an output that cannot be written, or a picture of another format,
+    before the work.
 
-    An output is a folder if its default has no suffix. A command that computes the default of --out checks it itself.
+    An output is a folder if its default has no suffix. A command that computes the default of --out
+    checks it itself.
     """
     for name, path in call.keywords.items():
         if name in _OUTPUTS and isinstance(path, pathlib.Path):
             default = inspect.signature(call.args[0]).parameters[name].default
             if default or name != "out":
-                check_output(f"--{name}", path, is_folder=not default.suffix if default else name == "pictures")
+                check_output(
+                    f"--{name}",
+                    path,
+                    is_folder=not default.suffix if default else name == "pictures",
+                )
             is_png = name == "png" or (default and default.suffix == ".png")
             if is_png and path.suffix.lower() not in ("", ".png"):
-                raise CongraspError(f"--{name} is {path}, but the picture is a PNG.", "End its name in .png.")
+                raise CongraspError(
+                    f"--{name} is {path}, but the picture is a PNG.", "End its name in .png."
+                )
 
 
 def _is_there(path: pathlib.Path) -> bool:
@@ -231,7 +284,9 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     return parser.of_command(module.COMMAND, prog, getattr(module, "defaults", lambda rest: {}))
 
 
-def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
+def _parsed(
+    name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]
+) -> Callable[[], Any]:
     """Parses a command line; errors are one line instead of the parser's box."""
     said = io.StringIO()
     try:
@@ -259,12 +314,14 @@ def usage() -> str:
         "Dexterous grasping under constraints: distributed training and a live policy.\n\n"
         f"{rows}\n\n"
         "Options of every command: --help, and --debug for the trace of an error.\n"
-        "First steps: 'congrasp grasp examples/mug.obj', or a mesh of yours, 'congrasp view', 'congrasp train'.\n"
+        "First steps: 'congrasp grasp examples/mug.obj', or a mesh of yours, 'congrasp view', "
+        "'congrasp train'.\n"
     )
 
 
 def _prepare_environment() -> None:
-    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would start processes).
+    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would
+    start processes).
 
     Variables set by the user are kept.
     """
@@ -274,7 +331,8 @@ def _prepare_environment() -> None:
     if folder.is_dir() or can_cache(folder.parent, "XDG_CACHE_HOME"):
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    # XLA's cache of GPU tuning would make the folder's path a part of every key: programs could not move to another.
+    # XLA's cache of GPU tuning would make the folder's path a part of every key: programs could not
+    # move to another.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES", "none")
     os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -29,7 +29,10 @@ _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yell
 
 
 def generate(
-    out: pathlib.Path = pathlib.Path("objects"), count: int = 24, seed: int = 0, families: tuple[str, ...] = ()
+    out: pathlib.Path = pathlib.Path("objects"),
+    count: int = 24,
+    seed: int = 0,
+    families: tuple[str, ...] = (),
 ) -> int:
     """Make procedural objects and store them in a folder.
 
@@ -37,7 +40,8 @@ def generate(
       out: Folder for the objects.
       count: Number of objects.
       seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
-      families: Families, in turn, or groups of them: basic (if none is named), household, all (both),
+      families: Families, in turn, or groups of them: basic (if none is named), household, all
+      (both),
         scans.
 
     Examples:
@@ -63,11 +67,13 @@ def import_meshes(
     out: pathlib.Path = pathlib.Path("objects"),
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
 ) -> int:
-    """Import objects from meshes: decompose and weigh them, find their resting poses, and store them in a folder.
+    """Import objects from meshes: decompose and weigh them, find their resting poses, and store
+    them in a folder.
 
-    A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a folder with convex
-    pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders. The exit code is 1 if a
-    shape is unreliable: its pieces are more than 5 mm or half of its volume off.
+    A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a
+    folder with convex pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such
+    files and folders. The exit code is 1 if a shape is unreliable: its pieces are more than 5 mm or
+    half of its volume off.
 
     Args:
       paths: Mesh files and folders.
@@ -101,7 +107,9 @@ def import_meshes(
                 report_error(obj)
                 failures += 1
             else:
-                earlier = file.read_bytes() if (file := catalogue.path(obj.name)).is_file() else None
+                earlier = (
+                    file.read_bytes() if (file := catalogue.path(obj.name)).is_file() else None
+                )
                 if earlier not in (None, catalogue.add(obj).read_bytes()):
                     say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
@@ -109,7 +117,10 @@ def import_meshes(
                 say(*(f"{obj.name}: {text}." for text in (size_in_words(sides), *obj.notes)))
                 if not obj.shape_reliable:
                     unreliable += 1
-                    print(f"{obj.name}: its shape is unreliable. Repair the mesh, or set --time-limit or --max-pieces.")
+                    print(
+                        f"{obj.name}: its shape is unreliable. Repair the mesh, or set "
+                        f"--time-limit or --max-pieces."
+                    )
             progress.advance(task)
     if done:
         doubtful = f", {unreliable} of them with an unreliable shape" if unreliable else ""
@@ -118,7 +129,9 @@ def import_meshes(
 
 
 def list_objects(
-    folder: Annotated[str, tyro.conf.Positional] = "objects", families: bool = False, png: pathlib.Path | None = None
+    folder: Annotated[str, tyro.conf.Positional] = "objects",
+    families: bool = False,
+    png: pathlib.Path | None = None,
 ) -> int:
     """List the objects of a folder, or the families of the generator.
 
@@ -146,10 +159,17 @@ def list_objects(
             failures += 1
             continue
         found.append(obj)
-        weight, pieces, poses = f"{1000 * obj.mass:.0f}", str(len(obj.pieces)), str(len(obj.rest_poses))
+        weight, pieces, poses = (
+            f"{1000 * obj.mass:.0f}",
+            str(len(obj.pieces)),
+            str(len(obj.rest_poses)),
+        )
         rows.append((name, obj.family, _size(obj), weight, pieces, *_parts(obj), poses))
     if names:
-        show_table(("name", "family", "size (cm)", "mass (g)", "pieces", "graspable", "avoid", "poses"), rows)
+        show_table(
+            ("name", "family", "size (cm)", "mass (g)", "pieces", "graspable", "avoid", "poses"),
+            rows,
+        )
     else:
         print(f"{folder} holds no object.")
     if png is not None and found:
@@ -159,12 +179,16 @@ def list_objects(
     return 2 if failures else 0
 
 
-def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None) -> int:
+def show(
+    object: Annotated[str, tyro.conf.Positional],
+    folder: str = "objects",
+    png: pathlib.Path | None = None,
+) -> int:
     """Print the facts of an object, and draw it.
 
     Args:
-      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
-      folder: Folder of objects.
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
+      mug:7. folder: Folder of objects.
       png: Picture to write: labelled surface, convex pieces, headings on the table.
 
     Examples:
@@ -178,23 +202,28 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     share = obj.graspable[obj.labels].mean()
     graspable, avoided = _parts(obj)
     free, on_graspable = (
-        sample_headings(obj, np.random.default_rng(0), use_affordance=affordance) for affordance in (False, True)
+        sample_headings(obj, np.random.default_rng(0), use_affordance=affordance)
+        for affordance in (False, True)
     )
     kinds = [piece.kind for piece in obj.pieces]
     facts = {
         "family": obj.family,
         "size": f"{_size(obj)} cm",
         "mass": f"{1000 * obj.mass:.1f} g",
-        "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia)) + " kg.mm²",
+        "principal inertia": " ".join(f"{1e6 * v:.1f}" for v in np.linalg.eigvalsh(obj.inertia))
+        + " kg.mm²",
         "pieces": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
         "pieces against the mesh": _errors(obj),
         "graspable region": f"{graspable} ({share:.0%} of the surface)",
         "avoid region": avoided or "nothing",
         "digest": digest(obj),
     }
-    for i, texts in enumerate(zip(_reach(obj, free), _reach(obj, on_graspable, region=True), strict=True)):
+    for i, texts in enumerate(
+        zip(_reach(obj, free), _reach(obj, on_graspable, region=True), strict=True)
+    ):
         facts[f"resting pose {i + 1}"] = (
-            f"{100 * obj.rest_poses[i][2]:.1f} cm high; headings within reach of the human hand {texts[0]}, on the "
+            f"{100 * obj.rest_poses[i][2]:.1f} cm high; headings within reach of the human hand "
+            f"{texts[0]}, on the "
             f"graspable region {texts[1]}"
         )
     say(obj.name)
@@ -208,13 +237,15 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
 
 
 def rests(
-    object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None
+    object: Annotated[str, tyro.conf.Positional],
+    folder: str = "objects",
+    png: pathlib.Path | None = None,
 ) -> int:
     """List and draw an object's resting poses, the most likely first, for `congrasp grasp --rest`.
 
     Args:
-      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
-      folder: Folder of objects.
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
+      mug:7. folder: Folder of objects.
       png: Picture to write: a thumbnail of each.
 
     Examples:
@@ -239,7 +270,9 @@ def rests(
 
 
 def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = False) -> list[str]:
-    """Share of the headings, or of those on the graspable region, that the human hand can use in each resting pose."""
+    """Share of the headings, or of those on the graspable region, that the human hand can use in
+    each resting pose.
+    """
     from congrasp.common.hands.closure import outline
     from congrasp.common.task.sampling.headings import above, within_reach
 
@@ -249,11 +282,13 @@ def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = Fa
     avoid = obj.non_graspable_points if region else None
     found = within_reach(headings, obj, obj.rest_poses, outline(HUMAN), avoid)
     for pose, cleared, reachable in zip(obj.rest_poses, *found, strict=True):
-        texts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
+        texts.append(
+            f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)"
+        )
     return texts
 
 
-def set_affordance(
+def set_affordance(  # noqa: PLR0913
     object: Annotated[str, tyro.conf.Positional],
     part_mesh: pathlib.Path | None = None,
     painted: pathlib.Path | None = None,
@@ -265,15 +300,16 @@ def set_affordance(
 ) -> int:
     """Divide an object's surface into graspable region and avoid region.
 
-    The graspable region is the mesh of a part, a painted colour, or the side of a plane. It must cover at least a tenth
-    of the surface. Constraint sets and evaluation then use it.
+    The graspable region is the mesh of a part, a painted colour, or the side of a plane. It must
+    cover at least a tenth of the surface. Constraint sets and evaluation then use it.
 
     Args:
-      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
-      part_mesh: A mesh of the graspable part, in the frame and unit of the object's file.
+      object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
+      mug:7. part_mesh: A mesh of the graspable part, in the frame and unit of the object's file.
       painted: A PLY file of the object with coloured vertices, in the same frame and unit.
-      colour: Colour of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
-      half_space: Three numbers of a direction and one in metres: the region farther than that along the direction is
+      colour: Colour of the graspable region in the painted file: red, green, blue, yellow, or
+      #rrggbb. half_space: Three numbers of a direction and one in metres: the region farther than
+      that along the direction is
         graspable. In the object's frame, whose origin is its centre of mass.
       invert: Use the selection as the avoid region, and the rest as the graspable one.
       name: Name of the new object; by default it replaces the old one.
@@ -288,7 +324,8 @@ def set_affordance(
 
     if [part_mesh, painted, half_space or None].count(None) != 2:
         raise CongraspError(
-            "The graspable region is not defined.", "Pass one of --part-mesh, --painted and --half-space."
+            "The graspable region is not defined.",
+            "Pass one of --part-mesh, --painted and --half-space.",
         )
     if len(half_space) not in (0, 4):
         raise CongraspError(
@@ -304,7 +341,8 @@ def set_affordance(
         found = affordance.in_half_space(obj, half_space[:3], half_space[3])
     if (found != invert).all():
         raise CongraspError(
-            f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.", "Choose a smaller part."
+            f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.",
+            "Choose a smaller part.",
         )
     labelled = affordance.two_parts(obj, found != invert, name)
     file = Catalogue(folder).add(labelled)
@@ -330,7 +368,9 @@ def _errors(obj: "GraspObject") -> str:
 def _parts(obj: "GraspObject") -> tuple[str, str]:
     """Names of the parts of the graspable and of the avoid region."""
     named = list(zip(obj.part_names, obj.graspable, strict=True))
-    graspable, avoided = (", ".join(name for name, allowed in named if allowed == wanted) for wanted in (True, False))
+    graspable, avoided = (
+        ", ".join(name for name, allowed in named if allowed == wanted) for wanted in (True, False)
+    )
     return graspable, avoided
 
 
@@ -341,7 +381,9 @@ def _colour(text: str) -> tuple[int, int, int]:
     try:
         red, green, blue = bytes.fromhex(text.removeprefix("#")) if text.startswith("#") else b""
     except ValueError:
-        raise CongraspError(f"--colour is '{text}'.", f"Write #rrggbb, or one of: {', '.join(_COLOURS)}.") from None
+        raise CongraspError(
+            f"--colour is '{text}'.", f"Write #rrggbb, or one of: {', '.join(_COLOURS)}."
+        ) from None
     return red, green, blue
 
 

@@ -24,14 +24,20 @@ _CONTINUED = re.compile(r"\s*\n\s*")
 
 
 def of_command(
-    command: Command, prog: str, defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {}
+    command: Command,
+    prog: str,
+    defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {},
 ) -> Parser:
-    """Returns the parser of a command; `defaults` computes values of its parameters that depend on the arguments."""
+    """Returns the parser of a command; `defaults` computes values of its parameters that depend on
+    the arguments.
+    """
 
     def parse(rest: list[str]) -> Callable[[], Any]:
         bound = functools.partial(_deferred(command), **defaults(rest))
         with _epilog(examples(command)):
-            return tyro.cli(bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY)
+            return tyro.cli(
+                bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY
+            )
 
     return parse
 
@@ -44,7 +50,9 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
         with _epilog([examples(command)[0] for command in commands.values()]):
-            return tyro.extras.subcommand_cli_from_dict(deferred, prog=prog, description=description, args=rest)
+            return tyro.extras.subcommand_cli_from_dict(
+                deferred, prog=prog, description=description, args=rest
+            )
 
     return parse
 
@@ -52,12 +60,19 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
 def examples(command: Command) -> list[str]:
     """Returns the command lines in the section `Examples` of a command's docstring."""
     found = docstring_parser.parse(inspect.getdoc(command) or "").examples
-    return [line.strip() for example in found for line in (example.description or "").splitlines() if line.strip()]
+    return [
+        line.strip()
+        for example in found
+        for line in (example.description or "").splitlines()
+        if line.strip()
+    ]
 
 
 @contextlib.contextmanager
 def _epilog(lines: Sequence[str]) -> Iterator[None]:
-    """Prints examples after the help, which is what a parser prints when it exits without an error."""
+    """Prints examples after the help, which is what a parser prints when it exits without an
+    error.
+    """
     try:
         yield
     except SystemExit as end:
@@ -73,15 +88,22 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
         return functools.partial(_run, command, *args, **options)
 
     hints = {
-        name: _described(name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else []))
+        name: _described(
+            name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else [])
+        )
         for name, hint in typing.get_type_hints(command, include_extras=True).items()
     }
     signature = inspect.signature(command)
     taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
     vars(bind)["__signature__"] = signature.replace(parameters=taken)
     bind.__name__, bind.__annotations__ = command.__name__, {**hints, "return": Any}
-    text = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
-    fields = [f"  {name}: {help}" for name, help in _meanings(command).items()] if isinstance(command, type) else []
+    # A parameter's text on one line
+    text = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")
+    fields = (
+        [f"  {name}: {help}" for name, help in _meanings(command).items()]
+        if isinstance(command, type)
+        else []
+    )
     bind.__doc__ = "\n".join([text, "", "Args:", *fields] if fields else [text])
     return bind
 
@@ -92,15 +114,21 @@ def _run(command: Command, *args: Any, **options: Any) -> Any:
 
 
 def _described(name: str, hint: Any, *more: Any) -> Any:
-    """Returns a parameter's type, with the display of its values and default, and the range of seeds."""
+    """Returns a parameter's type, with the display of its values and default, and the range of
+    seeds.
+    """
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
-    for mark in marks:  # a type that is known only when a command line is parsed, such as the engines' names
+    for mark in (
+        marks
+    ):  # a type that is known only when a command line is parsed, such as the engines' names
         kind = made() if (made := getattr(mark, "constructor_factory", None)) else kind
     metavar = None
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
         metavar = f"{_value(typing.get_args(kind)[0])} ..."
-    return Annotated[(kind, *marks, *more, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
+    return Annotated[
+        (kind, *marks, *more, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))
+    ]
 
 
 def _seed(words: list[str]) -> int:
@@ -136,8 +164,12 @@ _REGISTRY = tyro.constructors.ConstructorRegistry()
 
 
 @_REGISTRY.struct_rule
-def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.StructConstructorSpec | None:
-    """Options of a dataclass: tyro's own rule, with each field's text on one line and described as parameters are."""
+def _dataclass(
+    info: tyro.constructors.StructTypeInfo,
+) -> tyro.constructors.StructConstructorSpec | None:
+    """Options of a dataclass: tyro's own rule, with each field's text on one line and described as
+    parameters are.
+    """
     if not dataclasses.is_dataclass(info.type):
         return None
     hints = typing.get_type_hints(info.type, include_extras=True)
@@ -162,5 +194,7 @@ def _meanings(kind: type) -> Mapping[str, str]:
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         params = docstring_parser.parse_from_object(base).params
-        found |= {one.arg_name: _CONTINUED.sub(" ", one.description) for one in params if one.description}
+        found |= {
+            one.arg_name: _CONTINUED.sub(" ", one.description) for one in params if one.description
+        }
     return types.MappingProxyType(found)

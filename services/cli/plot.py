@@ -14,12 +14,15 @@ def plot(
     out: pathlib.Path | None = None,
     formats: tuple[Literal["png", "pdf"], ...] = ("png", "pdf"),
 ) -> int:
-    """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
+    """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates
+    and errors.
 
     Args:
-      paths: Runs' folders, or MCAP files, which are overlaid; a run in progress is drawn up to its last half second. Or
+      paths: Runs' folders, or MCAP files, which are overlaid; a run in progress is drawn up to its
+      last half second. Or
         the JSON file of one 'congrasp evaluate --json'.
-      out: Folder for the figures; by default 'plots' next to the recordings or the JSON file. Required for several
+      out: Folder for the figures; by default 'plots' next to the recordings or the JSON file.
+      Required for several
         runs.
       formats: Formats of the files.
 
@@ -32,14 +35,24 @@ def plot(
 
     evaluations = [path for path in paths if path.suffix == ".json"]
     if not paths:
-        raise CongraspError("No run was given.", "Pass the folders of runs: congrasp plot runs/mine")
+        raise CongraspError(
+            "No run was given.", "Pass the folders of runs: congrasp plot runs/mine"
+        )
     if len(paths) > 1 and evaluations:
-        raise CongraspError(f"{evaluations[0]} cannot be combined with other files.", "Only runs can be overlaid.")
+        raise CongraspError(
+            f"{evaluations[0]} cannot be combined with other files.", "Only runs can be overlaid."
+        )
     if len(paths) > 1 and out is None:
-        raise CongraspError("The figures of several runs have no default folder.", "Pass a folder with --out.")
+        raise CongraspError(
+            "The figures of several runs have no default folder.", "Pass a folder with --out."
+        )
     folder = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / "plots"
     check_output("--out", folder, is_folder=True)
-    for file in plot_evaluation(paths[0], folder, formats) if evaluations else plot_runs(paths, folder, formats):
+    for file in (
+        plot_evaluation(paths[0], folder, formats)
+        if evaluations
+        else plot_runs(paths, folder, formats)
+    ):
         print(file)
     return 0
 

@@ -10,7 +10,7 @@ from congrasp.services.cli.console import in_range
 from congrasp.services.client.policy_client import PolicyClient
 
 
-def query(
+def query(  # noqa: PLR0913
     connect: str = SERVER_URL,
     name: str = "policy",
     object_seed: int = 1_000_000,
@@ -63,9 +63,13 @@ def query(
     if json:
         print(json_module.dumps(result))
     else:
-        latency = "p50 {p50_ms:.2f} ms, p99 {p99_ms:.2f} ms, {answers_per_s:.0f} answers/s".format(**result)
+        latency = "p50 {p50_ms:.2f} ms, p99 {p99_ms:.2f} ms, {answers_per_s:.0f} answers/s".format(
+            **result
+        )
         lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
-        print(f"{repeat} queries of {states} state(s) from {concurrency} client(s): {latency}, {lost}")
+        print(
+            f"{repeat} queries of {states} state(s) from {concurrency} client(s): {latency}, {lost}"
+        )
     return 0 if result["failed"] == 0 else 1
 
 

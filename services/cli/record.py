@@ -29,17 +29,18 @@ def record(
     log_format: LogFormat = "text",
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and episodes.
+    """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and
+    episodes.
 
-    Ctrl-C ends it and finishes the file. A slow or killed recorder never blocks the run, and its file is readable up to
-    the last half second.
+    Ctrl-C ends it and finishes the file. A slow or killed recorder never blocks the run, and its
+    file is readable up to the last half second.
 
     Args:
       connect: The learner's endpoint, such as tcp/10.0.0.5:7447.
       run: Name of the run.
       out: Folder for the MCAP files.
-      live: Also serve everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
-      duration: Seconds after which to stop; by default on Ctrl-C.
+      live: Also serve everything to the Foxglove app on this port of the loopback interface:
+      ws://127.0.0.1:PORT. duration: Seconds after which to stop; by default on Ctrl-C.
       log_format: Text, or one JSON object per line: time, level, role, id, run, text, fields.
       certs: Folder of an observer's certificate (congrasp certs).
 
@@ -50,15 +51,25 @@ def record(
     structured = log_format == "json"
     end = math.inf if duration is None else time.monotonic() + duration
     console = Console(stderr=True, quiet=structured)
-    warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
+    warn = (
+        functools.partial(log, "warning")
+        if structured
+        else lambda text: console.print(f"congrasp: {text}")
+    )
     with contextlib.ExitStack() as stack:
-        stack.enter_context(logging_as(log_format, role="recorder", id=process_name("recorder"), run=run))
+        stack.enter_context(
+            logging_as(log_format, role="recorder", id=process_name("recorder"), run=run)
+        )
         transport = stack.enter_context(urls.connect(connect, "observer", certs=certs, run=run))
         sinks = [] if live is None else [stack.enter_context(LiveServer(live))]
         for server in sinks:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
-        recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, warn=warn))
-        transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
+        recorder = stack.enter_context(
+            Recorder(transport, run, out, name="record", sinks=sinks, warn=warn)
+        )
+        transport.declare_alive(
+            Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4))
+        )
         try:
             with console.status(_state(recorder)) as status:
                 while time.monotonic() < end and (sinks or not recorder.error):
@@ -73,9 +84,14 @@ def record(
                     print(file)
             console.print(_state(recorder))
         if recorder.error:
-            raise CongraspError(recorder.error, "Free space and restart the recorder, which begins a new file.")
+            raise CongraspError(
+                recorder.error, "Free space and restart the recorder, which begins a new file."
+            )
         if not recorder.messages:
-            console.print(f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its processes.")
+            console.print(
+                f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its "
+                f"processes."
+            )
     return 0
 
 

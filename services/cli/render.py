@@ -38,7 +38,8 @@ def episode(
     frames: Annotated[int, tyro.conf.arg(aliases=["--moments"])] = 8,
     video: pathlib.Path | None = None,
 ) -> int:
-    """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red, waypoints, pose.
+    """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red,
+    waypoints, pose.
 
     Args:
       path: A run's folder, or one MCAP file.
@@ -65,7 +66,9 @@ def episode(
     if video is not None:
         film = Film(overlays=True)
         if arm := arm_of_episode(chosen):
-            save_robot_video(video, arm, chosen, film, range(0, len(chosen.arrays["table"]), _FRAMED))
+            save_robot_video(
+                video, arm, chosen, film, range(0, len(chosen.arrays["table"]), _FRAMED)
+            )
         else:
             save_episode_video(video, chosen, film)
         print(video)

@@ -18,10 +18,11 @@ _POOL = 64
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Write one HTML file about a policy: results and those of the paper, failures and successes, and its training.
+    """Write one HTML file about a policy: results and those of the paper, failures and successes,
+    and its training.
 
-    It evaluates the policy by the paper's protocol first, and draws some of these episodes. With 200 episodes per row
-    that takes some minutes on a CPU; for a quick look pass --episodes 16.
+    It evaluates the policy by the paper's protocol first, and draws some of these episodes. With
+    200 episodes per row that takes some minutes on a CPU; for a quick look pass --episodes 16.
 
     Examples:
       congrasp report runs/mine --episodes 16
@@ -47,7 +48,9 @@ class Report:
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
     """Also write the rows to this file."""
     check: pathlib.Path | None = None
-    """A file of 'congrasp hands check --json' to include in the report, with its --png of the same name."""
+    """A file of 'congrasp hands check --json' to include in the report, with its --png of the same
+    name.
+    """
 
     def __call__(self) -> int:
         """Evaluates, and writes the report."""
@@ -68,7 +71,9 @@ class Report:
             made = report_on(
                 Experiment(
                     bundles.load(file),
-                    objects_of(self.objects, track=track) if self.objects else exam_pool("figures", self.pool),
+                    objects_of(self.objects, track=track)
+                    if self.objects
+                    else exam_pool("figures", self.pool),
                     episodes=self.episodes,
                     physics=resolve_physics(self.physics),
                     seed=self.seed,
@@ -98,7 +103,9 @@ def _checked(file: pathlib.Path) -> "HandCheck":
 
     picture = file.with_suffix(".png")
     if not picture.is_file():
-        raise CongraspError(f"There is no picture {picture}.", "Create it with 'congrasp hands check --png'.")
+        raise CongraspError(
+            f"There is no picture {picture}.", "Create it with 'congrasp hands check --png'."
+        )
     return HandCheck(read_findings(file), picture.read_bytes())
 
 
@@ -107,7 +114,10 @@ def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:
     from congrasp.learner.run_directory import POLICY_FILE
 
     if not (run_dir / POLICY_FILE).is_file():
-        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file.")
+        raise CongraspError(
+            f"The folder {run_dir} holds no {POLICY_FILE}.",
+            "Pass a run's folder, or a policy file.",
+        )
     return run_dir / POLICY_FILE
 
 

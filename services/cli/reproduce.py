@@ -25,13 +25,15 @@ _MANY = {True: 2, False: 50}
 
 @dataclasses.dataclass(frozen=True)
 class Reproduce:
-    """Reproduce the paper's tables: train missing policies, evaluate, and write a page, JSON and LaTeX.
+    """Reproduce the paper's tables: train missing policies, evaluate, and write a page, JSON and
+    LaTeX.
 
-    On a GPU it trains the full system for each hand, then the baselines and ablations that learn, each as 'congrasp
-    train' in a separate run below OUT/policies; a failure does not stop the rest. Then it evaluates all tables. Every
-    figure is shown with the paper's, its interval and the difference; figures that are not comparable are listed with
-    the reason. Repeat the command to resume a stopped one: trainings resume from their last checkpoint, and finished
-    tables are only repeated if policy or settings changed.
+    On a GPU it trains the full system for each hand, then the baselines and ablations that learn,
+    each as 'congrasp train' in a separate run below OUT/policies; a failure does not stop the rest.
+    Then it evaluates all tables. Every figure is shown with the paper's, its interval and the
+    difference; figures that are not comparable are listed with the reason. Repeat the command to
+    resume a stopped one: trainings resume from their last checkpoint, and finished tables are only
+    repeated if policy or settings changed.
 
     Examples:
       congrasp reproduce --quick
@@ -39,20 +41,24 @@ class Reproduce:
     """
 
     out: pathlib.Path = pathlib.Path("reproduction")
-    """Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures."""
+    """Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and
+    pictures.
+    """
     quick: bool = False
-    """Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores."""
+    """Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two
+    CPU cores.
+    """
     hands: tuple[str, ...] = ()
-    """Hands whose full system is evaluated; the other tables use the first one. By default all with a pretrained
-    policy."""
+    """Hands whose full system is evaluated; the other tables use the first one. By default all with
+    a pretrained policy."""
     methods: tuple[str, ...] = ()
-    """Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase, single-stage; by
-    default all."""
+    """Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward,
+    two-phase, single-stage; by default all."""
     policy: tuple[str, ...] = ()
     """Policies that need no training, in the form of 'congrasp evaluate --policy'."""
     captured: tuple[pathlib.Path, ...] = ()
-    """Folders of captured data sets, each with the folders 'objects' and 'constraints' that 'congrasp constraints
-    import' makes; most of the paper's tables need them."""
+    """Folders of captured data sets, each with the folders 'objects' and 'constraints' that
+    'congrasp constraints import' makes; most of the paper's tables need them."""
     episodes: int = 0
     """Episodes of a row; 0 takes 1,000, with --quick 48."""
     pool: int = 0
@@ -70,7 +76,10 @@ class Reproduce:
         """Trains, evaluates, and prints a summary."""
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        chosen, compared = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()), self.methods or BASELINES
+        chosen, compared = (
+            tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()),
+            self.methods or BASELINES,
+        )
         _check_names(chosen, compared)
         usual_episodes, usual_pool = _QUICK if self.quick else _FULL
         request = Request(
@@ -107,9 +116,13 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for an unknown hand or method."""
     for name in hands:
         if get_hand(name).name != name:
-            raise CongraspError(f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'.")
+            raise CongraspError(
+                f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'."
+            )
     if unknown := set(methods) - set(BASELINES):
-        raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
+        raise CongraspError(
+            f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}."
+        )
 
 
 def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
@@ -118,7 +131,8 @@ def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[Require
     for policy, one in found.items():
         if policy not in needed:
             raise CongraspError(
-                f"The policy {one.file.name} is of the hand '{policy.hand}' and the method '{policy.method}'.",
+                f"The policy {one.file.name} is of the hand '{policy.hand}' and the method "
+                f"'{policy.method}'.",
                 "Name that hand with --hands, the first one for methods, or leave the policy out.",
             )
     return found

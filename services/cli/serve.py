@@ -25,8 +25,8 @@ class Serve:
     """
 
     policy: pathlib.Path | None = None
-    """A policy file, reread whenever it changes, or 'allegro-student', whose inputs a robot can measure; by default the
-    pretrained policy of the hand."""
+    """A policy file, reread whenever it changes, or 'allegro-student', whose inputs a robot can
+    measure; by default the pretrained policy of the hand."""
     hand: str = "human"
     """Hand of the pretrained policy."""
     connect: str = ""
@@ -48,7 +48,8 @@ class Serve:
         """Serves until a signal."""
         starting = contextlib.ExitStack()
         starting.enter_context(announced("Loading and compiling the policy"))
-        # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it when it starts) ...
+        # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it
+        # when it starts) ...
         os.environ.setdefault("NPROC", "1")
 
         import jax
@@ -58,7 +59,8 @@ class Serve:
 
         if self.policy is not None and self.connect:
             raise CongraspError(
-                f"The server can follow either {self.policy} or {self.connect}.", "Give one of --policy and --connect."
+                f"The server can follow either {self.policy} or {self.connect}.",
+                "Give one of --policy and --connect.",
             )
         jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
         metrics = ServerMetrics()
@@ -69,19 +71,31 @@ class Serve:
             contextlib.ExitStack() as stack,
         ):
             if self.connect:
-                upstream = stack.enter_context(urls.connect(self.connect, "server", certs=self.certs, run=self.run))
-                upstream.declare_alive(Keys(self.run).alive("server", self.name, secrets.token_hex(4)))
-                source = follow_run(upstream, self.run, urls.name_on_wire(self.name, self.certs, "server"))
+                upstream = stack.enter_context(
+                    urls.connect(self.connect, "server", certs=self.certs, run=self.run)
+                )
+                upstream.declare_alive(
+                    Keys(self.run).alive("server", self.name, secrets.token_hex(4))
+                )
+                source = follow_run(
+                    upstream, self.run, urls.name_on_wire(self.name, self.certs, "server")
+                )
             else:
                 source = follow_file(policy_file(self.policy, self.hand))
             transport = stack.enter_context(
                 urls.listen(self.listen, "server", certs=self.certs, insecure=self.insecure)
             )
-            server = PolicyServer(transport, self.name, source, on_answer=metrics.answer, on_batch=metrics.batch)
+            server = PolicyServer(
+                transport, self.name, source, on_answer=metrics.answer, on_batch=metrics.batch
+            )
             metrics.health = server.health
             starting.close()
             health = server.health()
-            log("info", f"Serving '{self.name}' at {self.listen}: hand {health['hand']}, version {health['version']}.")
+            log(
+                "info",
+                f"Serving '{self.name}' at {self.listen}: hand {health['hand']}, version "
+                f"{health['version']}.",
+            )
             stop.wait()
             server.close()
         return stop.exit_code

@@ -16,7 +16,7 @@ from congrasp.services.train.presets import get_preset, student_of, with_hand
 from congrasp.services.train.processes import Launch
 
 
-def train(
+def train(  # noqa: PLR0913
     config: RunConfig,
     launch: Launch = Launch(),  # noqa: B008
     preset: str = "quickstart",
@@ -30,32 +30,42 @@ def train(
     resume: bool = False,
     evaluation: int | None = None,
 ) -> int:
-    """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
+    """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback
+    interface.
 
-    Starts from a preset; every field of the run can be set on the command line. `--preset full --hand HAND` is the full
-    task for any hand, by the recipe for all of them; human, allegro and sharpa are presets that mean the same.
+    Starts from a preset; every field of the run can be set on the command line. `--preset full
+    --hand HAND` is the full task for any hand, by the recipe for all of them; human, allegro and
+    sharpa are presets that mean the same.
 
     Args:
       config: The run.
       launch: Its processes.
-      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or check, which trains
+      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or
+      check, which trains
         nothing and shows that physics, messages, log, server and pictures work here.
-      method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl, dgrasp,
-        no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots (student, with a tracker;
-        camera, with a depth camera). By default that of the preset, ours.
-      hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
+      method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl,
+      dgrasp,
+        no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots
+        (student, with a tracker; camera, with a depth camera). By default that of the preset, ours.
+      hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by
+      default the
         preset's.
       run_dir: Folder of the run; runs/NAME-DATE by default.
-      initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
-        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md), or with
-        `--method camera` a partial point cloud (docs/camera.md). The task is the teacher's, the algorithm `distill`.
-      constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
+      initial: A policy to begin with instead of random weights, of the same networks:
+      `policy.safetensors` of a run. teacher: A policy file, or the hand of a pretrained policy, to
+      distil into a policy for robots, which sees the
+        joints, the wrist and a tracker's object poses, no forces and no velocities
+        (docs/students.md), or with `--method camera` a partial point cloud (docs/camera.md). The
+        task is the teacher's, the algorithm `distill`.
+      constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp
+      constraints import'); their
         objects are those of --objects.folder, and --objects.procedural adds others.
       split: Split of these sets: training (the default), held out, or all.
-      resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the run; options that
+      resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the
+      run; options that
         only the learner uses, such as --updates and --ppo.…, may be changed.
-      evaluation: Episodes of the evaluation after training, on held-out objects; by default 192, or three times
+      evaluation: Episodes of the evaluation after training, on held-out objects; by default 192, or
+      three times
         --environments if that is less; 0 leaves it out.
 
     Examples:
@@ -67,10 +77,14 @@ def train(
 
     config = with_hand(config if method is None else with_method(config, method), hand)
     given: dict[str, Any] = {"constraints": constraints and str(constraints), "split": split}
-    objects = dataclasses.replace(config.objects, **{name: value for name, value in given.items() if value})
+    objects = dataclasses.replace(
+        config.objects, **{name: value for name, value in given.items() if value}
+    )
     return run_training(
         dataclasses.replace(config, objects=objects),
-        run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
+        run_dir
+        or pathlib.Path("runs")
+        / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
         launch,
         resume=resume,
         initial=initial,
@@ -79,17 +93,23 @@ def train(
 
 
 def defaults(arguments: list[str]) -> dict[str, Any]:
-    """Defaults that depend on a command line: the configuration of the preset for the given hand and teacher.
+    """Defaults that depend on a command line: the configuration of the preset for the given hand
+    and teacher.
 
     With --resume the configuration is that of the run, and a preset for another hand is rejected.
     """
     named, hand = _value("--preset", arguments), _value("--hand", arguments) or None
     preset, run_dir = named or "quickstart", _value("--run-dir", arguments)
-    if {"--resume", "--or-resume"} & set(arguments) and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
+    if (
+        {"--resume", "--or-resume"} & set(arguments)
+        and run_dir
+        and (pathlib.Path(run_dir) / CONFIG_FILE).exists()
+    ):
         config = open_run(pathlib.Path(run_dir))
         if named and get_preset(named, hand).task.hand != config.task.hand:
             raise CongraspError(
-                f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset {named} is not for.",
+                f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset "
+                f"{named} is not for.",
                 "Leave out --preset, or choose another --run-dir.",
             )
         return {"config": config}

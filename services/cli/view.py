@@ -23,11 +23,12 @@ _RUN = "quickstart"
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Request a grasp in the browser and play it: set the heading, paint the avoid region, draw the wrist's path.
+    """Request a grasp in the browser and play it: set the heading, paint the avoid region, draw the
+    wrist's path.
 
-    With a run's folder, or with --connect, it uses the newest weights of a run in training and shows the run: its
-    curves, its actors and their episodes. With a run's folder, or with --recordings, a click on a curve finds the
-    episodes of that time.
+    With a run's folder, or with --connect, it uses the newest weights of a run in training and
+    shows the run: its curves, its actors and their episodes. With a run's folder, or with
+    --recordings, a click on a curve finds the episodes of that time.
 
     Examples:
       congrasp view runs/mine
@@ -35,7 +36,9 @@ class View:
     """
 
     run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
-    """Folder of a run on this machine, live or finished, in place of --connect, --run, --recordings and --policy."""
+    """Folder of a run on this machine, live or finished, in place of --connect, --run, --recordings
+    and --policy.
+    """
     objects: pathlib.Path | None = None
     """Custom objects: a mesh, a folder of meshes, or a folder of 'congrasp objects import'."""
     policy: pathlib.Path | None = None
@@ -55,14 +58,16 @@ class View:
     insecure: bool = False
     """Offer the page beyond loopback."""
     certs: pathlib.Path | None = None
-    """Folder of certificates (congrasp certs), for --connect: an observer's, and a server's to grasp with the weights
-    of the run."""
+    """Folder of certificates (congrasp certs), for --connect: an observer's, and a server's to
+    grasp with the weights of the run."""
 
     def __call__(self) -> int:
         """Offers the page until a signal."""
         view = self if self.run_dir is None else self._of_folder(self.run_dir)
         with contextlib.ExitStack() as starting:
-            starting.enter_context(announced("Loading the policies and compiling the studio's rules"))
+            starting.enter_context(
+                announced("Loading the policies and compiling the studio's rules")
+            )
             with on_signal() as stop, view._page() as url:
                 starting.close()
                 print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
@@ -106,11 +111,15 @@ class View:
             if self.connect or self.recordings:
                 window = training.opened_window(self.run if self.connect else "", self.recordings)
             if window is not None and self.connect:
-                watching = stack.enter_context(urls.connect(self.connect, "observer", certs=self.certs))
+                watching = stack.enter_context(
+                    urls.connect(self.connect, "observer", certs=self.certs)
+                )
                 stack.callback(training.Follower(watching, window).close)
                 hands = self._of_run(watching, stack)
             shown = hands or grasping.pretrained()
-            yield stack.enter_context(open_page(shown, self.objects, window, self.host, self.port, self.allow_host))
+            yield stack.enter_context(
+                open_page(shown, self.objects, window, self.host, self.port, self.allow_host)
+            )
 
     def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> "Loaders | None":
         """The policy of a run; None if there is only an observer's certificate."""
@@ -119,7 +128,9 @@ class View:
         pulling = watching
         if self.certs is not None:
             try:
-                pulling = stack.enter_context(urls.connect(self.connect, "server", certs=self.certs, run=self.run))
+                pulling = stack.enter_context(
+                    urls.connect(self.connect, "server", certs=self.certs, run=self.run)
+                )
             except CongraspError as error:
                 log("warning", f"{error} The studio grasps with the pretrained policies.")
                 return None

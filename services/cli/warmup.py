@@ -31,14 +31,16 @@ def warmup(
     export: pathlib.Path | None = None,
     source: Annotated[pathlib.Path | None, tyro.conf.arg(name="import")] = None,
 ) -> int:
-    """Compile the programs of `congrasp train` on this machine in advance: kernels, programs, the constraint bank.
+    """Compile the programs of `congrasp train` on this machine in advance: kernels, programs, the
+    constraint bank.
 
-    Makes the first update of such a training and discards it. It fills the caches in JAX_COMPILATION_CACHE_DIR
-    (compiled programs; by default congrasp/jax in the user's cache folder), WARP_CACHE_PATH (GPU kernels; by default
-    warp in that folder) and congrasp/banks in the user's cache folder (XDG_CACHE_HOME). They can be filled while a
-    container image is built, and carried as one file to machines with the same kind of GPU and the same versions. Other
-    numbers of environments or steps need other programs. On several GPUs, run it before `congrasp train --ranks`:
-    otherwise each rank compiles.
+    Makes the first update of such a training and discards it. It fills the caches in
+    JAX_COMPILATION_CACHE_DIR (compiled programs; by default congrasp/jax in the user's cache
+    folder), WARP_CACHE_PATH (GPU kernels; by default warp in that folder) and congrasp/banks in the
+    user's cache folder (XDG_CACHE_HOME). They can be filled while a container image is built, and
+    carried as one file to machines with the same kind of GPU and the same versions. Other numbers
+    of environments or steps need other programs. On several GPUs, run it before `congrasp train
+    --ranks`: otherwise each rank compiles.
 
     Args:
       preset: Named configuration that will be trained.
@@ -47,7 +49,8 @@ def warmup(
       environments: Environments of an actor; 0: those of the preset.
       rollout_steps: Control steps of a rollout; 0: those of the preset.
       export: Tar file into which everything in these caches is then written.
-      source: Such a file, from which the caches are filled instead. It holds programs that will run here: import only
+      source: Such a file, from which the caches are filled instead. It holds programs that will run
+      here: import only
         files that you trust.
 
     Examples:
@@ -64,7 +67,9 @@ def warmup(
     imported()
     console = Console(highlight=False, soft_wrap=True)
     if source is not None and export is not None:
-        raise CongraspError("--import and --export were given together.", "Run one after the other.")
+        raise CongraspError(
+            "--import and --export were given together.", "Run one after the other."
+        )
     if source is not None:
         console.print(f"{import_caches(source)} files of {source} are in the caches.", markup=False)
         return 0
@@ -96,8 +101,12 @@ def export_caches(path: pathlib.Path) -> None:
                 for name, folder in _folders().items():
                     for file in sorted(folder.rglob("[!.]*")):
                         if file.is_file() and not file.is_symlink():
-                            with contextlib.suppress(FileNotFoundError):  # another process may tidy up meanwhile
-                                archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
+                            with contextlib.suppress(
+                                FileNotFoundError
+                            ):  # another process may tidy up meanwhile
+                                archive.add(
+                                    file, f"{name}/{file.relative_to(folder)}", recursive=False
+                                )
             temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -107,7 +116,8 @@ def import_caches(path: pathlib.Path) -> int:
     """Adds the files of `export_caches` to the caches of this machine, and returns their number.
 
     Raises:
-      CongraspError: the file cannot be read, is not of this command, or was made for other versions or another device.
+      CongraspError: the file cannot be read, is not of this command, or was made for other versions
+      or another device.
     """
     folders, members = _folders(), dict[tarfile.TarInfo, pathlib.Path]()
     with _opened(path) as archive:
@@ -117,10 +127,13 @@ def import_caches(path: pathlib.Path) -> int:
             name, _, inside = member.name.partition("/")
             if name == "jax" and name not in folders:
                 raise CongraspError(
-                    "The cache of compiled programs cannot be written.", "Set JAX_COMPILATION_CACHE_DIR."
+                    "The cache of compiled programs cannot be written.",
+                    "Set JAX_COMPILATION_CACHE_DIR.",
                 )
             if name not in folders or not _is_inside(member, inside, folders[name]):
-                raise CongraspError(f"{path} has an entry that is no file of a cache: {member.name!a:.80}.", _REMEDY)
+                raise CongraspError(
+                    f"{path} has an entry that is no file of a cache: {member.name!a:.80}.", _REMEDY
+                )
             members[member] = folders[name] / inside
         for member, target in members.items():
             if not target.exists():
@@ -129,9 +142,16 @@ def import_caches(path: pathlib.Path) -> int:
 
 
 def _is_inside(member: tarfile.TarInfo, name: str, folder: pathlib.Path) -> bool:
-    """True if a member is a regular file that has this name in the folder, and no link leads out of there."""
+    """True if a member is a regular file that has this name in the folder, and no link leads out of
+    there.
+    """
     target = folder / name
-    if not member.isreg() or member.sparse or ".." in target.parts or f"{folder}/{name}" != str(target):
+    if (
+        not member.isreg()
+        or member.sparse
+        or ".." in target.parts
+        or f"{folder}/{name}" != str(target)
+    ):
         return False
     return target.resolve().is_relative_to(folder.resolve())
 
@@ -148,7 +168,8 @@ def _opened(path: pathlib.Path) -> Iterator[tarfile.TarFile]:
             for what, value in _machine().items():
                 if made_for[what] != value:
                     raise CongraspError(
-                        f"{path} was made for {what} {made_for[what]!a:.80}, but this machine has {value}.",
+                        f"{path} was made for {what} {made_for[what]!a:.80}, but this machine has "
+                        f"{value}.",
                         "Run 'congrasp warmup' here instead.",
                     )
             yield archive

@@ -1,6 +1,7 @@
 """Guard between a policy and a robot: a command every tick, even if the policy fails.
 
-A separate thread queries the policy, so that the network does not block the control loop. Needs only NumPy.
+A separate thread queries the policy, so that the network does not block the control loop. Needs
+only NumPy.
 """
 
 import collections
@@ -23,7 +24,11 @@ Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
 _END = 2.0  # deadline for the end of the querying thread, s
 _LIFTED = 0.02  # m above its first height at which an object counts as held
-_OBJECT = {"object_position": 3, "object_quaternion": 4}  # measurements by a tracker and their sizes
+# Measurements by a tracker and their sizes
+_OBJECT = {
+    "object_position": 3,
+    "object_quaternion": 4,
+}
 
 
 @dataclasses.dataclass
@@ -72,12 +77,14 @@ class Command(NamedTuple):
     u_target: np.ndarray
     """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
     q_torque: np.ndarray
-    """(F,) finger joint torques that correspond to the targets, for a torque-controlled robot, N.m."""
+    """(F,) finger joint torques that correspond to the targets, for a torque-controlled robot,
+    N.m.
+    """
     u_torque: np.ndarray
     """(6,) wrist forces and torques, likewise, N and N.m."""
     mode: Mode
-    """`follow`: targets of the policy; `hold`: the last targets, until the policy answers again; `freeze` and `open`:
-    the fallback, until `reset`."""
+    """`follow`: targets of the policy; `hold`: the last targets, until the policy answers again;
+    `freeze` and `open`: the fallback, until `reset`."""
     answer: Answer | None
     """The answer that it follows; None in the other modes."""
 
@@ -85,21 +92,23 @@ class Command(NamedTuple):
 class Guard(Closing):
     """A policy whose answers reach a robot only within limits and while they are fresh.
 
-    An answer is fresh if the state of its query is at most `stale` seconds old. While there is none, the last targets
-    are held; after `hold` seconds without one, the fallback applies until the next `reset`: `freeze` keeps the targets
-    and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
-    `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The
-    policy continues from the commanded targets, not from those that it requested.
+    An answer is fresh if the state of its query is at most `stale` seconds old. While there is
+    none, the last targets are held; after `hold` seconds without one, the fallback applies until
+    the next `reset`: `freeze` keeps the targets and their torques, `open` opens the fingers as fast
+    as the limits allow and keeps the wrist. `open` becomes `freeze` if the object may be held or a
+    measurement is missing; `open()` opens in any case. The policy continues from the commanded
+    targets, not from those that it requested.
 
-    An object may be held once it was 2 cm above its first height, or `table` of a state was false, until the next
-    `reset`; a policy with a camera has no height, so that only `table` counts.
+    An object may be held once it was 2 cm above its first height, or `table` of a state was false,
+    until the next `reset`; a policy with a camera has no height, so that only `table` counts.
 
     Attributes:
       counters: counters of commands and answers.
-      trouble: cause of the last query without an answer; empty while there are answers, also during a fallback.
+      trouble: cause of the last query without an answer; empty while there are answers, also during
+      a fallback.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         policy: Policy,
         limits: JointLimits | None = None,
@@ -117,7 +126,8 @@ class Guard(Closing):
 
         Args:
           policy: the policy.
-          limits: limits of the F finger joints, each of which has a motor, then the six wrist joints; by default those
+          limits: limits of the F finger joints, each of which has a motor, then the six wrist
+          joints; by default those
             of the policy's `metadata`.
           open_pose: (F,) rad, finger angles of `open`; by default those of the metadata.
           period: seconds between two steps.
@@ -125,11 +135,12 @@ class Guard(Closing):
           stale: largest age of the state of a fresh answer, s.
           hold: seconds without a fresh answer until the fallback.
           fallback: `freeze` or `open`.
-          table: a, b, c, d in the world frame: the palm stays where a x + b y + c z >= d; (a, b, c) of length 1.
-          clock: clock in seconds, such as `time.monotonic`.
+          table: a, b, c, d in the world frame: the palm stays where a x + b y + c z >= d; (a, b, c)
+          of length 1. clock: clock in seconds, such as `time.monotonic`.
 
         Raises:
-          CongraspError: limits and open pose do not match, the times are not 0 <= wait < period and 0 < stale <= hold,
+          CongraspError: limits and open pose do not match, the times are not 0 <= wait < period and
+          0 < stale <= hold,
             or there is no such fallback.
           TransportError: the policy's metadata is needed, and there is no response.
         """
@@ -139,7 +150,8 @@ class Guard(Closing):
         if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
             raise CongraspError(
                 "The open pose must have a finite angle for each finger joint of the limits.",
-                "For a hand with fewer motors than joints, make limits of its joints by hand (docs/robots.md).",
+                "For a hand with fewer motors than joints, make limits of its joints by hand "
+                "(docs/robots.md).",
             )
         if not (0.0 <= wait < period and 0.0 < stale <= hold):
             raise CongraspError("The times must be: 0 <= wait < period, and 0 < stale <= hold.")
@@ -163,18 +175,25 @@ class Guard(Closing):
         """Begins an episode; a pending query of the previous one is dropped.
 
         Args:
-          request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
+          request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand
+          must be, and those of
             the fingers continue from the last command. The first episode's start from its `q`.
-          moved: True if the fingers were moved by other means since the last command: their targets also start from
+          moved: True if the fingers were moved by other means since the last command: their targets
+          also start from
             `q`.
 
         Raises:
-          CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no pose.
+          CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no
+          pose.
         """
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
             start[: self._fingers] = self._limiter.target[: self._fingers]
-        floor = Floor(self._table, request.wrist, self._limits.palm) if request.wrist is not None else None
+        floor = (
+            Floor(self._table, request.wrist, self._limits.palm)
+            if request.wrist is not None
+            else None
+        )
         self._limiter = Limiter(self._limits, start, period=self._period, floor=floor)
         self._speeds = Speeds(self._limits.speed, self._stale)
         self._wanted, self._fresh = self._limiter.target, self._clock()
@@ -184,7 +203,9 @@ class Guard(Closing):
         self._asker.begin(request)
 
     def open(self) -> None:
-        """Opens the fingers from the next step on, until `reset` or `freeze`, even if they hold an object."""
+        """Opens the fingers from the next step on, until `reset` or `freeze`, even if they hold an
+        object.
+        """
         self._latched = "open"
 
     def freeze(self) -> None:
@@ -195,7 +216,8 @@ class Guard(Closing):
         """The next command; returns after at most `wait` seconds, and accepts invalid states.
 
         Args:
-          state: see `Policy.act`; missing fields count as not measured. Missing joint velocities are estimated from
+          state: see `Policy.act`; missing fields count as not measured. Missing joint velocities
+          are estimated from
             successive positions, for the limits and for the policy.
 
         Raises:
@@ -204,10 +226,20 @@ class Guard(Closing):
         if self._limiter is None:
             raise RefusedError("There is no episode yet.", "Begin one with reset.")
         now = self._clock()
-        targets = dict(zip(("q_target", "u_target"), np.split(self._limiter.target, [self._fingers]), strict=True))
-        lacking = {name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state}
+        targets = dict(
+            zip(
+                ("q_target", "u_target"),
+                np.split(self._limiter.target, [self._fingers]),
+                strict=True,
+            )
+        )
+        lacking = {
+            name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state
+        }
         position, velocity = self._measured(state, now)
-        speeds = dict(zip(("q_velocity", "u_velocity"), np.split(velocity, [self._fingers]), strict=True))
+        speeds = dict(
+            zip(("q_velocity", "u_velocity"), np.split(velocity, [self._fingers]), strict=True)
+        )
         self._take(self._asker.exchange({**speeds, **state, **lacking, **targets}, now, self._wait))
         mode = self._mode(state, np.append(position, velocity))
         if mode == "open":
@@ -217,7 +249,9 @@ class Guard(Closing):
         limited = self._limiter.limit(self._wanted, position, velocity, now)
         for name in ("steps", mode if mode in ("follow", "hold") else "fallback", *limited.by):
             setattr(self.counters, name, getattr(self.counters, name) + 1)
-        (q_target, u_target), (q_torque, u_torque) = (np.split(x, [self._fingers]) for x in limited[:2])
+        (q_target, u_target), (q_torque, u_torque) = (
+            np.split(x, [self._fingers]) for x in limited[:2]
+        )
         answer = self._answer if mode == "follow" else None
         return Command(q_target, u_target, q_torque, u_torque, mode, answer)
 
@@ -236,7 +270,9 @@ class Guard(Closing):
             self.counters.refused += isinstance(answer, RefusedError)
             self.counters.lost += not isinstance(answer, RefusedError)
             return
-        wanted = np.append(as_numbers(answer.q_target, self._fingers), as_numbers(answer.u_target, 6))
+        wanted = np.append(
+            as_numbers(answer.q_target, self._fingers), as_numbers(answer.u_target, 6)
+        )
         if not np.isfinite(wanted).all():
             self.counters.invalid += 1
         elif not 0.0 <= self._clock() - asked <= self._stale:
@@ -261,9 +297,16 @@ class Guard(Closing):
     def _measured(self, state: State, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (F + 6,) of a state; velocities that it lacks are estimated."""
         sizes = {"q": self._fingers, "u": 6}
-        position = np.concatenate([as_numbers(state.get(name), size) for name, size in sizes.items()])
-        estimated = dict(zip(sizes, np.split(self._speeds.of(position, now), [self._fingers]), strict=True))
-        velocity = [as_numbers(state.get(f"{name}_velocity", estimated[name]), size) for name, size in sizes.items()]
+        position = np.concatenate(
+            [as_numbers(state.get(name), size) for name, size in sizes.items()]
+        )
+        estimated = dict(
+            zip(sizes, np.split(self._speeds.of(position, now), [self._fingers]), strict=True)
+        )
+        velocity = [
+            as_numbers(state.get(f"{name}_velocity", estimated[name]), size)
+            for name, size in sizes.items()
+        ]
         return position, np.concatenate(velocity)
 
 
@@ -306,7 +349,8 @@ class _Asker:
             self._request, self._question, self._outcome = request, None, None
 
     def exchange(self, state: State, now: float, timeout: float) -> _Outcome | None:
-        """Queries with a state, unless a query is pending, and returns the newest outcome within the timeout.
+        """Queries with a state, unless a query is pending, and returns the newest outcome within
+        the timeout.
 
         Args:
           state: the state.
@@ -314,7 +358,8 @@ class _Asker:
           timeout: seconds to wait.
 
         Returns:
-          An outcome that was not returned before, of this state or of an earlier one; None without one.
+          An outcome that was not returned before, of this state or of an earlier one; None without
+          one.
         """
         with self._changed:
             earlier, self._outcome = self._outcome, None
@@ -357,7 +402,11 @@ class _Asker:
             if request is not None:
                 self._policy.reset(request)
             answer = self._policy.act(state)
-            return answer if isinstance(answer, Answer) else TransportError("The policy's answer is none.")
+            return (
+                answer
+                if isinstance(answer, Answer)
+                else TransportError("The policy's answer is none.")
+            )
         except TransportError as error:
             return error
         except Exception as error:
@@ -370,7 +419,8 @@ _KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
 class Ticker:
     """Ticks at multiples of a period.
 
-    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to avoid a burst.
+    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to
+    avoid a burst.
 
     Attributes:
       period: s.

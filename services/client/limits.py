@@ -1,6 +1,7 @@
 """Limits of commands to a robot for any input; needs NumPy only.
 
-NaN fails every comparison: a target that is NaN, infinite or of the wrong shape holds the joint at its last target.
+NaN fails every comparison: a target that is NaN, infinite or of the wrong shape holds the joint at
+its last target.
 """
 
 import dataclasses
@@ -24,10 +25,12 @@ _SHORTEST = 1e-9
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J = F + 6.
+    """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J
+    = F + 6.
 
-    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of speed, acceleration
-    and torque is limited, to the least of the three limits; likewise for the hinges.
+    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of
+    speed, acceleration and torque is limited, to the least of the three limits; likewise for the
+    hinges.
     """
 
     lower: np.ndarray
@@ -45,27 +48,39 @@ class JointLimits:
     acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     """(J,) greatest acceleration of a target; 0, the default, for no limit."""
     palm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 4)))
-    """(K, 4) m: centres in the wrist frame and radii of spheres that must stay above the table (`Guard`)."""
+    """(K, 4) m: centres in the wrist frame and radii of spheres that must stay above the table
+    (`Guard`).
+    """
 
     def __post_init__(self) -> None:
         if not np.size(self.acceleration):
             object.__setattr__(self, "acceleration", np.zeros(np.shape(self.lower)))
         for field in dataclasses.fields(self):
             value = np.array(getattr(self, field.name), float)
-            fits = value.shape[1:] == (4,) if field.name == "palm" else value.shape == np.shape(self.lower)
+            fits = (
+                value.shape[1:] == (4,)
+                if field.name == "palm"
+                else value.shape == np.shape(self.lower)
+            )
             if not fits or not np.isfinite(value).all():
-                raise CongraspError(f"The limits' '{field.name}' must be finite numbers of the documented shape.")
+                raise CongraspError(
+                    f"The limits' '{field.name}' must be finite numbers of the documented shape."
+                )
             if field.name not in ("lower", "upper", "palm") and not (value >= 0.0).all():
                 raise CongraspError(f"The limits' '{field.name}' must not be negative.")
             value.flags.writeable = False
             object.__setattr__(self, field.name, value)
         if self.lower.ndim != 1 or len(self.lower) < 6:
-            raise CongraspError("The limits are of the finger joints and the six joints of the wrist.")
+            raise CongraspError(
+                "The limits are of the finger joints and the six joints of the wrist."
+            )
         if not (self.lower <= self.upper).all() or not (self.kp > 0.0).all():
-            raise CongraspError("The limits have a lower bound above the upper one, or a kp that is not positive.")
+            raise CongraspError(
+                "The limits have a lower bound above the upper one, or a kp that is not positive."
+            )
 
     @classmethod
-    def of_hand(
+    def of_hand(  # noqa: PLR0913
         cls,
         hand: "Hand",
         control: "ControlConfig | None" = None,
@@ -78,11 +93,12 @@ class JointLimits:
         margin: float = 0.03,
         grip: float = math.inf,
     ) -> Self:
-        """Limits of the fingers' motors, then of the six wrist joints, with gains and torques of the hand's model.
+        """Limits of the fingers' motors, then of the six wrist joints, with gains and torques of
+        the hand's model.
 
-        The wrist's targets have the task's acceleration limits (`ControlConfig`); its force and torque are limited to
-        those that accelerate the hand's inertia as much. Most hands have a motor for each finger joint; see
-        `common.hands.motors` for others.
+        The wrist's targets have the task's acceleration limits (`ControlConfig`); its force and
+        torque are limited to those that accelerate the hand's inertia as much. Most hands have a
+        motor for each finger joint; see `common.hands.motors` for others.
 
         Args:
           hand: the hand (`common.hands.get_hand`).
@@ -90,10 +106,11 @@ class JointLimits:
           finger_speed: speed limit of the fingers, rad/s.
           wrist_speed: speed limit of the wrist, m/s.
           wrist_angular_speed: angular speed limit of the wrist, rad/s.
-          reach: largest displacement of the wrist since the start of the episode, along each axis, m.
-          turn: largest rotation, likewise, rad.
-          margin: distance of finger targets from the ends of their joints, rad; narrow joints stay in their middle.
-          grip: limit of the force of a straight finger at its tip, N; that of a bent one is larger, as its lever is
+          reach: largest displacement of the wrist since the start of the episode, along each axis,
+          m. turn: largest rotation, likewise, rad.
+          margin: distance of finger targets from the ends of their joints, rad; narrow joints stay
+          in their middle. grip: limit of the force of a straight finger at its tip, N; that of a
+          bent one is larger, as its lever is
             shorter.
         """
         from congrasp.common.hands.motors import motor_limits
@@ -104,14 +121,19 @@ class JointLimits:
         strongest = np.where(allowed > 0.0, allowed * hand.wrist_inertia, np.inf)
         force = np.minimum(strongest, [wrist.slide_limit, wrist.hinge_limit])
         levers = _levers(hand)
-        fingers = [min(m.torque_limit, grip * max(levers.get(name, 0.0) for name in m.joints)) for m in motors]
+        fingers = [
+            min(m.torque_limit, grip * max(levers.get(name, 0.0) for name in m.joints))
+            for m in motors
+        ]
         lower, upper = motor_limits(hand)
         middle = (lower + upper) / 2
         palm = [(*end, c.radius) for c in hand.links[0].capsules for end in (c.start, c.end)]
         return cls(
             lower=np.append(np.minimum(lower + margin, middle), np.repeat([-reach, -turn], 3)),
             upper=np.append(np.maximum(upper - margin, middle), np.repeat([reach, turn], 3)),
-            speed=np.append(np.full(len(motors), finger_speed), np.repeat([wrist_speed, wrist_angular_speed], 3)),
+            speed=np.append(
+                np.full(len(motors), finger_speed), np.repeat([wrist_speed, wrist_angular_speed], 3)
+            ),
             torque=np.append(fingers, np.repeat(force, 3)),
             kp=np.append([m.kp for m in motors], np.repeat([wrist.slide_kp, wrist.hinge_kp], 3)),
             kv=np.append([m.kv for m in motors], np.repeat([wrist.slide_kv, wrist.hinge_kv], 3)),
@@ -121,17 +143,23 @@ class JointLimits:
 
     def as_lists(self) -> dict[str, Any]:
         """The fields as lists, for JSON; `JointLimits(**fields)` is the inverse."""
-        return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
+        return {
+            field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)
+        }
 
 
 def _levers(hand: "Hand") -> dict[str, float]:
-    """Distances, m, from joints by name to the farthest fingertip that they move, with every joint at zero."""
+    """Distances, m, from joints by name to the farthest fingertip that they move, with every joint
+    at zero.
+    """
     links, found = {link.name: link for link in hand.links}, dict[str, float]()
     for tip in (link for link in hand.links if link.tip is not None):
         link = tip
         while link.joints:
             for joint in link.joints:
-                found[joint.name] = max(found.get(joint.name, 0.0), math.dist(joint.anchor, tip.tip or ()))
+                found[joint.name] = max(
+                    found.get(joint.name, 0.0), math.dist(joint.anchor, tip.tip or ())
+                )
             link = links[link.parent]
     return found
 
@@ -142,10 +170,12 @@ class Limited(NamedTuple):
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
     torque: np.ndarray
-    """(J,) torques of the servos at that target, within the limits; at the last measured position if a measurement is
-    not finite."""
+    """(J,) torques of the servos at that target, within the limits; at the last measured position
+    if a measurement is not finite."""
     by: tuple[str, ...]
-    """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
+    """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`,
+    `position`, `table`.
+    """
 
 
 class Speeds:
@@ -156,7 +186,8 @@ class Speeds:
 
         Args:
           most: (J,) largest plausible speed, rad/s or m/s.
-          lasting: seconds for which a speed counts after the change of the position; measurements may arrive at a lower
+          lasting: seconds for which a speed counts after the change of the position; measurements
+          may arrive at a lower
             rate than steps.
         """
         self._most, self._lasting = most, lasting
@@ -164,7 +195,8 @@ class Speeds:
         self._speed = np.zeros(len(most))
 
     def of(self, position: np.ndarray, now: float) -> np.ndarray:
-        """Speeds (J,) at a measurement: each joint's displacement since its last change over the time; zero at first.
+        """Speeds (J,) at a measurement: each joint's displacement since its last change over the
+        time; zero at first.
 
         Args:
           position: (J,) measured; the last three are angles modulo full turns.
@@ -176,7 +208,8 @@ class Speeds:
         changed = position != self._position  # also where it is not finite
         speed = np.where(known, way / np.maximum(elapsed, 1e-6), 0.0)
         self._speed = _bounded(
-            np.where(changed, speed, np.where(elapsed <= self._lasting, self._speed, 0.0)), self._most
+            np.where(changed, speed, np.where(elapsed <= self._lasting, self._speed, 0.0)),
+            self._most,
         )
         self._position, self._when = position, np.where(changed, now, self._when)
         return self._speed
@@ -185,16 +218,23 @@ class Speeds:
 class Limiter:
     """Targets within limits.
 
-    A target stays within the limits of position and speed. Within those of speed, it is moved to where the servo's
-    torque is within its limit, so that a blocked joint is not wound up, and a jump of a measurement moves no target
-    faster than usual. Limits of position and the table have priority over those of acceleration: a target stops there
-    at once.
+    A target stays within the limits of position and speed. Within those of speed, it is moved to
+    where the servo's torque is within its limit, so that a blocked joint is not wound up, and a
+    jump of a measurement moves no target faster than usual. Limits of position and the table have
+    priority over those of acceleration: a target stops there at once.
 
     Attributes:
       target: (J,) the last target.
     """
 
-    def __init__(self, limits: JointLimits, start: np.ndarray, *, period: float = 0.01, floor: "Floor | None" = None):
+    def __init__(
+        self,
+        limits: JointLimits,
+        start: np.ndarray,
+        *,
+        period: float = 0.01,
+        floor: "Floor | None" = None,
+    ):
         """Starts from a position, clipped to the limits.
 
         Args:
@@ -204,11 +244,14 @@ class Limiter:
           floor: plane below the palm; a palm that starts below it does not move deeper.
 
         Raises:
-          CongraspError: the start is not a finite number for each joint, or the period not positive.
+          CongraspError: the start is not a finite number for each joint, or the period not
+          positive.
         """
         first = as_numbers(start, len(limits.lower))
         if not np.isfinite(first).all() or not 0.0 < period < math.inf:
-            raise CongraspError("A limiter starts from one finite number for each joint, and has a positive period.")
+            raise CongraspError(
+                "A limiter starts from one finite number for each joint, and has a positive period."
+            )
         self._limits, self._period, self._floor, self._latest = limits, period, floor, -math.inf
         self.target = np.clip(first, limits.lower, limits.upper)
         self._position, self._speed = self.target, np.zeros(len(first))
@@ -235,7 +278,9 @@ class Limiter:
             inside = np.clip(last + soft, limits.lower, limits.upper)
             self.target = self._above(inside, last)
             self._speed = (self.target - last) / elapsed if elapsed else np.zeros(len(last))
-            torque = _bounded(limits.kp * (self.target - self._position) - limits.kv * v, limits.torque)
+            torque = _bounded(
+                limits.kp * (self.target - self._position) - limits.kv * v, limits.torque
+            )
         changed = {
             "not_finite": not (known & measured).all(),
             "torque": not np.allclose(within, wanted, rtol=0.0, atol=_EQUAL),
@@ -248,22 +293,36 @@ class Limiter:
         return Limited(self.target.copy(), np.where(np.isfinite(torque), torque, 0.0), by)
 
     def _allowed(self, way: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the displacements (J,) within the limits of speed, and within those of speed and acceleration."""
+        """Returns the displacements (J,) within the limits of speed, and within those of speed and
+        acceleration.
+        """
         limits = self._limits
         bounded = _bounded(way, limits.speed * elapsed)
         if not elapsed or not limits.acceleration.any():
             return bounded, bounded
-        free, gain = limits.acceleration == 0.0, limits.acceleration * elapsed  # m/s and rad/s in one step
-        distance = np.append(np.abs(way[:-6]), np.repeat(np.linalg.norm(way[-6:].reshape(2, 3), axis=1), 3))
-        # From v, v - gain, v - 2 gain, … a target comes to rest where the way ends, after this many steps.
+        # M/s and rad/s in one step
+        free, gain = (
+            limits.acceleration == 0.0,
+            limits.acceleration * elapsed,
+        )
+        distance = np.append(
+            np.abs(way[:-6]), np.repeat(np.linalg.norm(way[-6:].reshape(2, 3), axis=1), 3)
+        )
+        # From v, v - gain, v - 2 gain, … a target comes to rest where the way ends, after this many
+        # steps.
         steps = np.maximum(np.ceil((np.sqrt(1 + 8 * distance / (gain * elapsed)) - 1) / 2), 1)
         braking = distance / (steps * elapsed) + (steps - 1) * gain / 2
-        speed = _bounded(way, np.where(free, limits.speed, np.minimum(limits.speed, braking)) * elapsed) / elapsed
+        speed = (
+            _bounded(way, np.where(free, limits.speed, np.minimum(limits.speed, braking)) * elapsed)
+            / elapsed
+        )
         change = _bounded(speed - self._speed, np.where(free, np.inf, gain))
         return bounded, (self._speed + change) * elapsed
 
     def _above(self, target: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Returns the target, or the nearest one without further rotation that keeps the palm above the floor."""
+        """Returns the target, or the nearest one without further rotation that keeps the palm above
+        the floor.
+        """
         if self._floor is None:
             return target
         limits, floor = self._limits, self._floor
@@ -276,7 +335,9 @@ class Limiter:
         return raised if inside else np.append(target[:-6], last[-6:])
 
     def _elapsed(self, now: float) -> float:
-        """Seconds since the last target, at most a period, so that targets do not catch up after a pause."""
+        """Seconds since the last target, at most a period, so that targets do not catch up after a
+        pause.
+        """
         spent = now - self._latest
         if not (math.isfinite(now) and spent >= _SHORTEST):
             return 0.0
@@ -285,12 +346,15 @@ class Limiter:
 
 
 def _bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """(J,) values clipped to limits: those of fingers separately, those of the wrist's slides and hinges by norm."""
+    """(J,) values clipped to limits: those of fingers separately, those of the wrist's slides and
+    hinges by norm.
+    """
     bounded = np.clip(values, -most, most)
     for three in (slice(-6, -3), slice(-3, None)):
         length, longest = np.linalg.norm(values[three]), most[three].min()
         if not length <= longest:
-            bounded[three] = np.clip(values[three] * (longest / length), -longest, longest)  # rounding
+            # Rounding
+            bounded[three] = np.clip(values[three] * (longest / length), -longest, longest)
     return bounded
 
 
@@ -310,16 +374,23 @@ class Floor:
         """Takes the poses of an episode.
 
         Args:
-          plane: (4,) a, b, c, d, world frame: points with a x + b y + c z >= d are above; (a, b, c) of length 1.
-          wrist: the base of the wrist joints, world frame.
+          plane: (4,) a, b, c, d, world frame: points with a x + b y + c z >= d are above; (a, b, c)
+          of length 1. wrist: the base of the wrist joints, world frame.
           palm: see `JointLimits`.
 
         Raises:
           CongraspError: the normal is not of length 1, or a number is not finite.
         """
-        plane, position, quaternion = (as_numbers(x, n) for x, n in ((plane, 4), (wrist[0], 3), (wrist[1], 4)))
-        if not abs(np.linalg.norm(plane[:3]) - 1.0) < 1e-3 or not abs(np.linalg.norm(quaternion) - 1.0) < 0.02:
-            raise CongraspError("The table's normal and the wrist's quaternion must have the length 1.")
+        plane, position, quaternion = (
+            as_numbers(x, n) for x, n in ((plane, 4), (wrist[0], 3), (wrist[1], 4))
+        )
+        if (
+            not abs(np.linalg.norm(plane[:3]) - 1.0) < 1e-3
+            or not abs(np.linalg.norm(quaternion) - 1.0) < 0.02
+        ):
+            raise CongraspError(
+                "The table's normal and the wrist's quaternion must have the length 1."
+            )
         self.normal = _matrix(quaternion).T @ plane[:3]
         """(3,) normal of the plane in the frame of the base."""
         self._offset, self._palm = plane[3] - plane[:3] @ position, palm
@@ -341,6 +412,9 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
 
 def _turned(angles: np.ndarray) -> np.ndarray:
     """(3, 3) rotation by intrinsic x-y-z angles (3,)."""
-    turns = (np.append(np.cos(half := angle / 2), np.sin(half) * np.eye(3)[axis]) for axis, angle in enumerate(angles))
+    turns = (
+        np.append(np.cos(half := angle / 2), np.sin(half) * np.eye(3)[axis])
+        for axis, angle in enumerate(angles)
+    )
     x, y, z = map(_matrix, turns)
     return x @ y @ z

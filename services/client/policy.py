@@ -1,4 +1,5 @@
-"""Policies for control loops, local or remote: their interface, memory of one episode and queries; needs only NumPy.
+"""Policies for control loops, local or remote: their interface, memory of one episode and queries;
+needs only NumPy.
 
 A left hand's policy is that of the right one, with mirrored states and targets.
 """
@@ -42,7 +43,9 @@ class Answer(NamedTuple):
     q_target: np.ndarray
     """(F,) finger joint targets, rad."""
     u_target: np.ndarray
-    """(6,) virtual wrist targets relative to the base: x, y, z in m, then intrinsic x-y-z angles in rad."""
+    """(6,) virtual wrist targets relative to the base: x, y, z in m, then intrinsic x-y-z angles in
+    rad.
+    """
     action: np.ndarray
     """(M + 6,) the policy's raw action."""
     version: int
@@ -58,20 +61,22 @@ class Answer(NamedTuple):
 class Policy(Closing, Protocol):
     """Joint targets for one hand and object, one control step after the other.
 
-    It remembers the start of the episode and the previous targets. `PolicyClient` queries a server, `LocalPolicy`
-    computes in this process; checks, messages and answers are the same.
+    It remembers the start of the episode and the previous targets. `PolicyClient` queries a server,
+    `LocalPolicy` computes in this process; checks, messages and answers are the same.
 
-    Frames: the world frame, except for `u` (relative to the base, which is the wrist's pose at `reset`) and for
-    constraints and surface points (object frame). Metres, radians, newtons; quaternions (w, x, y, z).
+    Frames: the world frame, except for `u` (relative to the base, which is the wrist's pose at
+    `reset`) and for constraints and surface points (object frame). Metres, radians, newtons;
+    quaternions (w, x, y, z).
     """
 
     def reset(self, request: GraspRequest) -> None:
         """Begins an episode; constraints and arrays are checked by the first `act`.
 
         Args:
-          request: with `surface`, `q`, `wrist` (the base from now on) and `object_pose`, the goal arrays of its
-            constraints, and `avoid` if the affordance is among them. A policy with a camera takes `cloud` instead of
-            `surface` and `object_pose`, and constraints in the world frame.
+          request: with `surface`, `q`, `wrist` (the base from now on) and `object_pose`, the goal
+          arrays of its
+            constraints, and `avoid` if the affordance is among them. A policy with a camera takes
+            `cloud` instead of `surface` and `object_pose`, and constraints in the world frame.
 
         Raises:
           RefusedError: the request lacks one of them, or a value is no array of numbers.
@@ -82,26 +87,32 @@ class Policy(Closing, Protocol):
         """Joint targets for the current state.
 
         Args:
-          state: `q`, `u`, `object_position`, `object_quaternion`; optionally `table` (True by default) and, from
-            sensors, `q_velocity`, `u_velocity`, `object_velocity`, `object_angular_velocity`, `contact_force`,
-            `contact_position`, `contact_found` and `wrist_load`, by the names and shapes of
-            `common.task.types.SceneState` without the batch axis. A policy with a camera takes no pose of the object
-            but, from a newer image, `cloud` (N, 3) in the world frame.
+          state: `q`, `u`, `object_position`, `object_quaternion`; optionally `table` (True by
+          default) and, from
+            sensors, `q_velocity`, `u_velocity`, `object_velocity`, `object_angular_velocity`,
+            `contact_force`, `contact_position`, `contact_found` and `wrist_load`, by the names and
+            shapes of `common.task.types.SceneState` without the batch axis. A policy with a camera
+            takes no pose of the object but, from a newer image, `cloud` (N, 3) in the world frame.
 
         Raises:
-          RefusedError: the request or the state is invalid. Its subclasses in `common.errors` are errors that a program
-            can handle: an unknown constraint, a contradiction, an overloaded server, a deadline missed there.
+          RefusedError: the request or the state is invalid. Its subclasses in `common.errors` are
+          errors that a program
+            can handle: an unknown constraint, a contradiction, an overloaded server, a deadline
+                missed there.
           TransportError: there is no response from the server.
         """
         ...
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
-        """Joint targets for each of several states, as `act` would return them now; the episode does not advance.
+        """Joint targets for each of several states, as `act` would return them now; the episode
+        does not advance.
 
-        For planners that compare candidates: one query for all of them is much cheaper than one for each.
+        For planners that compare candidates: one query for all of them is much cheaper than one for
+        each.
 
         Args:
-          states: see `act`; 1 to 64. A state may also have `time` in control steps, and `q_target` and `u_target`,
+          states: see `act`; 1 to 64. A state may also have `time` in control steps, and `q_target`
+          and `u_target`,
             from which its targets continue.
 
         Raises:
@@ -113,10 +124,11 @@ class Policy(Closing, Protocol):
         """Returns hand, limits and timing of the policy.
 
         Returns:
-          `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
-          `JointLimits`, or None for a hand whose joints share motors; `period`, seconds of a control step;
-          `approach_steps`, control steps before the table is removed in training; `observation` (`full`,
-          `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`; `query`, the layout of queries
+          `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the
+          fields of `JointLimits`, or None for a hand whose joints share motors; `period`, seconds
+          of a control step; `approach_steps`, control steps before the table is removed in
+          training; `observation` (`full`, `tracked` or `camera`), `constraints`, `surface_points`,
+          `trajectory_points`; `query`, the layout of queries
           (`services.serve.requests.Layout.description`).
 
         Raises:
@@ -130,7 +142,9 @@ class Policy(Closing, Protocol):
 
 
 class EpisodePolicy(Policy):
-    """A `Policy` whose subclass answers one query at a time (`services.serve.requests` has their form)."""
+    """A `Policy` whose subclass answers one query at a time (`services.serve.requests` has their
+    form).
+    """
 
     def __init__(self) -> None:
         self._request: GraspRequest | None = None
@@ -138,8 +152,11 @@ class EpisodePolicy(Policy):
         self._layout: Mapping[str, Any] | None = None
         self._packer: Packer | None = None
         self._time = 0
-        self._rested = np.asarray(1)  # number of readings in the mean of the object's pose; 0 once it has moved
-        self._past: list[Mapping[str, np.ndarray]] = []  # readings of earlier control steps, newest first
+        # Number of readings in the mean of the object's pose; 0 once it has moved
+        self._rested = np.asarray(1)
+        self._past: list[
+            Mapping[str, np.ndarray]
+        ] = []  # readings of earlier control steps, newest first
 
     def _query(self, query: Message) -> Message:
         """The reply to a query.
@@ -188,7 +205,9 @@ class EpisodePolicy(Policy):
         """See `Policy.close`."""
 
     def _packing(self) -> "Packer":
-        """The form of the episode's queries, in the layout that the policy's metadata has had since the connection."""
+        """The form of the episode's queries, in the layout that the policy's metadata has had since
+        the connection.
+        """
         if self._request is None:
             raise RefusedError("There is no episode yet.", "Begin one with reset.")
         if self._layout is None:
@@ -198,7 +217,9 @@ class EpisodePolicy(Policy):
         return self._packer
 
     def _resting(self, state: State, settle: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Returns the resting pose with this reading, if the policy uses the mean, and the number of readings."""
+        """Returns the resting pose with this reading, if the policy uses the mean, and the number
+        of readings.
+        """
         if not (settle and self._time and {"object_position", "object_quaternion"} <= state.keys()):
             return {}, self._rested
         mean = np.concatenate([self._fields[name] for name in _FIRST])
@@ -210,7 +231,9 @@ class EpisodePolicy(Policy):
         return dict(zip(_FIRST, np.split(mean.astype(np.float32), [3]), strict=True)), rested
 
     def _ask(self, began: float, states: Sequence[State]) -> list[Answer]:
-        """Returns the answers to one query, which is repeated if the policy's layout has changed."""
+        """Returns the answers to one query, which is repeated if the policy's layout has
+        changed.
+        """
         try:
             reply = self._query(self._packed(states))
         except LayoutError:  # another server has replaced the one with this layout
@@ -229,7 +252,9 @@ class EpisodePolicy(Policy):
         packer, fields = self._packing(), self._fields
         now = {"time": np.asarray(self._time), "table": np.asarray(True)}
         now |= {name: fields[name] for name in ("q_target", "u_target", *_FIRST) if name in fields}
-        return packer.pack([{**now, **_with_own_normals(state, fields)} for state in states], self._past)
+        return packer.pack(
+            [{**now, **_with_own_normals(state, fields)} for state in states], self._past
+        )
 
 
 class Packer:
@@ -250,18 +275,28 @@ class Packer:
         Args:
           layout: `query` of the policy's metadata.
           episode: fields that stay the same.
-          constraints: goal arrays of each constraint. Those of a constraint that the policy lacks are not packed: the
+          constraints: goal arrays of each constraint. Those of a constraint that the policy lacks
+          are not packed: the
             policy refuses its name.
 
         Raises:
           RefusedError: a field is unknown, absent, of the wrong shape or in another unit.
         """
         self._layout, self._fields, self.settle = layout, layout["fields"], float(layout["settle"])
-        self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
+        self._past = {
+            name: self._fields[f"past_{name}"][1]
+            for name in _READ
+            if f"past_{name}" in self._fields
+        }
         needs = layout["constraints"]
         known = {name: own for name, own in constraints.items() if name in needs}
-        goals = {f"{name}_{field}": value for name, own in known.items() for field, value in own.items()}
-        fields = {**episode, **_checked({name: _numbers(name, value) for name, value in goals.items()})}
+        goals = {
+            f"{name}_{field}": value for name, own in known.items() for field, value in own.items()
+        }
+        fields = {
+            **episode,
+            **_checked({name: _numbers(name, value) for name, value in goals.items()}),
+        }
         _require([field for name in known for field in needs[name]], fields)
         self._meta = {"constraints": list(constraints), "layout": layout["digest"]}
         self._vector = np.zeros(layout["size"], np.float32)
@@ -273,33 +308,51 @@ class Packer:
         The oldest step is repeated where the history reaches back beyond the start of the episode.
 
         Raises:
-          RefusedError: there are too many states, or a field is unknown, absent, of the wrong shape or in another unit.
+          RefusedError: there are too many states, or a field is unknown, absent, of the wrong shape
+          or in another unit.
         """
         if len(states) > self._layout["states"]:
             raise RefusedError(
-                f"These are {len(states)} states.", f"The policy takes {self._layout['states']} at a time."
+                f"These are {len(states)} states.",
+                f"The policy takes {self._layout['states']} at a time.",
             )
         vectors = np.tile(self._vector, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
             _require([name for name in _MEASURED if name in self._fields], state)
-            self._write(vector, _checked({name: _numbers(name, value) for name, value in state.items()}))
+            self._write(
+                vector, _checked({name: _numbers(name, value) for name, value in state.items()})
+            )
             for name, steps in self._past.items():
                 rows = [_numbers(name, reading[name]) for reading in (past or [state])[:steps]]
-                self._write(vector, {f"past_{name}": np.stack(rows + rows[-1:] * (steps - len(rows)))})
+                self._write(
+                    vector, {f"past_{name}": np.stack(rows + rows[-1:] * (steps - len(rows)))}
+                )
         return Message({PACKED: vectors}, self._meta)
 
     def _write(self, vector: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """Writes fields to their places in a vector; points are spread over as many as the policy observes."""
+        """Writes fields to their places in a vector; points are spread over as many as the policy
+        observes.
+        """
         points = [fields[name].shape[:1] for name in _POINTS if name in fields]
         for name, value in fields.items():
-            if name not in self._fields and name in (NORMALS, CAMERA):  # the policy does not observe normals
+            if name not in self._fields and name in (
+                NORMALS,
+                CAMERA,
+            ):  # the policy does not observe normals
                 continue
             if name not in self._fields:
-                raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
+                raise RefusedError(
+                    f"The query has an unknown field '{name}'.",
+                    f"Known: {', '.join(self._fields)}.",
+                )
             offset, *shape = self._fields[name]
-            given = (max(*points[0], 1), *shape[1:]) if name in _POINTS and points[0] else tuple(shape)
+            given = (
+                (max(*points[0], 1), *shape[1:]) if name in _POINTS and points[0] else tuple(shape)
+            )
             if value.shape != given:
-                raise RefusedError(f"The field '{name}' has shape {value.shape}; it must be {given}.")
+                raise RefusedError(
+                    f"The field '{name}' has shape {value.shape}; it must be {given}."
+                )
             if given != tuple(shape):
                 value = value[np.arange(shape[0]) * len(value) // shape[0]]
             vector[offset : offset + math.prod(shape)] = value.ravel()
@@ -316,9 +369,15 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
     required = _REQUIRED if request.cloud is None else _WITH_CAMERA
     lacking = [f"'{name}'" for name in required if getattr(request, name) is None]
     if lacking or request.wrist is None:
-        raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop starts from measured poses.")
+        raise RefusedError(
+            f"The request lacks {' and '.join(lacking)}.",
+            "A control loop starts from measured poses.",
+        )
     if request.above:
-        raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
+        raise RefusedError(
+            "The request is for a hand from above.",
+            "Give the heading's direction to a control loop.",
+        )
     wrist, turn = _pair("wrist", request.wrist)
     position, quaternion = _pair("object_pose", request.object_pose)
     given = {
@@ -335,21 +394,34 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "surface_normals": request.normals,
         "camera_position": request.camera,
     }
-    return _checked({name: _numbers(name, value) for name, value in given.items() if value is not None})
+    return _checked(
+        {name: _numbers(name, value) for name, value in given.items() if value is not None}
+    )
 
 
 @np.errstate(invalid="ignore")  # of numbers that are not finite, which the first `act` refuses
 def _checked(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Returns the fields; raises a RefusedError for points in mm or cm, by their median, and for angles in degrees."""
+    """Returns the fields; raises a RefusedError for points in mm or cm, by their median, and for
+    angles in degrees.
+    """
     for name in ("surface_points", "cloud"):
         points = fields.get(name)
         if points is None or points.ndim != 2 or not points.size:
             continue
         if (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
-            raise RefusedError(f"The field '{name}' has half of its points beyond {size:.3g} m.", "Give it in metres.")
+            raise RefusedError(
+                f"The field '{name}' has half of its points beyond {size:.3g} m.",
+                "Give it in metres.",
+            )
     for name in filter(_ANGLES.fullmatch, fields):
-        if _TURN < (turn := np.abs(fields[name].ravel()[3 * (name == "u") :]).max(initial=0.0)) < math.inf:
-            raise RefusedError(f"The field '{name}' has an angle of {turn:.4g}.", "Give it in radians.")
+        if (
+            _TURN
+            < (turn := np.abs(fields[name].ravel()[3 * (name == "u") :]).max(initial=0.0))
+            < math.inf
+        ):
+            raise RefusedError(
+                f"The field '{name}' has an angle of {turn:.4g}.", "Give it in radians."
+            )
     return fields
 
 
@@ -363,7 +435,9 @@ def _pair(name: str, pose: Pose | None) -> tuple[Any, Any]:
 
 
 def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
-    """Returns a state whose new points do not get the normals of the episode's first ones: zeros are estimated."""
+    """Returns a state whose new points do not get the normals of the episode's first ones: zeros
+    are estimated.
+    """
     new = [state[name] for name in ("cloud", "surface_points") if name in state]
     if not new or "surface_normals" in state or "surface_normals" not in episode:
         return state
@@ -380,7 +454,9 @@ def _numbers(name: str, value: Any) -> np.ndarray:
 
 
 class LeftPolicy(Policy):
-    """A `Policy` for the left hand, whose states and targets are mirrored for a policy of the right one."""
+    """A `Policy` for the left hand, whose states and targets are mirrored for a policy of the right
+    one.
+    """
 
     def __init__(self, right: Policy):
         """Wraps a policy, and takes over its connection.
@@ -400,7 +476,10 @@ class LeftPolicy(Policy):
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """See `Policy.act_each`."""
-        return [_answer(answer) for answer in self._right.act_each([mirror.fields(state) for state in states])]
+        return [
+            _answer(answer)
+            for answer in self._right.act_each([mirror.fields(state) for state in states])
+        ]
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; the limits are those of the left hand."""
@@ -438,7 +517,9 @@ def _vectors(array: np.ndarray | None) -> np.ndarray | None:
 
 def _answer(answer: Answer) -> Answer:
     """The mirrored answer."""
-    return answer._replace(u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action))
+    return answer._replace(
+        u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action)
+    )
 
 
 def _pose(name: str, pose: Pose | None) -> Pose | None:

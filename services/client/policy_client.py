@@ -47,7 +47,9 @@ class PolicyClient(EpisodePolicy):
 
     def health(self) -> dict[str, object]:
         """Readiness, version, hand and queue of the server."""
-        return dict(self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta)
+        return dict(
+            self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta
+        )
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
@@ -65,9 +67,13 @@ class PolicyClient(EpisodePolicy):
         query = Message({}, {"metadata": True})
         found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
         if "query" not in found:
-            raise RefusedError("The server does not describe its queries.", "Update congrasp where it runs.")
+            raise RefusedError(
+                "The server does not describe its queries.", "Update congrasp where it runs."
+            )
         if found["hand"] != self._hand:
-            raise RefusedError(f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'.")
+            raise RefusedError(
+                f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'."
+            )
         return found
 
     def close(self) -> None:

@@ -1,1 +1,3 @@
-"""Datasets of verified grasps: episodes of a policy under sampled constraints, in Parquet shards."""
+"""Datasets of verified grasps: episodes of a policy under sampled constraints, in Parquet
+shards.
+"""

@@ -1,7 +1,8 @@
 """Makes a dataset, shard by shard: each is a pool of objects with all their episodes.
 
-A shard depends on the policy, the objects, the seed, the engine and the batch, never on other shards. Any number of
-processes can therefore make different ones, and a stopped process resumes with the missing ones.
+A shard depends on the policy, the objects, the seed, the engine and the batch, never on other
+shards. Any number of processes can therefore make different ones, and a stopped process resumes
+with the missing ones.
 """
 
 import collections
@@ -76,9 +77,14 @@ class Recipe:
 
     @functools.cached_property
     def about(self) -> dict[str, Any]:
-        """Description of the dataset in every shard, as JSON; equal for datasets with equal contents."""
+        """Description of the dataset in every shard, as JSON; equal for datasets with equal
+        contents.
+        """
         contents = json.dumps(
-            [dataclasses.asdict(dataclasses.replace(self.options, cache_dir="")), [at.digest() for at in self.objects]]
+            [
+                dataclasses.asdict(dataclasses.replace(self.options, cache_dir="")),
+                [at.digest() for at in self.objects],
+            ]
         )
         return {
             "format": FORMAT,
@@ -129,8 +135,12 @@ def make(
         for pool in ready:
             own = pool.experiment
             columns = grasp_columns(own.hand, own.task)
-            counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
-            rows: list[dict[str, np.ndarray]] = [{c.name: np.zeros((0, *c.shape), c.kind) for c in columns}]
+            counts: dict[str, collections.Counter[str]] = collections.defaultdict(
+                collections.Counter
+            )
+            rows: list[dict[str, np.ndarray]] = [
+                {c.name: np.zeros((0, *c.shape), c.kind) for c in columns}
+            ]
             if pool.real:
                 if running:
                     running.replace_objects(own.scaled, own.field)
@@ -146,8 +156,11 @@ def make(
             shards.write(own.pool, table(columns, found, said), of_objects)
 
 
-def _begun(pool: Pool, shares: Mapping[str, int]) -> tuple[list[InitialConditions], dict[str, np.ndarray]]:
-    """Initial conditions of the real objects' episodes under each set of constraints, and columns (E,) of all of them.
+def _begun(
+    pool: Pool, shares: Mapping[str, int]
+) -> tuple[list[InitialConditions], dict[str, np.ndarray]]:
+    """Initial conditions of the real objects' episodes under each set of constraints, and columns
+    (E,) of all of them.
 
     Each object has its share of episodes of the constraints that it allows.
     """
@@ -162,7 +175,9 @@ def _begun(pool: Pool, shares: Mapping[str, int]) -> tuple[list[InitialCondition
             continue  # no object allows them
         kept = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
         plan = plan._replace(episodes=jax.tree.map(lambda x, kept=kept: x[kept], plan.episodes))
-        for conditions, count in batches(own.hand, own.task, bank, plan, own.seed, share * len(own.scaled)):
+        for conditions, count in batches(
+            own.hand, own.task, bank, plan, own.seed, share * len(own.scaled)
+        ):
             begun.append(jax.tree.map(lambda x, count=count: x[:count], conditions))
         columns["constraints"].append(np.full(plan.total, asked))
         columns["object"].append(names[plan.episodes.objects])
@@ -170,8 +185,12 @@ def _begun(pool: Pool, shares: Mapping[str, int]) -> tuple[list[InitialCondition
     return begun, {name: np.concatenate(parts) for name, parts in columns.items() if parts}
 
 
-def _episodes(running: Episodes, pool: Pool, shares: Mapping[str, int]) -> Iterator[dict[str, np.ndarray]]:
-    """Yields columns of the real objects' episodes, batch by batch; a batch holds episodes under any constraints."""
+def _episodes(
+    running: Episodes, pool: Pool, shares: Mapping[str, int]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yields columns of the real objects' episodes, batch by batch; a batch holds episodes under
+    any constraints.
+    """
     begun, known = _begun(pool, shares)
     if not begun:
         return
@@ -180,13 +199,18 @@ def _episodes(running: Episodes, pool: Pool, shares: Mapping[str, int]) -> Itera
     for start in range(0, total, running.batch):
         chosen = np.arange(start, start + running.batch).clip(max=total - 1)
         of = {name: column[chosen] for name, column in known.items()}
-        batch = running.run(jax.tree.map(lambda x, chosen=chosen: x[chosen], conditions), stressed=running.stressable)
+        batch = running.run(
+            jax.tree.map(lambda x, chosen=chosen: x[chosen], conditions),
+            stressed=running.stressable,
+        )
         rows = grasp_rows(pool.experiment.task, of["constraints"], batch) | of
         yield {name: column[: total - start] for name, column in rows.items()}
 
 
 def _counted(
-    rows: Mapping[str, np.ndarray], keep: Sequence[str], counts: Mapping[str, collections.Counter[str]]
+    rows: Mapping[str, np.ndarray],
+    keep: Sequence[str],
+    counts: Mapping[str, collections.Counter[str]],
 ) -> dict[str, np.ndarray]:
     """Counts all rows by their constraints and outcomes; returns those to keep."""
     kept = np.all([np.ones(len(rows["episode"]), bool), *(rows[name] for name in keep)], 0)

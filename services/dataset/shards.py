@@ -1,7 +1,9 @@
-"""Files of a dataset: shards of grasps and of their objects, each written atomically, and the card about them.
+"""Files of a dataset: shards of grasps and of their objects, each written atomically, and the card
+about them.
 
-Columns have units and frames. Arrays are lists of one length in row-major order; their shape, unit and frame are in the
-schema. Values of constraints that were not requested are NaN. Poses are position (m) and quaternion (w, x, y, z).
+Columns have units and frames. Arrays are lists of one length in row-major order; their shape, unit
+and frame are in the schema. Values of constraints that were not requested are NaN. Poses are
+position (m) and quaternion (w, x, y, z).
 """
 
 import collections
@@ -32,7 +34,9 @@ from congrasp.services.evaluate.plan import ALIGNED
 from congrasp.services.evaluate.table import Table, percent
 
 VERDICTS = {
-    "success": "bool, the object is up a quarter of a second after the table's removal (the paper's)",
+    "success": (
+        "bool, the object is up a quarter of a second after the table's removal (the paper's)"
+    ),
     "held": "bool, and two seconds after it",
     "clean": "bool, held, and no penetration is deeper than 2 mm (3 mm of hand and object)",
     "lifted": "bool, held, then carried 15 cm upwards",
@@ -43,7 +47,11 @@ VERDICTS = {
 _SURVIVED = dict(zip(SURVIVAL, ("lifted", "pushed_weight", "pushed"), strict=True))
 _MEASURES = (*(name for name in ASSESSED if name not in (*SURVIVAL, "clean")), *FORCES)
 _MEASURES += ("links_at_removal", "moved_at_removal")
-_WIDE = {np.dtype(np.float32): pa.float32(), np.dtype(bool): pa.bool_(), np.dtype(np.int32): pa.int32()}
+_WIDE = {
+    np.dtype(np.float32): pa.float32(),
+    np.dtype(bool): pa.bool_(),
+    np.dtype(np.int32): pa.int32(),
+}
 
 
 class Column(NamedTuple):
@@ -58,10 +66,14 @@ class Column(NamedTuple):
 
 
 def grasp_columns(hand: Hand, task: TaskConfig) -> list[Column]:
-    """Columns of a grasp: episode, constraints, hand and object at the start and after the hold, outcome."""
+    """Columns of a grasp: episode, constraints, hand and object at the start and after the hold,
+    outcome.
+    """
     joints = (len(hand.joints),)
     goals = [
-        Column(f"goal_{c.name}_{name}", array.meaning, np.shape(getattr(c.neutral(hand, task), name)))
+        Column(
+            f"goal_{c.name}_{name}", array.meaning, np.shape(getattr(c.neutral(hand, task), name))
+        )
         for c in known(task)
         for name, array in c.arrays.items()
     ]
@@ -73,7 +85,11 @@ def grasp_columns(hand: Hand, task: TaskConfig) -> list[Column]:
     return [
         Column("object", "name, as in the table of objects", kind=str),
         Column("constraints", "requested ones, with + between them", kind=str),
-        Column("episode", "number among the episodes of this object and these constraints", kind=np.int32),
+        Column(
+            "episode",
+            "number among the episodes of this object and these constraints",
+            kind=np.int32,
+        ),
         Column("mass", "kg"),
         *goals,
         Column("start_q", "rad, finger joints at the start", joints),
@@ -107,20 +123,31 @@ def object_columns() -> list[Column]:
 
 
 def grasp_rows(task: TaskConfig, asked: np.ndarray, batch: Batch) -> dict[str, np.ndarray]:
-    """Columns (B, ...) of a batch of episodes under the constraints `asked` (B,), without those that a plan knows."""
+    """Columns (B, ...) of a batch of episodes under the constraints `asked` (B,), without those
+    that a plan knows.
+    """
     start, state, features = batch.conditions.reset_state, *batch.final
-    values, names = batch.sample.values, [one.removesuffix(ALIGNED).split("+") for one in asked.tolist()]
+    values, names = (
+        batch.sample.values,
+        [one.removesuffix(ALIGNED).split("+") for one in asked.tolist()],
+    )
     rows: dict[str, Any] = {
         "mass": values["mass_kg"],
         "start_q": start.q,
         "start_wrist": _in_object(
-            start.object_position, start.object_quaternion, start.base_position, start.base_quaternion
+            start.object_position,
+            start.object_quaternion,
+            start.base_position,
+            start.base_quaternion,
         ),
         "start_object": _pose(start.object_position, start.object_quaternion),
         "q": state.q,
         "q_target": state.q_target,
         "wrist": _in_object(
-            state.object_position, state.object_quaternion, features.wrist_position, features.wrist_quaternion
+            state.object_position,
+            state.object_quaternion,
+            features.wrist_position,
+            features.wrist_quaternion,
         ),
         "object_pose": _pose(state.object_position, state.object_quaternion),
         **{name: values[name] > 0 for name in ("success", "held", "clean")},
@@ -128,7 +155,9 @@ def grasp_rows(task: TaskConfig, asked: np.ndarray, batch: Batch) -> dict[str, n
         **{name: values.get(name, np.full(len(start.q), np.nan)) for name in _MEASURES},
     }
     for constraint in known(task):
-        requested = np.array([1.0 if constraint.name in own else np.nan for own in names], np.float32)
+        requested = np.array(
+            [1.0 if constraint.name in own else np.nan for own in names], np.float32
+        )
         rows |= {
             f"goal_{constraint.name}_{name}": (requested * np.asarray(array, np.float32).T).T
             for name, array in batch.conditions.goal[constraint.name]._asdict().items()
@@ -154,8 +183,12 @@ def object_rows(objects: Sequence[GraspObject]) -> dict[str, np.ndarray]:
     return {name: np.asarray(column) for name, column in rows.items()}
 
 
-def table(columns: Sequence[Column], rows: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> pa.Table:
-    """A Parquet table of these columns; `about` is in its metadata, as JSON under the key `congrasp`."""
+def table(
+    columns: Sequence[Column], rows: Mapping[str, np.ndarray], about: Mapping[str, Any]
+) -> pa.Table:
+    """A Parquet table of these columns; `about` is in its metadata, as JSON under the key
+    `congrasp`.
+    """
     fields, arrays = [], []
     for column in columns:
         facts = {"meaning": column.meaning, "shape": json.dumps(column.shape)}
@@ -171,7 +204,11 @@ def _array(column: Column, values: np.ndarray) -> pa.Array:
         return pa.array(values.tolist(), pa.string())
     flat: np.ndarray = np.asarray(values, column.kind).ravel()
     array = pa.array(flat, _WIDE[flat.dtype])
-    return pa.FixedSizeListArray.from_arrays(array, int(np.prod(column.shape))) if column.shape else array
+    return (
+        pa.FixedSizeListArray.from_arrays(array, int(np.prod(column.shape)))
+        if column.shape
+        else array
+    )
 
 
 def _pose(position: Any, quaternion: Any) -> np.ndarray:
@@ -179,8 +216,12 @@ def _pose(position: Any, quaternion: Any) -> np.ndarray:
     return np.concatenate([position, quaternion], -1, dtype=np.float32)
 
 
-def _in_object(position: Any, quaternion: Any, wrist_position: Any, wrist_quaternion: Any) -> np.ndarray:
-    """(B, 7) wrist poses in the object frames, from poses of objects and wrists in the world frame."""
+def _in_object(
+    position: Any, quaternion: Any, wrist_position: Any, wrist_quaternion: Any
+) -> np.ndarray:
+    """(B, 7) wrist poses in the object frames, from poses of objects and wrists in the world
+    frame.
+    """
     return _pose(*rotations.relative_pose(position, quaternion, wrist_position, wrist_quaternion))
 
 
@@ -199,17 +240,21 @@ class Shards(NamedTuple):
         return self.folder / kind / f"{number:05d}-of-{self.total:05d}.parquet"
 
     def write(self, number: int, grasps: pa.Table, objects: pa.Table) -> None:
-        """Writes a shard with a checksum of each page; the grasps come last: with both files it is complete."""
+        """Writes a shard with a checksum of each page; the grasps come last: with both files it is
+        complete.
+        """
         for kind, table in (("objects", objects), ("grasps", grasps)):
             buffer = io.BytesIO()
             pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
             write_atomically(self.file(kind, number), buffer.getvalue())
 
     def finished(self, about: Mapping[str, Any]) -> dict[int, dict[str, Any]]:
-        """Returns the descriptions of the finished shards by their numbers, with the SHA-256 of their files by name.
+        """Returns the descriptions of the finished shards by their numbers, with the SHA-256 of
+        their files by name.
 
         Raises:
-          CongraspError: the folder holds a shard of another dataset than `about` describes, or a damaged one.
+          CongraspError: the folder holds a shard of another dataset than `about` describes, or a
+          damaged one.
         """
         found = {}
         for path in sorted((self.folder / "grasps").glob("*.parquet")):
@@ -220,17 +265,22 @@ class Shards(NamedTuple):
             for name, value in about.items():
                 if said.get(name) != value:
                     raise CongraspError(
-                        f"{path} is of another dataset: its {name} is {said.get(name)}, not {value}.",
+                        f"{path} is of another dataset: its {name} is {said.get(name)}, not "
+                        f"{value}.",
                         "Pass another --out, or the options of the first command (in card.json).",
                     )
-            hashes = {f"grasps/{path.name}": sha256, f"objects/{path.name}": _read(other, other.stat().st_mtime_ns)[1]}
+            hashes = {
+                f"grasps/{path.name}": sha256,
+                f"objects/{path.name}": _read(other, other.stat().st_mtime_ns)[1],
+            }
             found[int(said["shard"])] = {**said, "sha256": hashes}
         return found
 
 
 @functools.cache
 def _read(path: pathlib.Path, changed: int) -> tuple[dict[str, Any], str]:
-    """Returns the description in a shard's metadata and the SHA-256 of its file, once for each time of change.
+    """Returns the description in a shard's metadata and the SHA-256 of its file, once for each time
+    of change.
 
     Raises:
       CongraspError: the checksums of its pages do not match, or it is no shard.
@@ -243,12 +293,15 @@ def _read(path: pathlib.Path, changed: int) -> tuple[dict[str, Any], str]:
             pass
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise CongraspError(
-            f"{path} is damaged, or no shard of a dataset ({str(error)[:100]}).", "Remove it, and repeat the command."
+            f"{path} is damaged, or no shard of a dataset ({str(error)[:100]}).",
+            "Remove it, and repeat the command.",
         ) from None
     return dict(said), hashlib.sha256(data).hexdigest()
 
 
-def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any]) -> dict[str, Any]:
+def write_card(
+    shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any]
+) -> dict[str, Any]:
     """Writes the card of the shards in a folder, and returns it.
 
     Args:
@@ -270,7 +323,9 @@ def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any
         "shards": {"finished": len(found), "of": shards.total},
         "left_out": sorted(name for said in found.values() for name in said["left_out"]),
         "counts": counts,
-        "sha256": {name: value for said in found.values() for name, value in said["sha256"].items()},
+        "sha256": {
+            name: value for said in found.values() for name, value in said["sha256"].items()
+        },
         "columns": {kind: _columns(shards, kind, found) for kind in ("grasps", "objects")},
     }
     write_atomically(shards.folder / CARD, (json.dumps(card, indent=1) + "\n").encode())
@@ -332,9 +387,13 @@ removed for two seconds, the object is carried upwards and pushed. {_kept(card["
 * Licence: {card["licence"]}; the objects' own licences stay theirs.
 
 Columns, with shapes, units and frames, are in `card.json` and in the schema of the files. Everything was simulated.
-"""
+"""  # noqa: E501
 
 
 def _kept(keep: list[str]) -> str:
     """Sentence on the episodes in the files."""
-    return f"The files hold those that are {' and '.join(keep)}." if keep else "The files hold all of them."
+    return (
+        f"The files hold those that are {' and '.join(keep)}."
+        if keep
+        else "The files hold all of them."
+    )

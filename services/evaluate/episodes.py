@@ -41,10 +41,13 @@ class Sample:
     """Episodes of one row."""
 
     values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for equal episodes; and
-    `reference`, equal for the same object and reference (`identity`, `reference`)."""
+    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for
+    equal episodes; and `reference`, equal for the same object and reference (`identity`,
+    `reference`)."""
     link_force: np.ndarray
-    """(E', W, L) net contact force of each link in the paper's window, N, for the first E' episodes."""
+    """(E', W, L) net contact force of each link in the paper's window, N, for the first E'
+    episodes.
+    """
     torque: np.ndarray
     """(E', W, F) finger torques in that window, as shares of their limits."""
 
@@ -81,7 +84,10 @@ def joined(samples: Sequence[Sample]) -> Sample:
         if len(sample.link_force) < len(sample.values["success"]):
             break
     return Sample(
-        {name: np.concatenate([sample.values[name] for sample in samples]) for name in samples[0].values},
+        {
+            name: np.concatenate([sample.values[name] for sample in samples])
+            for name in samples[0].values
+        },
         np.concatenate([sample.link_force for sample in probed])[:PROBED_EPISODES],
         np.concatenate([sample.torque for sample in probed])[:PROBED_EPISODES],
     )
@@ -99,9 +105,11 @@ class Batch(NamedTuple):
 
 
 class Episodes:
-    """Batches of given episodes of one policy, each from its beginning to the end of the hold or beyond."""
+    """Batches of given episodes of one policy, each from its beginning to the end of the hold or
+    beyond.
+    """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         bundle: PolicyBundle,
         task: TaskConfig,
@@ -141,7 +149,9 @@ class Episodes:
             traced="all" if traced else "none",
         )
         self.stressable = self._measured and hold == two_seconds(task)
-        """True if episodes can continue after the hold: the stress test begins after two seconds."""
+        """True if episodes can continue after the hold: the stress test begins after two
+        seconds.
+        """
         self._measure(objects, field)
 
     def __enter__(self) -> "Episodes":
@@ -151,21 +161,28 @@ class Episodes:
         self._worker.physics.close()
 
     def replace_objects(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
-        """Replaces the objects by as many others, with grids if the first ones had some; nothing is recompiled."""
+        """Replaces the objects by as many others, with grids if the first ones had some; nothing is
+        recompiled.
+        """
         self._worker.replace_objects(objects, None)
         self._measure(objects, field)
 
     def run(self, conditions: InitialConditions, *, stressed: bool = False) -> Batch:
         """Simulates B episodes.
 
-        They are collected in chunks, so that the observations of a large batch are not in memory for all steps.
+        They are collected in chunks, so that the observations of a large batch are not in memory
+        for all steps.
 
         Args:
           conditions: initial conditions, including the length of the hold.
           stressed: also simulates the stress test after the hold (`actors.stress`).
         """
         task, worker = self._task, self._worker
-        start, window, length = task.approach_steps, task.hold_steps, task.approach_steps + self._hold
+        start, window, length = (
+            task.approach_steps,
+            task.hold_steps,
+            task.approach_steps + self._hold,
+        )
         piece = math.gcd(start, self._hold)
         piece = piece if piece >= 10 else length
         after = -(-protocols.stress_steps(task) // piece) * piece if stressed else 0
@@ -184,33 +201,53 @@ class Episodes:
         values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
         if self._measured:
             values |= protocols.assess(samples, values["held"] > 0, task, self._hold)
-        force, torque = (x[start : start + window].swapaxes(0, 1) for x in (samples.link_force, samples.torque_share))
+        force, torque = (
+            x[start : start + window].swapaxes(0, 1)
+            for x in (samples.link_force, samples.torque_share)
+        )
 
         def message(episode: int) -> Message:
             """Returns the recording of one episode."""
             trace = Trace(
-                *(np.concatenate([np.asarray(x[:, episode]) for x in field]) for field in zip(*traces, strict=True))
+                *(
+                    np.concatenate([np.asarray(x[:, episode]) for x in field])
+                    for field in zip(*traces, strict=True)
+                )
             )
-            return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
+            return self._message(
+                begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode
+            )
 
-        return Batch(conditions, Sample({**values, **self._facts(conditions)}, force, torque), final, message)
+        return Batch(
+            conditions, Sample({**values, **self._facts(conditions)}, force, torque), final, message
+        )
 
     def take_grasps(self) -> Grasps:
         """Returns the grasps of the last batch that may become references."""
         return self._worker.take_grasps()
 
     def _facts(self, conditions: InitialConditions) -> dict[str, np.ndarray]:
-        """Columns (B,) of the initial conditions of episodes: masses in kg, and their identities."""
+        """Columns (B,) of the initial conditions of episodes: masses in kg, and their
+        identities.
+        """
         start = jax.tree.map(np.asarray, conditions.reset_state)
         masses = np.array([obj.mass for obj in self.objects])[start.object_index]
         mass = (masses * start.mass_scale).astype(np.float32)
-        return {"mass_kg": mass, "identity": identity(conditions), "reference": reference(conditions)}
+        return {
+            "mass_kg": mass,
+            "identity": identity(conditions),
+            "reference": reference(conditions),
+        }
 
     def _begin(self, conditions: InitialConditions, after: int) -> EnvState:
-        """Starts episodes with the full hold and `after` more steps; returns their initial state."""
+        """Starts episodes with the full hold and `after` more steps; returns their initial
+        state.
+        """
         self._worker.begin(conditions._replace(hold=jnp.full_like(conditions.hold, self._hold)))
         assert self._worker.state is not None
-        self._worker.state = self._worker.state._replace(after=jnp.full_like(conditions.hold, after))
+        self._worker.state = self._worker.state._replace(
+            after=jnp.full_like(conditions.hold, after)
+        )
         return self._worker.state
 
     def _measure(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
@@ -220,7 +257,9 @@ class Episodes:
             stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
             self._worker.adjust(protocol=stress, probe_data=field)
 
-    def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:
+    def _message(
+        self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int
+    ) -> Message:
         """Returns one episode, from the initial state of all of them and its recording."""
         return episode_message(
             self._hand,
@@ -239,7 +278,8 @@ class Episodes:
 
 
 def identity(conditions: InitialConditions) -> np.ndarray:
-    """(B,) uint32, equal for episodes with the same initial conditions and active constraints, ignoring sensors.
+    """(B,) uint32, equal for episodes with the same initial conditions and active constraints,
+    ignoring sensors.
 
     Numbers are rounded to 1e-4.
     """
@@ -254,7 +294,9 @@ def reference(conditions: InitialConditions) -> np.ndarray:
     """
     goal = conditions.goal
     drawn = [_active(goal, name) for name in goal.values if get_constraint(name).from_reference]
-    return _hashes([conditions.reset_state.object_index, *(array for arrays in drawn for array in arrays)])
+    return _hashes(
+        [conditions.reset_state.object_index, *(array for arrays in drawn for array in arrays)]
+    )
 
 
 def _active(goal: Goal, name: str) -> list[np.ndarray]:

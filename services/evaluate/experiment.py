@@ -1,4 +1,6 @@
-"""Experiments: episodes of one policy on some objects by the paper's protocol. Each variation of one is a row."""
+"""Experiments: episodes of one policy on some objects by the paper's protocol. Each variation of
+one is a row.
+"""
 
 import dataclasses
 import functools
@@ -49,7 +51,9 @@ STRESSED = 200
 MEASURED = 512
 """Number of objects above which distance fields, and thus plausibility, are skipped."""
 _KEPT = 8
-"""Episodes of a row kept for inspection: at most this many that hold the object to the end, and as many others."""
+"""Episodes of a row kept for inspection: at most this many that hold the object to the end, and as
+many others.
+"""
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(label, total if known) -> function to call with the number done."""
 
@@ -61,7 +65,9 @@ def silent(label: str, total: int | None) -> Callable[[int], None]:
 
 @dataclasses.dataclass(frozen=True)
 class Variation:
-    """A row of a table: the constraints of its episodes, and a change of the experiment, here none."""
+    """A row of a table: the constraints of its episodes, and a change of the experiment, here
+    none.
+    """
 
     constraint: str = "heading"
     """Name of the row's constraints, see `services.evaluate.plan.plan_row`."""
@@ -81,7 +87,9 @@ class Variation:
         return objects
 
     def episodes(self, conditions: InitialConditions, control_dt: float) -> InitialConditions:
-        """Returns the initial conditions of the simulation; a control step lasts `control_dt` seconds."""
+        """Returns the initial conditions of the simulation; a control step lasts `control_dt`
+        seconds.
+        """
         return conditions
 
 
@@ -109,8 +117,8 @@ class Experiment:
     objects: Sequence[GraspObject]
     """N objects, before they are scaled for the hand."""
     constraints: ConstraintBank | None = None
-    """Constraints of these objects in this order (`common.task.sampling.sets.bank_of`); sampled if None, with
-    references of the reference policy (`services.evaluate.references`)."""
+    """Constraints of these objects in this order (`common.task.sampling.sets.bank_of`); sampled if
+    None, with references of the reference policy (`services.evaluate.references`)."""
     episodes: int = 1000
     """Least number of episodes of a row."""
     physics: PhysicsName = "native"
@@ -171,26 +179,43 @@ class Experiment:
 
     @functools.cached_property
     def references(self) -> References | None:
-        """References of the reference policy on these objects; None if the constraints are not sampled."""
-        return None if self.constraints is not None else self.references_of(references.reference_policy(self.policy)[0])
+        """References of the reference policy on these objects; None if the constraints are not
+        sampled.
+        """
+        return (
+            None
+            if self.constraints is not None
+            else self.references_of(references.reference_policy(self.policy)[0])
+        )
 
     def references_of(self, policy: PolicyBundle) -> References:
-        """Returns references of a policy on these objects; see `services.evaluate.references.make`."""
+        """Returns references of a policy on these objects; see
+        `services.evaluate.references.make`.
+        """
         advance = self.track("Reference grasps", None)
         return references.make(
-            policy, self.task, self.scaled, self.bank, physics=self.physics, progress=lambda done, of: advance(done)
+            policy,
+            self.task,
+            self.scaled,
+            self.bank,
+            physics=self.physics,
+            progress=lambda done, of: advance(done),
         )
 
     @property
     def worlds(self) -> int:
-        """Number of parallel worlds: a power of two, or the most; rows have an episode of every object."""
+        """Number of parallel worlds: a power of two, or the most; rows have an episode of every
+        object.
+        """
         episodes = max(self.episodes, len(self.objects))
         return min(self.batch or ENGINES[self.physics].batch, 1 << (episodes - 1).bit_length())
 
     @functools.cached_property
     def field(self) -> DistanceField | None:
         """Grids of the objects' surfaces; None if plausibility is not measured."""
-        return distance_field(self.scaled) if self.measured and len(self.objects) <= MEASURED else None
+        return (
+            distance_field(self.scaled) if self.measured and len(self.objects) <= MEASURED else None
+        )
 
     def bank_for(self, constraint: str) -> ConstraintBank:
         """Returns the bank of a row's episodes."""
@@ -201,12 +226,18 @@ class Experiment:
         """Plans the episodes of a row; see `services.evaluate.plan.plan_row`.
 
         Raises:
-          CongraspError: no object allows the row's constraints, or the policy does not support them.
+          CongraspError: no object allows the row's constraints, or the policy does not support
+          them.
         """
-        return plan_row(self.task, variation.bank(self), self.scaled, variation.constraint, self.episodes)
+        return plan_row(
+            self.task, variation.bank(self), self.scaled, variation.constraint, self.episodes
+        )
 
-    def allowed(self, variations: Iterable[Variation]) -> tuple[list[Variation], list[CongraspError]]:
-        """Returns the rows that some object allows, and errors for the others (captured objects may lack parts).
+    def allowed(
+        self, variations: Iterable[Variation]
+    ) -> tuple[list[Variation], list[CongraspError]]:
+        """Returns the rows that some object allows, and errors for the others (captured objects may
+        lack parts).
 
         Raises:
           CongraspError: no row is left.
@@ -227,31 +258,57 @@ class Experiment:
         """Code, policy and settings."""
         packages = (congrasp.common, congrasp.actors, congrasp.services.evaluate)
         code = (files.source_digest(*packages), jax.__version__, mujoco.__version__)
-        settings = (self.task, self.steps, self.episodes, self.worlds, self.physics, self.seed, self.pool)
+        settings = (
+            self.task,
+            self.steps,
+            self.episodes,
+            self.worlds,
+            self.physics,
+            self.seed,
+            self.pool,
+        )
         return (*code, *settings, self.measured, content_hash(encode(self.policy.to_message())))
 
     def digest(self, *about: object) -> str:
-        """Returns sixteen hex digits that identify the code, the policy, the settings, and what else is given."""
+        """Returns sixteen hex digits that identify the code, the policy, the settings, and what
+        else is given.
+        """
         return content_hash(repr((*self._identity, *about)).encode())
 
     def run(
-        self, variations: Sequence[Variation], *, keep: bool = False, stored: pathlib.Path | None = None
+        self,
+        variations: Sequence[Variation],
+        *,
+        keep: bool = False,
+        stored: pathlib.Path | None = None,
     ) -> list[Result]:
         """Simulates rows; one does not depend on the others.
 
         Args:
           variations: the rows. Those of one task in a sequence share a simulator.
           keep: keeps some episodes of each row; every step of all worlds is then in memory.
-          stored: folder for the rows, without kept episodes; a run with the same arguments resumes from it.
+          stored: folder for the rows, without kept episodes; a run with the same arguments resumes
+          from it.
 
         Raises:
           CongraspError: no object allows a row's constraints, or the policy does not support them.
         """
         plans = [self.plan(variation) for variation in variations]
         advance = self.track("Episodes", sum(plan.total for plan in plans))
-        paths = [stored / f"{self._name(variation)}.safetensors" for variation in variations] if stored else []
-        samples = {n: Sample.of(message.arrays) for n, path in enumerate(paths) if (message := files.read_kept(path))}
-        found = {n: Result(variations[n], one, self.row(variations[n], one), [], []) for n, one in samples.items()}
+        paths = (
+            [stored / f"{self._name(variation)}.safetensors" for variation in variations]
+            if stored
+            else []
+        )
+        samples = {
+            n: Sample.of(message.arrays)
+            for n, path in enumerate(paths)
+            if (message := files.read_kept(path))
+        }
+        found = {
+            n: Result(variations[n], one, self.row(variations[n], one), [], [])
+            for n, one in samples.items()
+        }
         todo = [n for n in range(len(plans)) if n not in found]
         for task, group in itertools.groupby(todo, lambda n: variations[n].task(self.task)):
             with self.simulator(task, traced=keep) as running:
@@ -265,7 +322,9 @@ class Experiment:
 
     def _name(self, variation: Variation) -> str:
         """File name of a row, from everything that it depends on."""
-        bank = hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(variation.bank(self))))
+        bank = hashlib.sha256(
+            b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(variation.bank(self)))
+        )
         return self.digest(variation, bank.hexdigest(), self._contents)
 
     @functools.cached_property
@@ -274,7 +333,9 @@ class Experiment:
         return [store.digest(obj) for obj in self.objects]
 
     def simulator(self, task: TaskConfig | None = None, *, traced: bool = False) -> Episodes:
-        """Returns a simulator of the objects, by default of the experiment's task; its batch depends on `episodes`."""
+        """Returns a simulator of the objects, by default of the experiment's task; its batch
+        depends on `episodes`.
+        """
         return Episodes(
             self.policy,
             task or self.task,
@@ -287,7 +348,12 @@ class Experiment:
         )
 
     def _run(
-        self, running: Episodes, variation: Variation, plan: RowPlan, progress: Callable[[int], None], keep: bool
+        self,
+        running: Episodes,
+        variation: Variation,
+        plan: RowPlan,
+        progress: Callable[[int], None],
+        keep: bool,
     ) -> Result:
         """Simulates a row, and keeps some episodes."""
         kept: dict[bool, list[Message]] = {True: [], False: []}
@@ -331,21 +397,28 @@ class Experiment:
     def batches(
         self, running: Episodes, variation: Variation, plan: RowPlan, stressed: int
     ) -> Iterator[tuple[Batch, int]]:
-        """Simulates the episodes of a row in batches; yields each, and the number of its episodes that count.
+        """Simulates the episodes of a row in batches; yields each, and the number of its episodes
+        that count.
 
         Args:
           running: simulator of this experiment, or of one with the same policy and as many objects.
           variation: the row.
           plan: its episodes.
-          stressed: least number of episodes that continue after the hold with lift and pushes; batches continue as a
+          stressed: least number of episodes that continue after the hold with lift and pushes;
+          batches continue as a
             whole.
         """
         if (objects := variation.objects(self.scaled)) is not running.objects:
             running.replace_objects(objects, self.field)
         task = variation.task(self.task)
         done, most = 0, min(plan.total, stressed) if running.stressable else 0
-        for begun, count in batches(self.hand, task, variation.bank(self), plan, self.seed, running.batch):
-            yield running.run(variation.episodes(begun, task.control_dt), stressed=done < most), count
+        for begun, count in batches(
+            self.hand, task, variation.bank(self), plan, self.seed, running.batch
+        ):
+            yield (
+                running.run(variation.episodes(begun, task.control_dt), stressed=done < most),
+                count,
+            )
             done += count
 
     def row(self, variation: Variation, sample: Sample) -> Row:

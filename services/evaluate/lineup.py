@@ -1,4 +1,6 @@
-"""Selects the policies compared in an evaluation: given ones, pretrained ones, and methods without a policy."""
+"""Selects the policies compared in an evaluation: given ones, pretrained ones, and methods without
+a policy.
+"""
 
 import dataclasses
 import hashlib
@@ -15,7 +17,17 @@ from congrasp.learner.run_directory import POLICY_FILE
 from congrasp.services.evaluate.plan import objects_label
 
 Table = Literal[
-    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
+    "single",
+    "composed",
+    "cross",
+    "hands",
+    "ablation",
+    "objects",
+    "noise",
+    "sensing",
+    "payload",
+    "peers",
+    "all",
 ]
 ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
 """Methods of the table `ablation`."""
@@ -61,15 +73,25 @@ class Lineup(NamedTuple):
         what = f"{one.file.name}, version {one.policy.version}"
         if one.method == "ours":
             return what
-        return f"method {one.method}, {what}" if get_method(one.method).learns else f"method {one.method}"
+        return (
+            f"method {one.method}, {what}"
+            if get_method(one.method).learns
+            else f"method {one.method}"
+        )
 
     def objects(self, folder: pathlib.Path | None, exam: str) -> str:
         """Label of the objects, with their scale for the hand if there is one."""
-        labels = list(dict.fromkeys(objects_label(one.policy, folder, exam) for one, _ in self.entrants))
-        return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
+        labels = list(
+            dict.fromkeys(objects_label(one.policy, folder, exam) for one, _ in self.entrants)
+        )
+        return (
+            labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
+        )
 
     def require(self, hand: str) -> None:
-        """Raises a CongraspError unless captured constraints of this hand belong to all policies."""
+        """Raises a CongraspError unless captured constraints of this hand belong to all
+        policies.
+        """
         for one, _ in self.entrants:
             if one.hand != hand:
                 raise CongraspError(
@@ -91,14 +113,16 @@ def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:
 
 
 def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entrant]:
-    """Reads policies named by a user: FILE, METHOD=FILE, a name in the package, or a folder of runs with policies.
+    """Reads policies named by a user: FILE, METHOD=FILE, a name in the package, or a folder of runs
+    with policies.
 
     Args:
       texts: arguments of the user.
       method: method of policies given without one; by default that of the policy.
 
     Raises:
-      CongraspError: a policy cannot be read or has another method, a folder holds none, or two have the same hand and
+      CongraspError: a policy cannot be read or has another method, a folder holds none, or two have
+      the same hand and
         method.
     """
     found: list[Entrant] = []
@@ -112,24 +136,28 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
             files = sorted({*path.glob(POLICY_FILE), *path.glob(f"*/{POLICY_FILE}")})
             if not files:
                 raise CongraspError(
-                    f"The folder {path} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file."
+                    f"The folder {path} holds no {POLICY_FILE}.",
+                    "Pass a run's folder, or a policy file.",
                 )
         found += [read_entrant(file, own) for file in files]
     for i, one in enumerate(found):
         if any((one.hand, one.method) == (other.hand, other.method) for other in found[:i]):
             raise CongraspError(
-                f"Two policies have the hand '{one.hand}' and the method '{one.method}'.", "Evaluate one at a time."
+                f"Two policies have the hand '{one.hand}' and the method '{one.method}'.",
+                "Evaluate one at a time.",
             )
     return found
 
 
-def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method: str | None = None) -> Lineup:
+def line_up(
+    tables: Sequence[Table], given: Sequence[Entrant], hand: str, method: str | None = None
+) -> Lineup:
     """Selects the policies for some tables.
 
-    `hands` compares full systems: the given ones, or else the pretrained ones. `ablation` compares the methods of
-    `ABLATION` for the hand of the first policy; the full system defaults to the pretrained one. `sensing` compares a
-    student with the full system, with the same default. Every other table covers each given policy, or else the
-    pretrained one of a hand.
+    `hands` compares full systems: the given ones, or else the pretrained ones. `ablation` compares
+    the methods of `ABLATION` for the hand of the first policy; the full system defaults to the
+    pretrained one. `sensing` compares a student with the full system, with the same default. Every
+    other table covers each given policy, or else the pretrained one of a hand.
 
     Args:
       tables: requested tables.
@@ -150,7 +178,11 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
             for name in pretrained_hands():
                 known.setdefault((name, "ours"), read_entrant(policy_file(None, name)))
         taught = table == "sensing" and any(one.method in STUDENTS for one in first)
-        if (taught or table == "ablation") and (own, "ours") not in known and own in pretrained_hands():
+        if (
+            (taught or table == "ablation")
+            and (own, "ours") not in known
+            and own in pretrained_hands()
+        ):
             known[own, "ours"] = read_entrant(policy_file(None, own))
         chosen = {
             "hands": [key for key in known if key[1] == "ours"],
@@ -160,10 +192,14 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
             chosen = list(dict.fromkeys([(own, "ours"), *chosen]))
         for key in chosen:
             if key in known:
-                tables_of.setdefault(key, []).append("single" if table in ("hands", "ablation") else table)
+                tables_of.setdefault(key, []).append(
+                    "single" if table in ("hands", "ablation") else table
+                )
             else:
                 missing.append(Missing(*key, "not trained"))
-    return Lineup([(known[key], tuple(dict.fromkeys(tables))) for key, tables in tables_of.items()], missing)
+    return Lineup(
+        [(known[key], tuple(dict.fromkeys(tables))) for key, tables in tables_of.items()], missing
+    )
 
 
 def facts(one: Entrant) -> dict[str, Any]:

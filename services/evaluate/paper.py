@@ -1,4 +1,6 @@
-"""Tables of the paper, with figures to compare with rows of the same hand, method and source of constraints."""
+"""Tables of the paper, with figures to compare with rows of the same hand, method and source of
+constraints.
+"""
 
 import dataclasses
 import functools
@@ -16,10 +18,14 @@ class PaperRow:
 
 
 CENTER_GROUP = "hand's centre alone above the table"
-"""Group of the row whose headings only keep the hand's centre above the table; the paper has no rule for the hand."""
+"""Group of the row whose headings only keep the hand's centre above the table; the paper has no
+rule for the hand.
+"""
 SOURCES = {
     "hands": "procedural references for each hand (hand morphology)",
-    "captured": "captured constraints of GRAB and OakInk (single and composed constraints, ablation)",
+    "captured": (
+        "captured constraints of GRAB and OakInk (single and composed constraints, ablation)"
+    ),
     "cross": "captured constraints of DexYCB (cross-dataset)",
     "objects": "large-scale objects of Objaverse",
 }
@@ -28,12 +34,15 @@ CAPTURED_SETS = {"grab": "captured", "oakink": "captured", "dexycb": "cross"}
 """Table of each captured data set; others have none."""
 
 
-def paper_row(source: str, hand: str, method: str, constraint: str, group: str = "") -> PaperRow | None:
+def paper_row(
+    source: str, hand: str, method: str, constraint: str, group: str = ""
+) -> PaperRow | None:
     """Returns the paper's row for these episodes; None if it has none.
 
     Args:
       source: one of `SOURCES`, or empty for none.
-      hand: name of the hand; in the tables of captured constraints and of large-scale objects, the human hand is
+      hand: name of the hand; in the tables of captured constraints and of large-scale objects, the
+      human hand is
         MANO's.
       method: method of `common.task.methods`.
       constraint: constraints joined by `+`.
@@ -78,4 +87,6 @@ TABLES = {
 def paper_lines() -> tuple[PaperLine, ...]:
     """Returns every line of the paper's tables, in its order."""
     rows = json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())
-    return tuple(PaperLine(figures=PaperRow(row.pop("success"), row.pop("errors")), **row) for row in rows)
+    return tuple(
+        PaperLine(figures=PaperRow(row.pop("success"), row.pop("errors")), **row) for row in rows
+    )

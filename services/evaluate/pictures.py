@@ -1,4 +1,6 @@
-"""Pictures of an evaluation's episodes: sheets with the cause of each failure, and an interactive grasp."""
+"""Pictures of an evaluation's episodes: sheets with the cause of each failure, and an interactive
+grasp.
+"""
 
 import base64
 import json
@@ -28,7 +30,9 @@ _PUSHED = 0.05  # tolerated displacement of an object before the table is remove
 
 
 def cause(episode: Message, drop_height: float) -> str:
-    """Cause of an episode's end with the object `drop_height` (m) or more below its initial height, or `held`."""
+    """Cause of an episode's end with the object `drop_height` (m) or more below its initial height,
+    or `held`.
+    """
     metrics = episode.meta["metrics"]
     if metrics.get("diverged"):
         return "the physics diverged"
@@ -39,12 +43,15 @@ def cause(episode: Message, drop_height: float) -> str:
         return f"pushed away before {moment}"
     if not metrics["links_at_removal"]:
         return f"not touched when {moment}"
-    seconds = (fall_step(episode, drop_height) - grasp_steps(episode)[1]) * episode.meta["control_dt"]
+    seconds = (fall_step(episode, drop_height) - grasp_steps(episode)[1]) * episode.meta[
+        "control_dt"
+    ]
     return f"slipped {seconds:.2f} s after {moment}"
 
 
 def fall_step(episode: Message, drop_height: float) -> int:
-    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the last one.
+    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the
+    last one.
 
     In a lift the height is relative to the wrist.
     """
@@ -59,7 +66,8 @@ def fall_step(episode: Message, drop_height: float) -> int:
 def failure_sheets(
     experiment: Experiment, results: Sequence[Result], successes: int, failures: int
 ) -> Iterator[tuple[str, np.ndarray, Sequence[str]]]:
-    """Draws kept episodes of rows up to the step at which the object has fallen, or to the end, failures first.
+    """Draws kept episodes of rows up to the step at which the object has fallen, or to the end,
+    failures first.
 
     Args:
       experiment: experiment of the rows.
@@ -68,7 +76,8 @@ def failure_sheets(
       failures: most failures to show for each row.
 
     Yields:
-      For each row with an episode: its name, the sheet (H, W, 3) uint8, and the outcome of each episode.
+      For each row with an episode: its name, the sheet (H, W, 3) uint8, and the outcome of each
+      episode.
     """
     policy, drop_height = experiment.policy, experiment.task.drop_height
     for result in results:
@@ -77,7 +86,8 @@ def failure_sheets(
             continue
         causes = [cause(episode, drop_height) for episode in episodes]
         title = (
-            f"{policy.spec.hand_name} hand, version {policy.version}, {name}: {len(episodes)} episodes, failures first"
+            f"{policy.spec.hand_name} hand, version {policy.version}, {name}: {len(episodes)} "
+            f"episodes, failures first"
         )
         strips = [
             (episode, episode.meta["object"], f": {outcome}", fall_step(episode, drop_height))
@@ -87,7 +97,8 @@ def failure_sheets(
 
 
 def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
-    """Draws a kept episode that holds the object under the worst of each kind of noise, if there is one, as PNG.
+    """Draws a kept episode that holds the object under the worst of each kind of noise, if there is
+    one, as PNG.
 
     Args:
       results: rows of `services.evaluate.tables.NOISE`; the last one of each kind is the worst.
@@ -96,9 +107,18 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    worst = {result.variation.label.partition(" ")[0]: result for result in results if result.variation.label}
+    worst = {
+        result.variation.label.partition(" ")[0]: result
+        for result in results
+        if result.variation.label
+    }
     strips = [
-        (episode, f"{variation.constraint}, {variation.label}: {episode.meta['object']}", ", held", None)
+        (
+            episode,
+            f"{variation.constraint}, {variation.label}: {episode.meta['object']}",
+            ", held",
+            None,
+        )
         for variation, _, _, held, _ in worst.values()
         for episode in held[:1]
     ]
@@ -108,7 +128,9 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
 
 
 def _sheet(strips: Sequence[tuple[Message, str, str, int | None]], title: str) -> np.ndarray:
-    """Draws key frames of episodes: each with its first caption, the end of its last one, and its last step."""
+    """Draws key frames of episodes: each with its first caption, the end of its last one, and its
+    last step.
+    """
     images: list[np.ndarray] = []
     labels: list[str] = []
     for episode, first, last, until in strips:
@@ -121,15 +143,16 @@ def _sheet(strips: Sequence[tuple[Message, str, str, int | None]], title: str) -
 def turntable(episode: Message) -> Mapping[str, Any]:
     """Returns the data of an episode for motion.html: skin, object and table as one skinned mesh.
 
-    They move with bones: the hand's links, then the object, then the world. The matrix of a bone maps resting points to
-    the world frame.
+    They move with bones: the hand's links, then the object, then the world. The matrix of a bone
+    maps resting points to the world frame.
 
     Returns:
-      `data`, JSON whose arrays are base64 of little-endian numbers: for V points `position` and `normal` (V, 3)
-      float32, `colour` (V, 3) uint8 sRGB, `bones` (V, 4) and `weights` (V, 4) uint8 of 255; `faces` (F, 3) uint32; and
-      `frames` (T, B, 12) float32, the upper three rows of each bone's matrix. Then `seconds` between two frames, the
-      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre` (3,) and
-      `radius`, m, of the grasp.
+      `data`, JSON whose arrays are base64 of little-endian numbers: for V points `position` and
+      `normal` (V, 3) float32, `colour` (V, 3) uint8 sRGB, `bones` (V, 4) and `weights` (V, 4) uint8
+      of 255; `faces` (F, 3) uint32; and `frames` (T, B, 12) float32, the upper three rows of each
+      bone's matrix. Then `seconds` between two frames, the frame of the table's `removal`, the
+      `table`'s first and last corner in `faces`, and the `centre` (3,) and `radius`, m, of the
+      grasp.
     """
     arrays, hand = episode.arrays, known_hand(episode.meta["hand"])
     every = max(1, round(FRAME_SECONDS / float(episode.meta["control_dt"])))
@@ -137,17 +160,27 @@ def turntable(episode: Message) -> Mapping[str, Any]:
     frames, bones = _frames(episode, steps), len(hand.links)
     skin, table = skin_of(hand), table_shape(arrays["object_position"][0])
     links, weights = skin.influences()
-    body = Shape("mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"])
+    body = Shape(
+        "mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"]
+    )
     parts = [(skin.points, skin.normals, skin_colours(skin), skin.faces, links, weights)]
     for bone, shape in ((bones, body), (bones + 1, table)):
         found = triangles_of([shape], fine=False)
         count = len(found.points)
         moved = np.tile([bone, 0, 0, 0], (count, 1)), np.tile([1.0, 0, 0, 0], (count, 1))
-        parts.append((found.points, found.normals, np.tile(shape.colour, (count, 1)), found.faces, *moved))
+        parts.append(
+            (found.points, found.normals, np.tile(shape.colour, (count, 1)), found.faces, *moved)
+        )
     counts = np.cumsum([0, *(len(part[0]) for part in parts)])
-    points, normals, colours, _, bone_of, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
-    faces = np.concatenate([part[3] + first for part, first in zip(parts, counts[:-1], strict=True)])
-    seen = np.concatenate([frames[:, :bones, :, 3] @ np.eye(3), arrays["object_position"][steps][:, None]], 1)
+    points, normals, colours, _, bone_of, weight = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
+    faces = np.concatenate(
+        [part[3] + first for part, first in zip(parts, counts[:-1], strict=True)]
+    )
+    seen = np.concatenate(
+        [frames[:, :bones, :, 3] @ np.eye(3), arrays["object_position"][steps][:, None]], 1
+    )
     removal = int(np.sum(arrays["table"][steps]))
     held = seen[removal // 2 : removal + 1].reshape(-1, 3)
     centre = (held.min(0) + held.max(0)) / 2
@@ -172,11 +205,21 @@ def turntable(episode: Message) -> Mapping[str, Any]:
 def _frames(episode: Message, steps: np.ndarray) -> np.ndarray:
     """Matrices (T, B, 3, 4) of all bones at some steps."""
     arrays, skin = episode.arrays, skin_of(known_hand(episode.meta["hand"]))
-    places = np.concatenate([arrays["link_position"][steps], arrays["object_position"][steps][:, None]], 1)
-    turns = np.concatenate([arrays["link_quaternion"][steps], arrays["object_quaternion"][steps][:, None]], 1)
-    rotations = Rotation.from_quat(turns.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*turns.shape[:2], 3, 3)
+    places = np.concatenate(
+        [arrays["link_position"][steps], arrays["object_position"][steps][:, None]], 1
+    )
+    turns = np.concatenate(
+        [arrays["link_quaternion"][steps], arrays["object_quaternion"][steps][:, None]], 1
+    )
+    rotations = (
+        Rotation.from_quat(turns.reshape(-1, 4), scalar_first=True)
+        .as_matrix()
+        .reshape(*turns.shape[:2], 3, 3)
+    )
     origins = np.concatenate([skin.origins, np.zeros((1, 3))])
-    moved = np.concatenate([rotations, (places - np.einsum("tbij,bj->tbi", rotations, origins))[..., None]], -1)
+    moved = np.concatenate(
+        [rotations, (places - np.einsum("tbij,bj->tbi", rotations, origins))[..., None]], -1
+    )
     world = np.broadcast_to(np.eye(3, 4), (len(steps), 1, 3, 4))
     return np.concatenate([moved, world], 1)
 

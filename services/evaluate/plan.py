@@ -1,8 +1,9 @@
 """Protocol of an evaluation, and plans of the episodes of a row before any is simulated.
 
-A row has the same number of episodes for every object that allows its constraints, and nearly the same number for each
-resting pose of an object. The draws of an episode depend on the seed, the row's constraints, the object and the
-episode's number, never on other rows, objects or policies of the evaluation.
+A row has the same number of episodes for every object that allows its constraints, and nearly the
+same number for each resting pose of an object. The draws of an episode depend on the seed, the
+row's constraints, the object and the episode's number, never on other rows, objects or policies of
+the evaluation.
 """
 
 import dataclasses
@@ -41,10 +42,11 @@ def two_seconds(task: TaskConfig) -> int:
 
 
 def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
-    """Returns the task with `hold` steps without the table, unscaled masses, one stiff friction and no disturbances.
+    """Returns the task with `hold` steps without the table, unscaled masses, one stiff friction and
+    no disturbances.
 
-    Servo gains are nominal, and the tracker is perfect. Rates are therefore comparable between policies trained with
-    different ranges.
+    Servo gains are nominal, and the tracker is perfect. Rates are therefore comparable between
+    policies trained with different ranges.
     """
     return dataclasses.replace(
         task.evaluated(),
@@ -61,7 +63,11 @@ def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None, exam: str =
     """Name of the objects' source, with the factor on their lengths for the policy's hand."""
     scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
     source = str(folder) if folder else f"procedural objects ({exam})"
-    return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
+    return (
+        source
+        if scale == 1.0
+        else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
+    )
 
 
 class RowPlan(NamedTuple):
@@ -99,8 +105,12 @@ def plan_row(
     """
     constraint, aligned = name.removesuffix(ALIGNED), name.endswith(ALIGNED)
     require_known(constraint.split("+"), task)
-    allowed = initial.allowing(dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+"))
-    allowed = allowed & ~repeated_rests(np.asarray(bank.rest)) & (np.asarray(bank.weight) > 0)[:, None]
+    allowed = initial.allowing(
+        dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+")
+    )
+    allowed = (
+        allowed & ~repeated_rests(np.asarray(bank.rest)) & (np.asarray(bank.weight) > 0)[:, None]
+    )
     covered = np.asarray(allowed.any(1))
     if not covered.any():
         raise CongraspError(
@@ -117,7 +127,9 @@ def plan_row(
         aligned,
         PlannedEpisodes(
             objects=index.astype(np.int32),
-            rests=np.array([rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)], np.int32),
+            rests=np.array(
+                [rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)], np.int32
+            ),
             names=np.array([zlib.crc32(objects[n].name.encode()) for n in index], np.uint32),
             numbers=number.astype(np.int32),
         ),
@@ -127,13 +139,16 @@ def plan_row(
 
 def from_references(name: str) -> bool:
     """True if a row's constraints are drawn from references."""
-    return any(get_constraint(part).from_reference for part in name.removesuffix(ALIGNED).split("+"))
+    return any(
+        get_constraint(part).from_reference for part in name.removesuffix(ALIGNED).split("+")
+    )
 
 
 def batches(
     hand: Hand, task: TaskConfig, bank: ConstraintBank, plan: RowPlan, seed: int, size: int
 ) -> Iterator[tuple[InitialConditions, int]]:
-    """Yields the row's episodes in batches of `size`, and the number that count: the last batch is padded.
+    """Yields the row's episodes in batches of `size`, and the number that count: the last batch is
+    padded.
 
     Args:
       hand: the hand.
@@ -148,7 +163,9 @@ def batches(
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(plan.constraint.encode()))
     for start in range(0, plan.total, size):
         chosen = np.minimum(np.arange(start, start + size), plan.total - 1)
-        conditions = _planned(hand, task, bank, key, jax.tree.map(lambda x, c=chosen: x[c], plan.episodes), asked)
+        conditions = _planned(
+            hand, task, bank, key, jax.tree.map(lambda x, c=chosen: x[c], plan.episodes), asked
+        )
         yield conditions, min(size, plan.total - start)
 
 
@@ -157,7 +174,9 @@ _planned = jax.jit(initial.planned, static_argnums=(0, 1))
 
 
 def repeated_rests(rest: np.ndarray) -> np.ndarray:
-    """(N, R) bool: resting poses (N, R, 7) that only pad the row of an object with fewer of them."""
+    """(N, R) bool: resting poses (N, R, 7) that only pad the row of an object with fewer of
+    them.
+    """
     same = (rest[:, :, None] == rest[:, None]).all(-1)
     repeated: np.ndarray = np.tril(same, -1).any(-1)
     return repeated

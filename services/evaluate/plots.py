@@ -1,4 +1,6 @@
-"""Figures of an evaluation's rows: comparison with the paper, rates with intervals, errors, and the effect of noise."""
+"""Figures of an evaluation's rows: comparison with the paper, rates with intervals, errors, and the
+effect of noise.
+"""
 
 import functools
 import pathlib
@@ -30,7 +32,9 @@ _NOISES = {
 _LARGEST = 64 << 20  # limit of a JSON file in bytes
 
 
-def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
+def plot_evaluation(
+    path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]
+) -> list[pathlib.Path]:
     """Plots the result of `congrasp evaluate --json`.
 
     Args:
@@ -92,18 +96,29 @@ def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
     pairs = list(zip(NOISE, rows, strict=True))
     for (above, below), (kind, heading) in zip(grid.T, _NOISES.items(), strict=True):
         constraint = next(noise.constraint for noise in NOISE if noise.kind == kind)
-        shown = [(n, row) for n, row in pairs if n.constraint == constraint and n.kind in ("", kind)]
+        shown = [
+            (n, row) for n, row in pairs if n.constraint == constraint and n.kind in ("", kind)
+        ]
         unit, factor = ("rad", 1.0) if kind == "joints" else ("cm", 100.0)
         x = [factor * noise.level for noise, _ in shown]
         style(above, heading, "", "%")
         style(below, "", f"{kind}, {unit}", "mean error")
-        for name, label, colour in (("success", "success", COLOURS[0]), ("held_2s", "held for 2 s", COLOURS[2])):
+        for name, label, colour in (
+            ("success", "success", COLOURS[0]),
+            ("held_2s", "held for 2 s", COLOURS[2]),
+        ):
             ends = ("_low", "", "_high")
-            low, middle, high = ([100 * (getattr(row, f"{name}{end}") or 0.0) for _, row in shown] for end in ends)
+            low, middle, high = (
+                [100 * (getattr(row, f"{name}{end}") or 0.0) for _, row in shown] for end in ends
+            )
             above.plot(x, middle, "o-", color=colour, label=label)
             above.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-        for (name, scale, unit), colour in zip(_scaled(constraint), (COLOURS[3], COLOURS[1]), strict=True):
-            found = [np.nan if (value := row.errors[name]) is None else scale * value for _, row in shown]
+        for (name, scale, unit), colour in zip(
+            _scaled(constraint), (COLOURS[3], COLOURS[1]), strict=True
+        ):
+            found = [
+                np.nan if (value := row.errors[name]) is None else scale * value for _, row in shown
+            ]
             below.plot(x, found, "s-", color=colour, label=f"error, {unit}")
         above.set_ylim(0, 102)
         below.set_ylim(0, 1.1 * below.get_ylim()[1])
@@ -138,12 +153,18 @@ def _table(table: Table) -> Any:
     """Draws a table."""
     heads = [name.replace(", ", ",\n", 1) for name in table.columns]
     cells = zip(heads, *table.rows, strict=True)
-    widths = [2 + max(len(word) for cell in column for word in cell.split("\n")) for column in cells]
+    widths = [
+        2 + max(len(word) for cell in column for word in cell.split("\n")) for column in cells
+    ]
     figure = new_figure(0.085 * sum(widths) + 0.3, 0.32 * (1 + len(table.rows)) + 1.0, table.title)
     axes = figure.subplots()
     axes.set_axis_off()
     shown = axes.table(
-        table.rows, colLabels=heads, colWidths=np.divide(widths, sum(widths)), bbox=(0, 0, 1, 1), edges="horizontal"
+        table.rows,
+        colLabels=heads,
+        colWidths=np.divide(widths, sum(widths)),
+        bbox=(0, 0, 1, 1),
+        edges="horizontal",
     )
     shown.auto_set_font_size(False)
     shown.set_fontsize(8.5)
@@ -162,21 +183,27 @@ def _success(rows: Sequence[Row]) -> Any:
     y = np.arange(len(rows))[::-1]
     rates = np.array([row.success for row in rows])
     spread = np.abs(np.array([[row.success_low, row.success_high] for row in rows]).T - rates)
-    axes.errorbar(rates, y, xerr=spread, fmt="o", color=COLOURS[0], capsize=3, markersize=5, label="ours")
+    axes.errorbar(
+        rates, y, xerr=spread, fmt="o", color=COLOURS[0], capsize=3, markersize=5, label="ours"
+    )
     paper = [(row.paper.success, height) for row, height in zip(rows, y, strict=True) if row.paper]
     if paper:
         axes.plot(*zip(*paper, strict=True), "D", color=COLOURS[1], markersize=5, label="paper")
     axes.set_yticks(y, _labels(rows))
     style(axes, "", "share of episodes", "")
     axes.set_xlim(right=1.005)
-    axes.legend(fontsize=8, frameon=False, labelcolor=QUIET, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes.legend(
+        fontsize=8, frameon=False, labelcolor=QUIET, loc="upper left", bbox_to_anchor=(1.0, 1.0)
+    )
     return figure
 
 
 def _errors(rows: Sequence[Row]) -> Any:
     """Draws cumulative distributions of the errors, one panel each."""
     shown = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
-    figure, grid = panel_grid(len(shown), 2.8, "Errors of successful episodes: share of episodes below")
+    figure, grid = panel_grid(
+        len(shown), 2.8, "Errors of successful episodes: share of episodes below"
+    )
     labels = _labels(rows)
     for axes, name in zip(grid, shown, strict=True):
         title, unit = _TITLES[name]
@@ -184,7 +211,9 @@ def _errors(rows: Sequence[Row]) -> Any:
             if not (found := row.quantiles.get(name)):
                 continue
             colour = COLOURS[i % len(COLOURS)]
-            axes.plot(found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=labels[i])
+            axes.plot(
+                found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=labels[i]
+            )
             if row.paper and name in row.paper.errors:
                 axes.axvline(row.paper.errors[name], color=colour, linewidth=1.0, linestyle=":")
         style(axes, title, f"{unit}   (dotted: mean of the paper)", "share")

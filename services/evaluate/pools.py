@@ -1,8 +1,10 @@
-"""Objects of evaluations: the procedural ones of the two exams, and pools of as many as there is time for.
+"""Objects of evaluations: the procedural ones of the two exams, and pools of as many as there is
+time for.
 
-Pools have one size, so that no program is compiled again, and only two are in memory: while the episodes of one are
-simulated, the next is made or imported with its constraints. The result of a pool is a few numbers per episode, which
-can be stored on disk, so that a stopped evaluation resumes at its current pool.
+Pools have one size, so that no program is compiled again, and only two are in memory: while the
+episodes of one are simulated, the next is made or imported with its constraints. The result of a
+pool is a few numbers per episode, which can be stored on disk, so that a stopped evaluation resumes
+at its current pool.
 """
 
 import concurrent.futures
@@ -44,7 +46,9 @@ MANY = 50_000
 """Most procedural objects of the table `objects` by default."""
 _SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}
 _MOST = {True: 4096, False: 128}
-"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
+"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the
+latter.
+"""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
 _UNCHANGED = ImportOptions()
@@ -59,7 +63,9 @@ def first_seed(exam: Exam, count: int) -> int:
       CongraspError: that many objects of the development exam would overlap those for figures.
     """
     if exam == "development" and count > FIGURES_SEED - HELD_OUT_SEED:
-        raise CongraspError(f"The development set does not have {count} objects.", "Pass a smaller --pool.")
+        raise CongraspError(
+            f"The development set does not have {count} objects.", "Pass a smaller --pool."
+        )
     return _SEEDS[exam]
 
 
@@ -112,9 +118,11 @@ def most_objects(physics: PhysicsName) -> int:
     return min(_MOST[ENGINES[physics].on_device], _MESHES)
 
 
-def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = "") -> Pools:
-    """Objects of different names in pools of at most `most`; meshes are imported when their turn comes, and those that
-    cannot be are left out."""
+def listed_pools(
+    found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = ""
+) -> Pools:
+    """Objects of different names in pools of at most `most`; meshes are imported when their turn
+    comes, and those that cannot be are left out."""
     number, size = _divided(len(found), most)
 
     def make(part: list[ObjectAt]) -> Loaded:
@@ -126,7 +134,10 @@ def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = 
 
         objects = load_each(part, options, on_error=leave_out)
         names = [one.name for one in part if one.name not in left_out]
-        return Loaded([dataclasses.replace(obj, name=n) for obj, n in zip(objects, names, strict=True)], left_out)
+        return Loaded(
+            [dataclasses.replace(obj, name=n) for obj, n in zip(objects, names, strict=True)],
+            left_out,
+        )
 
     parts = [[found[i] for i in part] for part in np.array_split(np.arange(len(found)), number)]
     return Pools(source, size, [functools.partial(make, part) for part in parts])
@@ -142,14 +153,20 @@ class Pool(NamedTuple):
     """A pool that is ready for simulation."""
 
     experiment: Experiment
-    """Its objects are the pool's; those from `real` on are repetitions that pad it. It has none if none remains."""
+    """Its objects are the pool's; those from `real` on are repetitions that pad it. It has none if
+    none remains.
+    """
     real: int
     left_out: list[str]
 
 
 @contextlib.contextmanager
-def prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> Iterator[Iterator[Pool]]:
-    """Yields an experiment on each of some pools, made in a thread while the previous one is in use."""
+def prepared(
+    experiment: Experiment, pools: Pools, wanted: Sequence[int]
+) -> Iterator[Iterator[Pool]]:
+    """Yields an experiment on each of some pools, made in a thread while the previous one is in
+    use.
+    """
     with _one_ahead(_prepared(experiment, pools, wanted)) as found:
         yield found
 
@@ -158,7 +175,9 @@ def _prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> It
     """Yields experiments on pools, with their constraints."""
     for number in wanted:
         loaded, left_out = pools.make[number]()
-        own, kept = _approachable(dataclasses.replace(experiment, pool=number, track=silent), loaded, pools.size)
+        own, kept = _approachable(
+            dataclasses.replace(experiment, pool=number, track=silent), loaded, pools.size
+        )
         lost = [obj.name for obj in loaded if all(obj is not other for other in kept)]
         if kept:
             _ = own.field  # computed here
@@ -182,7 +201,9 @@ def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
 def _approachable(
     experiment: Experiment, objects: list[GraspObject], size: int
 ) -> tuple[Experiment, list[GraspObject]]:
-    """Returns an experiment on `size` of the objects that the hand can approach in some resting pose, and all these."""
+    """Returns an experiment on `size` of the objects that the hand can approach in some resting
+    pose, and all these.
+    """
     while objects:
         filled = list(itertools.islice(itertools.cycle(objects), size))
         own = dataclasses.replace(experiment, objects=filled)
@@ -193,7 +214,9 @@ def _approachable(
             task, scale = own.task, object_scale(own.hand, own.task)
             seeds = [(own.seed + own.pool, n) for n in range(size)]
             hand = itertools.repeat(outline(own.hand), size)
-            fine = parallel_map(_has_heading, [task] * size, own.scaled, seeds, [scale] * size, hand)
+            fine = parallel_map(
+                _has_heading, [task] * size, own.scaled, seeds, [scale] * size, hand
+            )
             if all(fine):
                 raise
             _log.warning("%s", error)
@@ -202,8 +225,12 @@ def _approachable(
     return dataclasses.replace(experiment, objects=()), []
 
 
-def _has_heading(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
-    """True if an object has a heading for the hand with this outline, and does not lie too flat for all of them."""
+def _has_heading(
+    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline
+) -> bool:
+    """True if an object has a heading for the hand with this outline, and does not lie too flat for
+    all of them.
+    """
     try:
         return bool(headings_of(task, obj, seed, None, scale, own)["weight"])
     except CongraspError:
@@ -211,7 +238,9 @@ def _has_heading(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scal
 
 
 class _Result(NamedTuple):
-    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each object."""
+    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each
+    object.
+    """
 
     sample: Sample
     objects: list[tuple[str, float, float, str]]
@@ -227,13 +256,17 @@ class _Result(NamedTuple):
         return Message(self.sample.arrays(), {"objects": self.objects, "left_out": self.left_out})
 
 
-def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None) -> list[Row]:
-    """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass and family.
+def evaluate_pools(
+    experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None
+) -> list[Row]:
+    """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass
+    and family.
 
     Args:
-      experiment: policy and settings; `episodes` is the least total number, and every object has the same number.
-      pools: pools of objects.
-      kept: folder for results of pools, from which an evaluation with the same arguments resumes; None stores none.
+      experiment: policy and settings; `episodes` is the least total number, and every object has
+      the same number. pools: pools of objects.
+      kept: folder for results of pools, from which an evaluation with the same arguments resumes;
+      None stores none.
 
     Raises:
       CongraspError: the hand can approach none of the objects.
@@ -242,7 +275,10 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
     each = -(-experiment.episodes // (pools.size * number))
     advance = experiment.track("Episodes on many objects", each * pools.size * number)
     experiment = dataclasses.replace(
-        experiment, constraints=None, episodes=each * pools.size, measured=pools.size * number <= MEASURED
+        experiment,
+        constraints=None,
+        episodes=each * pools.size,
+        measured=pools.size * number <= MEASURED,
     )
     name = experiment.digest(pools.source, pools.size)
     files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []
@@ -264,7 +300,9 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
     return _rows([found[n] for n in sorted(found)], experiment)
 
 
-def _simulated(running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int) -> _Result:
+def _simulated(
+    running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int
+) -> _Result:
     """Simulates the episodes of a pool, if it has objects."""
     if not running or not pool.real:
         return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
@@ -282,13 +320,17 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
     left_out = [name for result in results for name in result.left_out]
     results = [result for result in results if result.episodes]
     if not results:
-        raise CongraspError("None of the objects can be approached.", "Scale them for the hand, or pass others.")
+        raise CongraspError(
+            "None of the objects can be approached.", "Scale them for the hand, or pass others."
+        )
     firsts = np.cumsum([0, *(len(result.objects) for result in results)])
     for result, first in zip(results, firsts, strict=False):
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
     whole = joined([result.sample for result in results])
     index = whole.values["object_index"].astype(int)
-    names, sizes, masses, families = zip(*(facts for result in results for facts in result.objects), strict=True)
+    names, sizes, masses, families = zip(
+        *(facts for result in results for facts in result.objects), strict=True
+    )
     row = functools.partial(
         summarise,
         Variation().constraint,

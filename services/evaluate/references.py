@@ -1,8 +1,10 @@
-"""Reference poses and trajectories independent of the policy under test (paper, section Hand Morphology).
+"""Reference poses and trajectories independent of the policy under test (paper, section Hand
+Morphology).
 
-A policy trained without poses and trajectories grasps every object under headings, on the whole surface and on the
-graspable region. Final states of its successful episodes are the references, and approach paths to them the
-trajectories. Tables draw from all of them: no policy was trained with the objects of an exam.
+A policy trained without poses and trajectories grasps every object under headings, on the whole
+surface and on the graspable region. Final states of its successful episodes are the references, and
+approach paths to them the trajectories. Tables draw from all of them: no policy was trained with
+the objects of an exam.
 """
 
 import hashlib
@@ -35,7 +37,9 @@ from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.plan import RowPlan, batches, protocol
 
 HELD_OUT = POSES // 5
-"""References of an object and region that its constraint set holds out (`sampling.sets`), the last ones."""
+"""References of an object and region that its constraint set holds out (`sampling.sets`), the last
+ones.
+"""
 _ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
 _SPARE = 1.25
@@ -50,15 +54,15 @@ class References(NamedTuple):
 
     bank: ConstraintBank
     grasps: np.ndarray
-    """(N, V) int: references of each object and region that are grasps of the reference policy; if there are none,
-    poses that close the hand around the object are used."""
+    """(N, V) int: references of each object and region that are grasps of the reference policy; if
+    there are none, poses that close the hand around the object are used."""
 
 
 def reference_policy(bundle: PolicyBundle) -> tuple[PolicyBundle, str]:
     """Returns the reference policy of a policy's hand, and its description.
 
-    The package has one for the hands of its pretrained policies; for any other hand it is the policy itself, under
-    headings and affordances only.
+    The package has one for the hands of its pretrained policies; for any other hand it is the
+    policy itself, under headings and affordances only.
     """
     hand = get_hand(bundle.spec.hand)
     if hand.reference == hand.name and (file := reference_file(hand.name)):
@@ -95,10 +99,14 @@ def make(
     return made
 
 
-_REGIONS = tuple(next(c.name for c in CONSTRAINTS if c.region == v and not c.from_reference) for v in range(2))
+_REGIONS = tuple(
+    next(c.name for c in CONSTRAINTS if c.region == v and not c.from_reference) for v in range(2)
+)
 """Constraints of the grasps on the whole surface, and on the graspable region."""
 _FROM_REFERENCES = {constraint.name for constraint in CONSTRAINTS if constraint.from_reference}
-_ARRAYS = tuple(name for name in ConstraintBank._fields if name.partition("_")[0] in _FROM_REFERENCES)
+_ARRAYS = tuple(
+    name for name in ConstraintBank._fields if name.partition("_")[0] in _FROM_REFERENCES
+)
 """Columns of references: fields of `Poses`, then results of `make_references`."""
 
 
@@ -118,19 +126,28 @@ def _grasp(
     regions = [initial.allowing(own, bank, (asked,)) for asked in _REGIONS]
     most = POSES * sum(int(allowed.any(1).sum()) for allowed in regions)
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
-    with Episodes(policy, own, objects, hold=own.hold_steps, batch=size, physics=physics) as episodes:
+    with Episodes(
+        policy, own, objects, hold=own.hold_steps, batch=size, physics=physics
+    ) as episodes:
         for region, constraint in enumerate(_REGIONS):
             rests = [np.flatnonzero(row) for row in regions[region]]
             tried = np.zeros(len(objects), int)
             while True:
-                missing = np.array([POSES - len(of[region]) for of in found]) * regions[region].any(1)
+                missing = np.array([POSES - len(of[region]) for of in found]) * regions[region].any(
+                    1
+                )
                 wanted = np.minimum(np.ceil(_SPARE * missing).astype(int), _ATTEMPTS - tried)
                 if not wanted.any():
                     break
                 index = np.repeat(np.arange(len(objects)), wanted)
                 number = tried[index] + np.concatenate([np.arange(count) for count in wanted])
-                rest = np.array([rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)], np.int32)
-                planned = PlannedEpisodes(index.astype(np.int32), rest, names[index], number.astype(np.int32))
+                rest = np.array(
+                    [rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)],
+                    np.int32,
+                )
+                planned = PlannedEpisodes(
+                    index.astype(np.int32), rest, names[index], number.astype(np.int32)
+                )
                 plan = RowPlan(constraint, False, planned, wanted > 0)
                 for conditions, count in batches(hand, own, bank, plan, _SEED, size):
                     episodes.run(conditions)
@@ -138,7 +155,9 @@ def _grasp(
                     for i in np.flatnonzero(grasps.found[:count]):
                         taken = found[grasps.object_index[i]][region]
                         if len(taken) < POSES:
-                            taken.append(Poses(grasps.q[i], grasps.position[i], grasps.quaternion[i]))
+                            taken.append(
+                                Poses(grasps.q[i], grasps.position[i], grasps.quaternion[i])
+                            )
                     progress(sum(len(taken) for of in found for taken in of), most)
                 tried += wanted
     return found
@@ -147,23 +166,37 @@ def _grasp(
 def _filled(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
-    """Returns the bank with these grasps and trajectories to them, none of them both held out and for training.
+    """Returns the bank with these grasps and trajectories to them, none of them both held out and
+    for training.
 
-    A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of them (at least one) is
-    repeated among those held out, and the others among those for training.
+    A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of
+    them (at least one) is repeated among those held out, and the others among those for training.
     """
     hand = get_hand(policy.spec.hand)
     arrays = {name: np.array(getattr(bank, name)) for name in _ARRAYS}
     counts = np.zeros((len(grasps), 2), int)
-    flat = [(n, v, pose) for n, of in enumerate(grasps) for v, poses in enumerate(of) for pose in poses]
+    flat = [
+        (n, v, pose) for n, of in enumerate(grasps) for v, poses in enumerate(of) for pose in poses
+    ]
     if flat:
-        poses = Poses(*(jnp.asarray(np.stack(field)) for field in zip(*(pose for *_, pose in flat), strict=True)))
+        poses = Poses(
+            *(
+                jnp.asarray(np.stack(field))
+                for field in zip(*(pose for *_, pose in flat), strict=True)
+            )
+        )
         rest = jnp.asarray(bank.rest)[np.array([n for n, *_ in flat])]
-        path, turns, valid = make_references(hand, poses, rest, jax.random.key(_SEED), task.trajectory_points)
+        path, turns, valid = make_references(
+            hand, poses, rest, jax.random.key(_SEED), task.trajectory_points
+        )
         new = dict(zip(_ARRAYS, map(np.asarray, (*poses, path, turns, valid)), strict=True))
         owners = np.array([(n, v) for n, v, _ in flat])
     for n, v in np.ndindex(counts.shape):
-        usable = np.flatnonzero((owners == (n, v)).all(1) & new["pose_valid"].any(1)) if flat else np.zeros(0, int)
+        usable = (
+            np.flatnonzero((owners == (n, v)).all(1) & new["pose_valid"].any(1))
+            if flat
+            else np.zeros(0, int)
+        )
         counts[n, v] = len(usable)
         if len(usable):
             order = usable[_arranged(len(usable))]
@@ -177,7 +210,9 @@ def _filled(
             rows["pose_valid"] = arrays["pose_valid"][n, v].T[order]
         for name, values in rows.items():
             arrays[name][n, v] = values.T if name == "pose_valid" else values
-    return References(bank._replace(**{name: jnp.asarray(values) for name, values in arrays.items()}), counts)
+    return References(
+        bank._replace(**{name: jnp.asarray(values) for name, values in arrays.items()}), counts
+    )
 
 
 def _arranged(count: int) -> np.ndarray:
@@ -185,11 +220,16 @@ def _arranged(count: int) -> np.ndarray:
     held_out = max(1, round(count * HELD_OUT / POSES))
     training = np.arange(max(count - held_out, 1))
     return np.concatenate(
-        [np.resize(training, POSES - HELD_OUT), np.resize(np.arange(count - held_out, count), HELD_OUT)]
+        [
+            np.resize(training, POSES - HELD_OUT),
+            np.resize(np.arange(count - held_out, count), HELD_OUT),
+        ]
     )
 
 
-def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject], physics: str) -> str:
+def _key(
+    policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject], physics: str
+) -> str:
     """File name from everything that references depend on."""
     made_by = bundles.content_hash(encode(policy.to_message()))
     digests = [store.digest(obj) for obj in objects]
@@ -199,10 +239,16 @@ def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject],
 
 
 def _read(path: pathlib.Path, bank: ConstraintBank) -> References | None:
-    """Reads cached references of the bank's objects; returns None if they are missing or damaged."""
+    """Reads cached references of the bank's objects; returns None if they are missing or
+    damaged.
+    """
     if not (message := read_kept(path)):
         return None
     arrays = message.arrays
-    if any(name not in arrays or arrays[name].shape != getattr(bank, name).shape for name in _ARRAYS):
+    if any(
+        name not in arrays or arrays[name].shape != getattr(bank, name).shape for name in _ARRAYS
+    ):
         return None
-    return References(bank._replace(**{name: jnp.asarray(arrays[name]) for name in _ARRAYS}), arrays["grasps"])
+    return References(
+        bank._replace(**{name: jnp.asarray(arrays[name]) for name in _ARRAYS}), arrays["grasps"]
+    )

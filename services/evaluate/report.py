@@ -1,4 +1,6 @@
-"""Report and model card of a policy: one HTML file with tables, pictures, curves and the commands that made them."""
+"""Report and model card of a policy: one HTML file with tables, pictures, curves and the commands
+that made them.
+"""
 
 import base64
 import collections
@@ -50,16 +52,26 @@ _OVERLAPS = {
 }
 _FAST = 1.0  # m/s of a wrist, above which an arm hardly follows
 _SIMULATED = (
-    "It was trained and measured in simulation, never on a physical hand: success here implies nothing about the "
+    "It was trained and measured in simulation, never on a physical hand: success here implies "
+    "nothing about the "
     "safety of a robot."
 )
-_MET = "Its objects were rigid and fit the hand: no soft or articulated ones, no clutter and no obstacles."
+_MET = (
+    "Its objects were rigid and fit the hand: no soft or articulated ones, no clutter and no "
+    "obstacles."
+)
 _HEADINGS = {
     "all": "all headings",
     "above": "headings within 30° of straight down",
     "center": "headings with the hand's centre above the table",
 }
-_TRACKER_UNITS = {"period": "s", "delay": "s", "position_noise": "m", "rotation_noise": "rad", "dropout": ""}
+_TRACKER_UNITS = {
+    "period": "s",
+    "delay": "s",
+    "position_noise": "m",
+    "rotation_noise": "rad",
+    "dropout": "",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,18 +137,40 @@ def report_on(
         sheets.append(Picture(row, png_of(sheet), count_causes(causes)))
         advance(len(sheets))
     subject += f" --objects {objects}" if objects else f" --pool {len(experiment.objects)}"
-    numbers = f"--episodes {experiment.episodes} --physics {experiment.physics} --seed {experiment.seed}"
+    numbers = (
+        f"--episodes {experiment.episodes} --physics {experiment.physics} --seed {experiment.seed}"
+    )
     command = f"congrasp evaluate --table single composed {subject} {numbers}"
-    commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
-    rules = f". {found.heading_rules.sentence(policy.spec.hand_name)}" if found.heading_rules else ""
+    commands = Commands(
+        command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else ""
+    )
+    rules = (
+        f". {found.heading_rules.sentence(policy.spec.hand_name)}" if found.heading_rules else ""
+    )
     which = f"{len(experiment.objects)} objects ({objects_label(policy, objects)})"
-    how = f"{experiment.episodes} episodes a row on {which}, {engine_title(experiment.physics)}, seed {experiment.seed}"
-    write_report(out, policy, name, found.rows, how + rules, sheets, curves, commands, check, _motion(results))
+    how = (
+        f"{experiment.episodes} episodes a row on {which}, {engine_title(experiment.physics)}, "
+        f"seed {experiment.seed}"
+    )
+    write_report(
+        out,
+        policy,
+        name,
+        found.rows,
+        how + rules,
+        sheets,
+        curves,
+        commands,
+        check,
+        _motion(results),
+    )
     return found
 
 
 def _motion(results: Sequence[Result]) -> Mapping[str, Any] | None:
-    """Returns the interactive view of a success of the first row that has one, or else of a failure."""
+    """Returns the interactive view of a success of the first row that has one, or else of a
+    failure.
+    """
     episodes = [(result, episode) for result in results for episode in result.held]
     episodes += [(result, episode) for result in results for episode in result.lost]
     for result, episode in episodes[:1]:
@@ -144,7 +178,7 @@ def _motion(results: Sequence[Result]) -> Mapping[str, Any] | None:
     return None
 
 
-def write_report(
+def write_report(  # noqa: PLR0913
     out: pathlib.Path,
     policy: PolicyBundle,
     name: str,
@@ -195,12 +229,16 @@ def write_report(
 
 @functools.cache
 def template(path: pathlib.Path = _REPORT) -> Any:
-    """Returns a page template, which may extend `base.html`; raises a CongraspError if jinja2 is not installed."""
+    """Returns a page template, which may extend `base.html`; raises a CongraspError if jinja2 is
+    not installed.
+    """
     need_package("A report", "jinja2")
     import jinja2
 
     loader = jinja2.FileSystemLoader([path.parent, _REPORT.parent])
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, loader=loader)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, loader=loader
+    )
     return environment.get_template(path.name)
 
 
@@ -224,8 +262,10 @@ def _warning(rows: Sequence[Row]) -> str:
         return ""
     width = max(row.success_high - row.success_low for row in rows)
     return (
-        f"Preliminary: rows of {fewest} episodes, fewer than {_FEW}, with intervals of {100 * width:.0f} points. "
-        "Do not quote these figures or compare policies by them. Pass --episodes 200 for better ones."
+        f"Preliminary: rows of {fewest} episodes, fewer than {_FEW}, with intervals of "
+        f"{100 * width:.0f} points. "
+        "Do not quote these figures or compare policies by them. Pass --episodes 200 for better "
+        "ones."
     )
 
 
@@ -235,8 +275,10 @@ def _summary(rows: Sequence[Row]) -> str:
     above = sum(row.success >= row.paper.success for row in compared if row.paper)
     clear = collections.Counter(_verdict(row) for row in compared)
     return (
-        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the paper's in "
-        f"{above} of its {len(compared)} rows; the 95 % interval is above it in {clear['better']} and below it in "
+        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the "
+        f"paper's in "
+        f"{above} of its {len(compared)} rows; the 95 % interval is above it in {clear['better']} "
+        f"and below it in "
         f"{clear['worse']}."
     )
 
@@ -270,7 +312,11 @@ def _findings(check: HandCheck) -> Table:
 
 def embedded(picture: Picture) -> Mapping[str, Any]:
     """Picture for the template."""
-    return {"title": picture.title, "caption": picture.caption, "image": base64.b64encode(picture.png).decode()}
+    return {
+        "title": picture.title,
+        "caption": picture.caption,
+        "image": base64.b64encode(picture.png).decode(),
+    }
 
 
 def _facts(policy: PolicyBundle, name: str) -> list[tuple[str, str]]:
@@ -296,14 +342,16 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
       rows: rows of its evaluation.
 
     Returns:
-      `hand`; `constraints`: names; `data`: sentences; `limits`: sentences, those from the rows first. The rest
+      `hand`; `constraints`: names; `data`: sentences; `limits`: sentences, those from the rows
+      first. The rest
         of a card is the same for all policies.
     """
     return {
         "hand": policy.spec.hand_name,
         "constraints": policy.task.constraints,
         "data": (
-            "It was trained by reinforcement learning in simulation. Objects are procedural, or those of the "
+            "It was trained by reinforcement learning in simulation. Objects are procedural, or "
+            "those of the "
             "run's folder; constraints are sampled, or those of the run's constraint sets.",
             _trained(policy.task),
         ),
@@ -312,15 +360,23 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
 
 
 def limits(rows: Sequence[Row]) -> list[str]:
-    """Limits shown by the figures: rows below the paper's or below 80 %, lost objects, implausible motions."""
+    """Limits shown by the figures: rows below the paper's or below 80 %, lost objects, implausible
+    motions.
+    """
     found = []
     for row in rows:
         name = f"{row.constraint} ({row.group})" if row.group else row.constraint
         rates = [("success", row.success), ("held for 2 s", row.held_2s)]
-        low = [f"{100 * rate:.1f} % {what}" for what, rate in rates if rate is not None and rate < _LEAST]
+        low = [
+            f"{100 * rate:.1f} % {what}"
+            for what, rate in rates
+            if rate is not None and rate < _LEAST
+        ]
         if row.paper and row.success < row.paper.success:
             below = 100 * (row.paper.success - row.success)
-            low.append(f"success {below:.1f} points below the paper's {100 * row.paper.success:.1f} %")
+            low.append(
+                f"success {below:.1f} points below the paper's {100 * row.paper.success:.1f} %"
+            )
         if low:
             found.append(f"{name.capitalize()}: {', '.join(low)}.")
     if not found:
@@ -346,21 +402,33 @@ def _worst(rows: Sequence[Row]) -> list[str]:
             episodes[of["name"]] = episodes.get(of["name"], 0) + of["episodes"]
             held[of["name"]] = held.get(of["name"], 0.0) + of["episodes"] * of["success"]
     rates = sorted((held[name] / count, name) for name, count in episodes.items())
-    return [f"{name} ({100 * rate:.0f} % of {episodes[name]})" for rate, name in rates if rate < _LEAST][:_WORST]
+    return [
+        f"{name} ({100 * rate:.0f} % of {episodes[name]})" for rate, name in rates if rate < _LEAST
+    ][:_WORST]
 
 
 def _trained(task: TaskConfig) -> str:
     """Describes the distribution of the episodes in training."""
-    parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
-    ranges = [f"mass x {_range(task.mass_range)}", f"sliding friction {_range(task.friction_range)}"]
+    parts = [
+        f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)
+    ]
+    ranges = [
+        f"mass x {_range(task.mass_range)}",
+        f"sliding friction {_range(task.friction_range)}",
+    ]
     if task.gain_range != (1.0, 1.0):
         ranges.append(f"servo gains x {_range(task.gain_range)}")
     ranges += _tracker(task.sensing)
-    return f"In training: {_HEADINGS[task.headings]}; {', '.join(parts) or 'no other constraint'}; {', '.join(ranges)}."
+    return (
+        f"In training: {_HEADINGS[task.headings]}; {', '.join(parts) or 'no other constraint'}; "
+        f"{', '.join(ranges)}."
+    )
 
 
 def _tracker(sensing: SensingConfig) -> list[str]:
-    """Describes the tracker's ranges in training, with units, omitting those that were always zero."""
+    """Describes the tracker's ranges in training, with units, omitting those that were always
+    zero.
+    """
     ranges = {name: (getattr(sensing, name), unit) for name, unit in _TRACKER_UNITS.items()}
     return [
         f"tracker's {name.replace('_', ' ')} {_range(limits)} {unit}".rstrip()
@@ -377,9 +445,15 @@ def _range(limits: tuple[float, float]) -> str:
 
 def _observed(task: TaskConfig) -> str:
     """Describes the observation of the policy."""
-    robot = f"It observes the last {task.history} control steps of joint angles, the wrist, their targets"
+    robot = (
+        f"It observes the last {task.history} control steps of joint angles, the wrist, their "
+        f"targets"
+    )
     if task.observation == "camera":
-        return f"{robot}, and a partial cloud of the object from a depth camera; no pose, velocities or contact forces."
+        return (
+            f"{robot}, and a partial cloud of the object from a depth camera; no pose, velocities "
+            f"or contact forces."
+        )
     if task.observation == "tracked":
         return f"{robot} and the object's pose from a tracker; no velocities and no contact forces."
     pose = "exact poses" if task.sensing == SensingConfig() else "the object's pose from a tracker"

@@ -1,8 +1,8 @@
 """Published figures: the files of `docs/results`, and the tables of them in pages.
 
-`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes
-each table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`. KIND is one
-of `KINDS`.
+`congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m
+congrasp.services.evaluate.results` writes each table between `<!-- results NAME KIND -->` and `<!--
+end of results -->` in the README and in `docs`. KIND is one of `KINDS`.
 """
 
 import dataclasses
@@ -23,7 +23,15 @@ from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.evaluate.scores import Row
-from congrasp.services.evaluate.table import PLAUSIBILITY, RATE, Columns, Table, paper_rate, percent, row_title
+from congrasp.services.evaluate.table import (
+    PLAUSIBILITY,
+    RATE,
+    Columns,
+    Table,
+    paper_rate,
+    percent,
+    row_title,
+)
 from congrasp.services.evaluate.tables import HeadingRules
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -69,7 +77,18 @@ def read_results(file: pathlib.Path) -> Results:
         rows = [Row.from_json(row) for row in about.pop("rows")]
     except (LookupError, TypeError, AttributeError):
         raise CongraspError(f"{file} is not a file of results of this version.", remedy) from None
-    if missing := {"policies", "command", "machine", "version", "objects", "physics", "heading_rules"} - about.keys():
+    if (
+        missing := {
+            "policies",
+            "command",
+            "machine",
+            "version",
+            "objects",
+            "physics",
+            "heading_rules",
+        }
+        - about.keys()
+    ):
         raise CongraspError(f"{file} lacks '{min(missing)}'.", remedy)
     return Results(rows, about)
 
@@ -86,7 +105,10 @@ def summary(results: Results) -> list[str]:
         ("success", lambda row: percent(row.success)),
         ("held for 2 s", lambda row: percent(row.held_2s)),
         ("held, and clean", lambda row: percent(row.plausibility.get("clean"))),
-        ("success, held of all objects", lambda row: f"{percent(row.success_all)}, {percent(row.held_all)}"),
+        (
+            "success, held of all objects",
+            lambda row: f"{percent(row.success_all)}, {percent(row.held_all)}",
+        ),
         ("paper", paper_rate),
     )
     return Table.of("", results.rows, columns).markdown()
@@ -107,7 +129,14 @@ def rates(results: Results) -> list[str]:
 
 def plausibility(results: Results) -> list[str]:
     """Penetrations (mean, 95th percentile), peaks of the wrist, and survival of grasps."""
-    heads = ("constraint", "in itself, mm", "in the table", "in the object", "wrist, m/s", *dict(PLAUSIBILITY[5:]))
+    heads = (
+        "constraint",
+        "in itself, mm",
+        "in the table",
+        "in the object",
+        "wrist, m/s",
+        *dict(PLAUSIBILITY[5:]),
+    )
     columns = [(head, cell) for head, (_, cell) in zip(heads, PLAUSIBILITY, strict=True)]
     return Table.of("", results.rows, columns).markdown()
 
@@ -120,7 +149,8 @@ def conditions(results: Results) -> list[str]:
         for policy in about["policies"]
     )
     return [
-        f"{policies}, on {about['objects']}, {engine_title(about['physics'])}, {about['machine']}, congrasp "
+        f"{policies}, on {about['objects']}, {engine_title(about['physics'])}, {about['machine']}, "
+        f"congrasp "
         f"{about['version']}:",
         "",
         "```text",
@@ -132,7 +162,10 @@ def conditions(results: Results) -> list[str]:
 
 def headings(results: Results) -> list[str]:
     """Effect of the rules for headings."""
-    return [HeadingRules(**found).sentence(hand) for hand, found in results.about["heading_rules"].items()]
+    return [
+        HeadingRules(**found).sentence(hand)
+        for hand, found in results.about["heading_rules"].items()
+    ]
 
 
 KINDS: dict[str, Callable[[Results], list[str]]] = {

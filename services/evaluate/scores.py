@@ -1,4 +1,6 @@
-"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures for comparison."""
+"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures for
+comparison.
+"""
 
 import dataclasses
 import json
@@ -26,7 +28,9 @@ TABLES = {
 """Rows of the paper's tables, by active constraints; the aligned pairs are not in the paper."""
 ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
 """Names of the errors of each constraint, in the metrics of episodes and in rows."""
-UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
+UNITS = {
+    spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors
+}
 """Units of the errors, by their names in rows."""
 NORMAL_95 = 1.959964
 """Quantile of the normal distribution for two-sided 95 % intervals."""
@@ -66,7 +70,9 @@ class Row:
     success_all: float
     """Success rate over all requested objects, counting every uncovered object as a failure."""
     held_2s: float | None
-    """Rate of success that lasts for two seconds without the table; None if episodes ended earlier."""
+    """Rate of success that lasts for two seconds without the table; None if episodes ended
+    earlier.
+    """
     held_2s_low: float | None
     held_2s_high: float | None
     held_all: float | None
@@ -79,11 +85,17 @@ class Row:
     """Rate of episodes with diverged physics."""
     paper: PaperRow | None
     plausibility: dict[str, float | None] = dataclasses.field(default_factory=dict)
-    """Means of the measures over all episodes, `_p95` of the deepest penetrations, and rates (`actors.stress`)."""
+    """Means of the measures over all episodes, `_p95` of the deepest penetrations, and rates
+    (`actors.stress`).
+    """
     margins: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Half of the 95 % interval of each error's mean (two successful episodes at least): 1.96 standard errors."""
+    """Half of the 95 % interval of each error's mean (two successful episodes at least): 1.96
+    standard errors.
+    """
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
-    """Quantiles of each error in successful episodes: minimum, every hundredth, and maximum; 101 numbers."""
+    """Quantiles of each error in successful episodes: minimum, every hundredth, and maximum; 101
+    numbers.
+    """
     objects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     """Name, number of episodes and rates of each object with episodes."""
 
@@ -100,24 +112,31 @@ class Row:
         Raises:
           LookupError, TypeError: `row` has another format.
         """
-        own = {field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row}
+        own = {
+            field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row
+        }
         # Older files lack constraints that were added later.
         errors = {name: row.get(name) for names in ERRORS.values() for name in names.values()}
         forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
         forces |= {name: row[name] for name in _PRESSED}
         known = {*own, *errors, *forces, "return"}
         measured = {name: value for name, value in row.items() if name not in known}
-        own |= {"paper": PaperRow(**row["paper"]) if row["paper"] else None, "plausibility": measured}
+        own |= {
+            "paper": PaperRow(**row["paper"]) if row["paper"] else None,
+            "plausibility": measured,
+        }
         return cls(**own, errors=errors, forces=forces, episode_return=row["return"])
 
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
     """Names of the rows of some of `TABLES` whose constraints the task's policy supports."""
     rows = dict.fromkeys(row for table in tables for row in TABLES[table])
-    return [row for row in rows if set(row.removesuffix(ALIGNED).split("+")) <= set(task.constraints)]
+    return [
+        row for row in rows if set(row.removesuffix(ALIGNED).split("+")) <= set(task.constraints)
+    ]
 
 
-def summarise(
+def summarise(  # noqa: PLR0913
     name: str,
     hand: str,
     sample: Sample,
@@ -139,8 +158,8 @@ def summarise(
       held_2s: True if the episodes lasted for two seconds without the table.
       objects: names of the pool's objects, including those without an episode.
       pool: number of requested objects, if the row covers only some of them; all by default.
-      by_reference: uses references, such as captured sequences, as clusters of the intervals instead of objects.
-      group: group of objects, such as "small (below 8 cm)".
+      by_reference: uses references, such as captured sequences, as clusters of the intervals
+      instead of objects. group: group of objects, such as "small (below 8 cm)".
       method: method of `common.task.methods`.
       paper: table of the paper for comparison, see `services.evaluate.paper`.
     """
@@ -150,7 +169,11 @@ def summarise(
     success, index = values["success"] > 0, values["object_index"]
     clusters = values["reference"] if by_reference else index
     held = _rates(("held_2s", "held_all"), values["held"] > 0, clusters, index, pool)
-    found = {name: values[source][success] for part in constraint.split("+") for source, name in ERRORS[part].items()}
+    found = {
+        name: values[source][success]
+        for part in constraint.split("+")
+        for source, name in ERRORS[part].items()
+    }
     reached = {name: error for name, error in found.items() if len(error)}
     means = {name: float(error.mean()) for name, error in reached.items()}
     return Row(
@@ -173,16 +196,28 @@ def summarise(
         diverged=float((values["diverged"] > 0).mean()),
         paper=paper_row(paper, hand, method, constraint, group),
         plausibility=_plausibility(values, held_2s),
-        margins={name: NORMAL_95 * standard_error(error) for name, error in reached.items() if len(error) > 1},
-        quantiles={name: np.quantile(error, _HUNDREDTHS).round(6).tolist() for name, error in reached.items()},
+        margins={
+            name: NORMAL_95 * standard_error(error)
+            for name, error in reached.items()
+            if len(error) > 1
+        },
+        quantiles={
+            name: np.quantile(error, _HUNDREDTHS).round(6).tolist()
+            for name, error in reached.items()
+        },
         objects=_by_object(values, objects, held_2s),
     )
 
 
 def _rates(
-    names: tuple[str, str], outcomes: np.ndarray, clusters: np.ndarray, objects: np.ndarray, pool: int
+    names: tuple[str, str],
+    outcomes: np.ndarray,
+    clusters: np.ndarray,
+    objects: np.ndarray,
+    pool: int,
 ) -> dict[str, Any]:
-    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, some without episodes.
+    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, some
+    without episodes.
 
     Args:
       names: names of the two means.
@@ -198,7 +233,9 @@ def _rates(
     return {**found, names[1]: float(of_each.sum() / pool)}
 
 
-def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:
+def _by_object(
+    values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool
+) -> list[dict[str, Any]]:
     """Rates of each object with episodes, in the pool's order."""
     index = values["object_index"].astype(int)
     counts = np.bincount(index, minlength=len(objects))
@@ -216,7 +253,9 @@ def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: b
 
 
 def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
-    """Means of the plausibility measures; None if not measured, or if they need the missing two-second hold."""
+    """Means of the plausibility measures; None if not measured, or if they need the missing
+    two-second hold.
+    """
     row: dict[str, float | None] = {}
     for name in ASSESSED:
         column = values.get(name, np.zeros(0))
@@ -229,10 +268,11 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
 
 
 def _forces(sample: Sample) -> dict[str, float | None]:
-    """Mean and 95th percentile of: force of a touching link, sum over the links, and finger torque over its limit.
+    """Mean and 95th percentile of: force of a touching link, sum over the links, and finger torque
+    over its limit.
 
-    `force_peak_n` is the greatest force of a link in an episode, `force_mean_n` that of the strongest link in a step.
-    Both are means over the episodes.
+    `force_peak_n` is the greatest force of a link in an episode, `force_mean_n` that of the
+    strongest link in a step. Both are means over the episodes.
     """
     links = np.asarray(sample.link_force, np.float32)
     samples = links[links > 0], links.sum(-1).ravel(), np.asarray(sample.torque, np.float32).ravel()
@@ -264,10 +304,11 @@ def wilson(rate: float, count: float) -> tuple[float, float]:
 def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
     """Number of independent episodes with the same variance of the rate as these clustered ones.
 
-    It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the cluster-robust variance of
-    the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p (1 - p) / n. The design effect is at least 1.
-    If all episodes have the same outcome it cannot be estimated, and each cluster counts once. Episodes of a single
-    cluster count as independent, and the rate is that of the cluster.
+    It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the
+    cluster-robust variance of the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p
+    (1 - p) / n. The design effect is at least 1. If all episodes have the same outcome it cannot be
+    estimated, and each cluster counts once. Episodes of a single cluster count as independent, and
+    the rate is that of the cluster.
 
     Args:
       outcomes: (E,) bool.
@@ -286,7 +327,9 @@ def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
 
 
 def clustered(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with `independent_episodes`."""
+    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with
+    `independent_episodes`.
+    """
     rate = float(np.mean(outcomes)) if len(outcomes) else 0.0
     return wilson(rate, independent_episodes(outcomes, clusters))
 
@@ -296,7 +339,9 @@ def standard_error(values: np.ndarray) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -> tuple[np.ndarray, list[str]]:
+def terciles(
+    values: np.ndarray, names: Sequence[str], unit: str, factor: float
+) -> tuple[np.ndarray, list[str]]:
     """Divides objects into three groups of equal size by a property (N,).
 
     Returns:
@@ -311,14 +356,19 @@ def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float)
     return (values > low).astype(int) + (values > high), labels
 
 
-def object_groups(sizes: np.ndarray, masses: np.ndarray, families: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def object_groups(
+    sizes: np.ndarray, masses: np.ndarray, families: np.ndarray
+) -> list[tuple[str, np.ndarray]]:
     """Labels and members (N,) bool of the groups of objects in the test on unseen geometry.
 
-    The paper stratifies by size without giving bounds. The groups are terciles of the largest side (m), terciles of the
-    mass (kg), and families.
+    The paper stratifies by size without giving bounds. The groups are terciles of the largest side
+    (m), terciles of the mass (kg), and families.
     """
     groups = []
-    for values, names, unit, factor in ((sizes, _SIZES, "cm", 100.0), (masses, ("light", "mid", "heavy"), "g", 1000.0)):
+    for values, names, unit, factor in (
+        (sizes, _SIZES, "cm", 100.0),
+        (masses, ("light", "mid", "heavy"), "g", 1000.0),
+    ):
         of_object, labels = terciles(values, names, unit, factor)
         groups += [(label, of_object == i) for i, label in enumerate(labels)]
     return groups + [(f"family {family}", families == family) for family in np.unique(families)]

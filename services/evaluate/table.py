@@ -1,5 +1,5 @@
-"""Tables of text, and how they are written: to a terminal, as Markdown, HTML and LaTeX; and the rows of evaluations as
-such tables."""
+"""Tables of text, and how they are written: to a terminal, as Markdown, HTML and LaTeX; and the
+rows of evaluations as such tables."""
 
 import dataclasses
 import html
@@ -59,7 +59,11 @@ class Table:
     @classmethod
     def of(cls, title: str, items: Iterable[_Item], columns: Columns[_Item]) -> "Table":
         """Returns a table with a row for each item."""
-        return cls(title, [name for name, _ in columns], [[cell(item) for _, cell in columns] for item in items])
+        return cls(
+            title,
+            [name for name, _ in columns],
+            [[cell(item) for _, cell in columns] for item in items],
+        )
 
     def terminal(self) -> Any:
         """The table for a terminal, as a `rich.table.Table`."""
@@ -75,13 +79,20 @@ class Table:
     def markdown(self) -> list[str]:
         """Lines of Markdown, without the title."""
         lines = [self.columns, ["---"] * len(self.columns), *self.rows]
-        return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines]
+        return [
+            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines
+        ]
 
     def html(self) -> str:
         """The table as HTML; its title is the caption."""
-        heads = (f"<th{' class=paper' * (name == 'paper')}>{html.escape(name)}</th>" for name in self.columns)
+        heads = (
+            f"<th{' class=paper' * (name == 'paper')}>{html.escape(name)}</th>"
+            for name in self.columns
+        )
         rows = (
-            "".join(x.html() if isinstance(x, Styled) else f"<td>{html.escape(x)}</td>" for x in row)
+            "".join(
+                x.html() if isinstance(x, Styled) else f"<td>{html.escape(x)}</td>" for x in row
+            )
             for row in self.rows
         )
         caption = f"<caption>{html.escape(self.title)}</caption>\n" if self.title else ""
@@ -89,7 +100,8 @@ class Table:
         return f"<table>\n{caption}{lines}\n</table>"
 
     def latex(self, conditions: str) -> str:
-        """A `table` environment for documents that load booktabs and graphicx, with a rule before each new first cell.
+        """A `table` environment for documents that load booktabs and graphicx, with a rule before
+        each new first cell.
 
         Args:
           conditions: a sentence for the caption.
@@ -116,11 +128,15 @@ def escape(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
-def percent(rate: float | None, low: float | None = None, high: float | None = None, unit: str = " %") -> str:
+def percent(
+    rate: float | None, low: float | None = None, high: float | None = None, unit: str = " %"
+) -> str:
     """Formats a rate, with its interval if there is one: "98.7 % (96.6-99.5)"."""
     if rate is None:
         return NONE
-    return f"{100 * rate:.1f}{unit}" + ("" if low is None or high is None else f" ({100 * low:.1f}-{100 * high:.1f})")
+    return f"{100 * rate:.1f}{unit}" + (
+        "" if low is None or high is None else f" ({100 * low:.1f}-{100 * high:.1f})"
+    )
 
 
 def row_title(row: Row) -> str:
@@ -150,23 +166,32 @@ def errors_text(errors: Mapping[str, float | None]) -> str:
     parts = []
     for names in ERRORS.values():
         found = [(errors.get(name), UNITS[name]) for name in names.values()]
-        parts.append(" ".join(f"{value:.3f} {unit}".strip() for value, unit in found if value is not None))
+        parts.append(
+            " ".join(f"{value:.3f} {unit}".strip() for value, unit in found if value is not None)
+        )
     return ", ".join(filter(None, parts))
 
 
 def error_columns(rows: Sequence[Row]) -> Columns[Row]:
-    """Columns of the errors that some row has, in degrees, millimetres and per cent, with the paper's as notes."""
+    """Columns of the errors that some row has, in degrees, millimetres and per cent, with the
+    paper's as notes.
+    """
     shown = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
     columns = []
     for constraint, names in ERRORS.items():
-        for name in (name for name in names.values() if any(row.errors.get(name) is not None for row in rows)):
+        for name in (
+            name for name in names.values() if any(row.errors.get(name) is not None for row in rows)
+        ):
             unit, factor = shown[UNITS[name]]
 
             def cell(row: Row, name: str = name, factor: float = factor) -> Styled:
                 """Our error, and the paper's as a note."""
                 ours, paper = (
                     "" if error is None else f"{factor * error:.1f}"
-                    for error in (row.errors.get(name), row.paper.errors.get(name) if row.paper else None)
+                    for error in (
+                        row.errors.get(name),
+                        row.paper.errors.get(name) if row.paper else None,
+                    )
                 )
                 return Styled(ours, "number", paper)
 
@@ -176,7 +201,11 @@ def error_columns(rows: Sequence[Row]) -> Columns[Row]:
 
 def _mesh_note(row: Row) -> str:
     """Depth of the hand's meshes in the object, if it has some."""
-    return f", its meshes {measured(row, 'hand_mesh_mm')}" if row.plausibility.get("hand_mesh_mm") is not None else ""
+    return (
+        f", its meshes {measured(row, 'hand_mesh_mm')}"
+        if row.plausibility.get("hand_mesh_mm") is not None
+        else ""
+    )
 
 
 def _peak(name: str) -> Callable[[Row], str]:
@@ -193,17 +222,31 @@ RATES: Columns[Row] = (
     ("constraint", row_title),
     (
         "episodes",
-        lambda row: str(row.episodes) + (f" ({row.distinct} different)" if row.distinct != row.episodes else ""),
+        lambda row: (
+            str(row.episodes)
+            + (f" ({row.distinct} different)" if row.distinct != row.episodes else "")
+        ),
     ),
-    ("objects", lambda row: str(row.covered) + (f" of {row.pool}" if row.covered != row.pool else "")),
+    (
+        "objects",
+        lambda row: str(row.covered) + (f" of {row.pool}" if row.covered != row.pool else ""),
+    ),
     ("success", lambda row: percent(row.success, row.success_low, row.success_high)),
     ("held 2 s", lambda row: percent(row.held_2s, row.held_2s_low, row.held_2s_high)),
-    ("of all objects", lambda row: ", ".join(percent(x) for x in (row.success_all, row.held_all) if x is not None)),
+    (
+        "of all objects",
+        lambda row: ", ".join(percent(x) for x in (row.success_all, row.held_all) if x is not None),
+    ),
     ("error", lambda row: errors_text(row.errors)),
-    ("paper", lambda row: "  ".join((paper_rate(row), errors_text(row.paper.errors))).strip() if row.paper else ""),
+    (
+        "paper",
+        lambda row: (
+            "  ".join((paper_rate(row), errors_text(row.paper.errors))).strip() if row.paper else ""
+        ),
+    ),
 )
-"""Rates and errors, with those of the paper. "Of all objects": success and held, counting uncovered objects as
-failures."""
+"""Rates and errors, with those of the paper. "Of all objects": success and held, counting uncovered
+objects as failures."""
 RATE = dict(RATES)
 """Cells of `RATES` by their columns."""
 PLAUSIBILITY: Columns[Row] = (
@@ -219,8 +262,9 @@ PLAUSIBILITY: Columns[Row] = (
         strict=True,
     ),
 )
-"""Plausibility: deepest penetrations (mean, 95th percentile), also of the hand's meshes into the object if it has some;
-peak speed and acceleration of the wrist; rates. A push stands for six in a row (`actors.stress.Protocol`)."""
+"""Plausibility: deepest penetrations (mean, 95th percentile), also of the hand's meshes into the
+object if it has some; peak speed and acceleration of the wrist; rates. A push stands for six in a
+row (`actors.stress.Protocol`)."""
 FORCES: Columns[Row] = (
     ("constraint", row_title),
     ("link, N", lambda row: measured(row, "link_force")),
@@ -233,7 +277,9 @@ FORCES: Columns[Row] = (
 FORCES_TITLE = "Forces after the removal: mean, 95th percentile"
 
 
-def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()) -> list[Table]:
+def tables_of(
+    rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()
+) -> list[Table]:
     """Returns rows as tables: rates and errors with those of the paper, plausibility, then forces.
 
     Args:
@@ -247,7 +293,9 @@ def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str,
     if missing or len({(row.hand, row.method) for row in rows}) > 1:
         who = (("hand", lambda row: row.hand), ("method", lambda row: row.method))
     titled = {title: RATES, "Plausibility of all episodes": PLAUSIBILITY, FORCES_TITLE: FORCES}
-    rates, *others = (Table.of(name, rows, (*own[:1], *who, *own[1:])) for name, own in titled.items())
+    rates, *others = (
+        Table.of(name, rows, (*own[:1], *who, *own[1:])) for name, own in titled.items()
+    )
     absent = [(reason, hand, method, *[""] * (len(RATES) - 1)) for hand, method, reason in missing]
     return [dataclasses.replace(rates, rows=[*rates.rows, *absent]), *others]
 
@@ -255,12 +303,19 @@ def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str,
 def object_table(rows: Sequence[Row]) -> Table:
     """Returns the success and held rates of each object (a line) in each row (a column)."""
     several = len({(row.hand, row.method) for row in rows}) > 1
-    heads = [f"{row_title(row)}, {row.hand}, {row.method}" if several else row_title(row) for row in rows]
+    heads = [
+        f"{row_title(row)}, {row.hand}, {row.method}" if several else row_title(row) for row in rows
+    ]
     found = [{of["name"]: of for of in row.objects} for row in rows]
     lines = [
         [
             name,
-            *(", ".join(percent(of[name][k]) for k in ("success", "held_2s") if k in of.get(name, ())) for of in found),
+            *(
+                ", ".join(
+                    percent(of[name][k]) for k in ("success", "held_2s") if k in of.get(name, ())
+                )
+                for of in found
+            ),
         ]
         for name in dict.fromkeys(name for of in found for name in of)
     ]

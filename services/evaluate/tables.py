@@ -1,4 +1,6 @@
-"""Tables of an evaluation: their rows, as variations of one experiment, and the effect of the rules for headings."""
+"""Tables of an evaluation: their rows, as variations of one experiment, and the effect of the rules
+for headings.
+"""
 
 import dataclasses
 import math
@@ -33,7 +35,14 @@ from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 
 MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Masses of the table `payload`, kg."""
-_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
+# Tables whose rows are not constraints
+_OTHERS = {
+    "noise",
+    "sensing",
+    "objects",
+    "payload",
+    "peers",
+}
 _LIFT = np.array([0, 0, 10, 0, 0, 0, 0])
 """z coordinate of the resting pose, m: higher than any hand reaches down."""
 
@@ -51,11 +60,15 @@ class Center(Variation):
 
 @dataclasses.dataclass(frozen=True)
 class Noise(Variation):
-    """References with errors like captured ones; errors of the row are relative to the request, including noise.
+    """References with errors like captured ones; errors of the row are relative to the request,
+    including noise.
 
-    * joints: an independent normal error of standard deviation `level` on every finger joint, clipped to its limits.
-    * depth: a displacement of the wrist along the hand's heading axis, into the object, uniform up to `level`.
-    * jitter: an independent normal error of standard deviation `level` on every coordinate of every waypoint.
+    * joints: an independent normal error of standard deviation `level` on every finger joint,
+      clipped to its limits.
+    * depth: a displacement of the wrist along the hand's heading axis, into the object, uniform up
+      to `level`.
+    * jitter: an independent normal error of standard deviation `level` on every coordinate of every
+      waypoint.
     """
 
     kind: str = ""
@@ -85,10 +98,11 @@ class Noise(Variation):
 
 @dataclasses.dataclass(frozen=True)
 class Sensors(Variation):
-    """A tracker, a friction and an error of the gains; by default a tracker with 30 Hz, 5 mm, 3 degrees and 60 ms.
+    """A tracker, a friction and an error of the gains; by default a tracker with 30 Hz, 5 mm, 3
+    degrees and 60 ms.
 
-    A policy of the full state gets the tracker's pose instead of the true one, and keeps its contact forces and
-    velocities. Errors and losses use the same random numbers at all levels.
+    A policy of the full state gets the tracker's pose instead of the true one, and keeps its
+    contact forces and velocities. Errors and losses use the same random numbers at all levels.
     """
 
     position_noise: float = 0.005
@@ -109,8 +123,12 @@ class Sensors(Variation):
     """Seconds until the servos follow a target."""
 
     def task(self, task: TaskConfig) -> TaskConfig:
-        """Returns the task in which a policy observes trackers, with room for the longest delay of `SENSING`."""
-        delay, latency = ((0.0, max(getattr(level, name) for level in SENSING)) for name in ("delay", "latency"))
+        """Returns the task in which a policy observes trackers, with room for the longest delay of
+        `SENSING`.
+        """
+        delay, latency = (
+            (0.0, max(getattr(level, name) for level in SENSING)) for name in ("delay", "latency")
+        )
         sensing = SensingConfig(delay=delay, latency=latency, settle=task.sensing.settle)
         return dataclasses.replace(task, sensing=sensing)
 
@@ -125,25 +143,37 @@ class Sensors(Variation):
             "latency": round(self.latency / control_dt),
         }
         sensors, start = conditions.sensors, conditions.reset_state
-        friction = start.friction if self.friction is None else jnp.full_like(start.friction, self.friction)
+        friction = (
+            start.friction
+            if self.friction is None
+            else jnp.full_like(start.friction, self.friction)
+        )
         return conditions._replace(
-            sensors=sensors._replace(**{k: jnp.full_like(getattr(sensors, k), value) for k, value in values.items()}),
-            reset_state=start._replace(friction=friction, gain_scale=jnp.full_like(start.gain_scale, self.gains)),
+            sensors=sensors._replace(
+                **{k: jnp.full_like(getattr(sensors, k), value) for k, value in values.items()}
+            ),
+            reset_state=start._replace(
+                friction=friction, gain_scale=jnp.full_like(start.gain_scale, self.gains)
+            ),
         )
 
 
 @dataclasses.dataclass(frozen=True)
 class Load(Variation):
-    """Mass of an object and friction of an episode, each uniform in a range; by default those of the evaluation.
+    """Mass of an object and friction of an episode, each uniform in a range; by default those of
+    the evaluation.
 
-    The inertia is scaled with the mass. Objects are replaced instead of scaling the mass of an episode: engines derive
-    the softness of contacts from the mass at compilation, and diverge far from it.
+    The inertia is scaled with the mass. Objects are replaced instead of scaling the mass of an
+    episode: engines derive the softness of contacts from the mass at compilation, and diverge far
+    from it.
     """
 
     mass: tuple[float, float] | None = None
     """kg; the object's name determines the position in the range."""
     friction: tuple[float, float] | None = None
-    """Sliding friction between hand and object; the episode determines the position in the range."""
+    """Sliding friction between hand and object; the episode determines the position in the
+    range.
+    """
     factor: float = 1.0
     """Factor on the object's mass, if no mass is given."""
 
@@ -153,7 +183,10 @@ class Load(Variation):
         for obj in objects:
             mass = self.factor * obj.mass
             if self.mass:
-                mass = self.mass[0] + (self.mass[1] - self.mass[0]) * zlib.crc32(obj.name.encode()) / 2**32
+                mass = (
+                    self.mass[0]
+                    + (self.mass[1] - self.mass[0]) * zlib.crc32(obj.name.encode()) / 2**32
+                )
             found.append(dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass))
         return found
 
@@ -162,7 +195,9 @@ class Load(Variation):
         if not self.friction:
             return conditions
         low, high = self.friction
-        share = np.array([zlib.crc32(episode.tobytes()) for episode in identity(conditions)]) / 2**32
+        share = (
+            np.array([zlib.crc32(episode.tobytes()) for episode in identity(conditions)]) / 2**32
+        )
         friction = (low + (high - low) * share).astype(np.float32)
         return conditions._replace(reset_state=conditions.reset_state._replace(friction=friction))
 
@@ -179,7 +214,9 @@ NOISE = (
 )
 """Rows of the table `noise` (paper, noisy constraints)."""
 SENSING = (
-    Sensors(label="the true pose", position_noise=0.0, rotation_noise=0.0, delay=0.0, rate=math.inf),
+    Sensors(
+        label="the true pose", position_noise=0.0, rotation_noise=0.0, delay=0.0, rate=math.inf
+    ),
     Sensors(label="5 mm 3°, 30 Hz, 60 ms"),
     Sensors(label="no noise", position_noise=0.0, rotation_noise=0.0),
     Sensors(label="10 mm 6°", position_noise=0.01, rotation_noise=math.radians(6.0)),
@@ -194,16 +231,21 @@ SENSING = (
     Sensors(label="targets 20 ms late", latency=0.02),
     Sensors(label="targets 40 ms late", latency=0.04),
 )
-"""Rows of the table `sensing`; each but the first differs from the second, a typical tracker, in one setting."""
+"""Rows of the table `sensing`; each but the first differs from the second, a typical tracker, in
+one setting.
+"""
 PEERS = (
     Load(label="RobustDexGrasp: 0.25 kg, friction 0.8", mass=(0.25, 0.25), friction=(0.8, 0.8)),
     Load(label="dexsuite: 0.04-0.5 kg, friction 0.5-1", mass=(0.04, 0.5), friction=(0.5, 1.0)),
 )
-"""Rows of the table `peers`: conditions of RobustDexGrasp (arXiv:2504.05287) and of Isaac Lab's dexsuite."""
+"""Rows of the table `peers`: conditions of RobustDexGrasp (arXiv:2504.05287) and of Isaac Lab's
+dexsuite.
+"""
 
 
 def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
-    """Rows of the table `payload`: fixed masses, the objects' masses, and masses scaled with lengths if different.
+    """Rows of the table `payload`: fixed masses, the objects' masses, and masses scaled with
+    lengths if different.
 
     Args:
       scale: factor on the lengths of the hand's objects.
@@ -231,23 +273,38 @@ class HeadingRules:
     kept_by_center: float
     """Pairs kept if only the hand's centre must be above the table."""
     opposed: float
-    """Share of the headings by the paper's rules alone that have surfaces to press on from both sides."""
+    """Share of the headings by the paper's rules alone that have surfaces to press on from both
+    sides.
+    """
 
     def sentence(self, hand: str) -> str:
         """Summary, such as "Headings of the human hand: 24 % of those sampled are kept …"."""
-        shares = (self.kept, self.from_below, self.no_room, self.moved, self.kept_by_center, 1 - self.opposed)
+        shares = (
+            self.kept,
+            self.from_below,
+            self.no_room,
+            self.moved,
+            self.kept_by_center,
+            1 - self.opposed,
+        )
         kept, below, room, moved, by_center, lost = (f"{100 * share:.0f} %" for share in shares)
         return (
-            f"Headings of the {hand} hand: {kept} of the sampled ones are kept, {below} dropped because they come from "
-            f"below and {room} because the table leaves the hand no room; {moved} of the kept ones are moved back from "
-            f"the table. By the paper's rules, with the hand's centre above the table, {by_center} are kept; {lost} of "
-            "these rules' headings have no surfaces to press on from both sides, which the full rules do not sample. "
+            f"Headings of the {hand} hand: {kept} of the sampled ones are kept, {below} dropped "
+            f"because they come from "
+            f"below and {room} because the table leaves the hand no room; {moved} of the kept ones "
+            f"are moved back from "
+            f"the table. By the paper's rules, with the hand's centre above the table, {by_center} "
+            f"are kept; {lost} of "
+            "these rules' headings have no surfaces to press on from both sides, which the full "
+            "rules do not sample. "
             "The paper states no such rules."
         )
 
 
 def heading_rules(experiment: Experiment) -> HeadingRules:
-    """Effect of the rules on the sampled headings of the whole surface, over all resting poses of the objects."""
+    """Effect of the rules on the sampled headings of the whole surface, over all resting poses of
+    the objects.
+    """
     bank, by_center, objects = experiment.bank, experiment.by_center, experiment.scaled
     total, below, opposed = 0, 0, []
     for n, obj in enumerate(objects):
@@ -274,7 +331,9 @@ def _sampled(bank: ConstraintBank, n: int) -> Headings:
 
 
 def _kept(bank: ConstraintBank) -> tuple[int, int]:
-    """Numbers of pairs of a heading and a resting pose that a bank keeps, and of those moved back."""
+    """Numbers of pairs of a heading and a resting pose that a bank keeps, and of those moved
+    back.
+    """
     index, back = np.asarray(bank.heading_index)[:, 0], np.asarray(bank.heading_back)[:, 0]
     kept = moved = 0
     for n, r in np.argwhere(~repeated_rests(np.asarray(bank.rest))):
@@ -315,22 +374,29 @@ def evaluate_tables(
     """Evaluates the rows of some tables.
 
     Args:
-      experiment: policy, evaluated as the method of its task, objects, engine and numbers. The table `objects` has
+      experiment: policy, evaluated as the method of its task, objects, engine and numbers. The
+      table `objects` has
         as many episodes in total, on objects of its own.
-      tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all of these.
-      pools: pools of the table `objects`, if it is wanted.
-      kept: folder for the results of rows and pools, to resume from; rows with kept episodes are not stored.
-      keep: keeps episodes for pictures.
+      tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all
+      of these. pools: pools of the table `objects`, if it is wanted.
+      kept: folder for the results of rows and pools, to resume from; rows with kept episodes are
+      not stored. keep: keeps episodes for pictures.
 
     Raises:
       CongraspError: the policy's method has no row in these tables, or no object allows one.
     """
     task, wanted = experiment.policy.task, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
-    names = [name for name in known_rows((k for k in TABLES if k in wanted), task) if takes(task.method, name)]
+    names = [
+        name
+        for name in known_rows((k for k in TABLES if k in wanted), task)
+        if takes(task.method, name)
+    ]
     if not takes(task.method, Variation().constraint):
         wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
-        raise CongraspError(f"The method '{task.method}' has no row in these tables.", "Pass another --table.")
+        raise CongraspError(
+            f"The method '{task.method}' has no row in these tables.", "Pass another --table."
+        )
     found = Found(experiment, [], [], [], "")
     if names or wanted & _OTHERS - {"objects"}:
         found = _rows(experiment, names, wanted, keep, kept and kept / "rows")
@@ -340,7 +406,11 @@ def evaluate_tables(
 
 
 def _rows(
-    experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: bool, stored: pathlib.Path | None
+    experiment: Experiment,
+    names: Sequence[str],
+    wanted: Set[str],
+    keep: bool,
+    stored: pathlib.Path | None,
 ) -> Found:
     """Evaluates constraints of these names, and the rows at levels of some tables."""
     experiment.track("Generating constraints", None)
@@ -374,7 +444,9 @@ def _source(experiment: Experiment) -> str:
     closed = [obj.name for obj, count in zip(experiment.objects, whole, strict=True) if not count]
     text = f"References: grasps of {who}, {np.median(whole):.0f} per object (median)."
     return text + (
-        f" Without a grasp, the hand closed around the object is used: {', '.join(closed)}." if closed else ""
+        f" Without a grasp, the hand closed around the object is used: {', '.join(closed)}."
+        if closed
+        else ""
     )
 
 
@@ -390,7 +462,8 @@ class Captured(NamedTuple):
 
 
 def captured(folder: pathlib.Path, split: Split, objects: Sequence[GraspObject]) -> Captured:
-    """Returns the objects that have a constraint set with a heading of the split in a folder, and the sets.
+    """Returns the objects that have a constraint set with a heading of the split in a folder, and
+    the sets.
 
     Raises:
       CongraspError: none has one, or a set belongs to another object.

@@ -27,7 +27,13 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     names = identifiers([_ROOT, *(body.name for body in found)])[1:]
     count = len(motion.time)
     # A root turns the world y-up; everything below keeps z-up coordinates.
-    lines = ["HIERARCHY", f"ROOT {_ROOT}", "{", "  OFFSET 0 0 0", f"  CHANNELS 3 {' '.join(_ROTATION)}"]
+    lines = [
+        "HIERARCHY",
+        f"ROOT {_ROOT}",
+        "{",
+        "  OFFSET 0 0 0",
+        f"  CHANNELS 3 {' '.join(_ROTATION)}",
+    ]
     columns = [np.tile(_angles(TO_Y_UP), (count, 1))]
 
     def add(index: int, indent: str) -> None:
@@ -35,7 +41,8 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         body = found[index]
         moves = len(body.translation) > 1
         channels = (*_POSITION, *_ROTATION) if moves else _ROTATION
-        # Programs differ in whether a joint's positions replace its offset or add to it: with no offset they agree.
+        # Programs differ in whether a joint's positions replace its offset or add to it: with no
+        # offset they agree.
         offset = np.zeros(3) if moves else _CM * body.translation[0]
         lines.extend([f"{indent}JOINT {names[index]}", f"{indent}{{"])
         lines.append(f"{indent}  OFFSET {_row(offset)}")

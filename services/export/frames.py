@@ -1,4 +1,6 @@
-"""Poses, meshes with their texture coordinates, and facts of a motion, from which every format is written."""
+"""Poses, meshes with their texture coordinates, and facts of a motion, from which every format is
+written.
+"""
 
 import contextlib
 import re
@@ -31,7 +33,9 @@ NOT_LINKS = (OBJECT, SKIN, "world")
 COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
 """Colours of the materials of hands, and of the object."""
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
-_STILL = 1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
+_STILL = (
+    1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
+)
 TO_Y_UP = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from a world frame with the z axis up to one with the y axis up: z to y, y to -z."""
 _MARGIN = 0.004  # space between charts, as a share of the root of the surface's area
@@ -49,7 +53,9 @@ class Body(NamedTuple):
     """T rotations."""
 
     def quaternions(self, *, scalar_first: bool) -> np.ndarray:
-        """(T, 4), each on the side of the one before, so that programs may interpolate between them."""
+        """(T, 4), each on the side of the one before, so that programs may interpolate between
+        them.
+        """
         return continuous(self.rotation.as_quat(scalar_first=scalar_first))
 
 
@@ -73,12 +79,16 @@ def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
     for k in np.flatnonzero(motion.capsule_link == link):
         start, end = motion.capsule_ends[k].astype(float)
         length = float(np.linalg.norm(end - start))
-        turn = Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
+        turn = (
+            Rotation.align_vectors([end - start], [[0, 0, 1]])[0] if length else Rotation.identity()
+        )
         yield Capsule(int(k), length, float(motion.capsule_radius[k]), (start + end) / 2, turn)
 
 
 def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The object's mesh (V, 3), (F, 3), and the sRGB (V, 3) in [0, 1] of its points, for which it is refined."""
+    """The object's mesh (V, 3), (F, 3), and the sRGB (V, 3) in [0, 1] of its points, for which it
+    is refined.
+    """
     if motion.colours is None:
         return motion.object_vertices, motion.object_faces, None
     vertices, faces, colours = painted(motion.object_vertices, motion.object_faces, motion.colours)
@@ -86,7 +96,9 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:
-    """Returns the surface of the motion's hand; that of its file's meshes if it is a custom hand and readable."""
+    """Returns the surface of the motion's hand; that of its file's meshes if it is a custom hand
+    and readable.
+    """
     with contextlib.suppress(CongraspError):  # the motion itself has all the data
         if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
             return skin_of(hand)
@@ -107,7 +119,9 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
 
 
 def link_origins(motion: GraspMotion) -> np.ndarray:
-    """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of their first joints."""
+    """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of
+    their first joints.
+    """
     origins = np.zeros((len(motion.link_names), 3))
     links, first = np.unique(motion.joint_link, return_index=True)
     origins[links] = motion.joint_anchor[first]
@@ -121,20 +135,30 @@ def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
 
 
 def bodies(motion: GraspMotion) -> list[Body]:
-    """Links of the hand in their order, each after its parent, the object, and the links of the arm."""
-    found = _nested(motion.link_names, motion.link_parent, motion.link_position, motion.link_quaternion)
+    """Links of the hand in their order, each after its parent, the object, and the links of the
+    arm.
+    """
+    found = _nested(
+        motion.link_names, motion.link_parent, motion.link_position, motion.link_quaternion
+    )
     turn = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
     found.append(Body(OBJECT, -1, motion.object_position.astype(float), turn))
     if arm := motion.arm:
         first = len(found)
         links = _nested(arm.link_names, arm.link_parent, arm.link_position, arm.link_quaternion)
-        found += [link._replace(parent=link.parent + first if link.parent >= 0 else -1) for link in links]
+        found += [
+            link._replace(parent=link.parent + first if link.parent >= 0 else -1) for link in links
+        ]
     return found
 
 
-def _nested(names: np.ndarray, parents: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> list[Body]:
+def _nested(
+    names: np.ndarray, parents: np.ndarray, position: np.ndarray, quaternion: np.ndarray
+) -> list[Body]:
     """Links in their parents' frames, from poses (T, L, 3) and (T, L, 4) in the world."""
-    turns = [Rotation.from_quat(q, scalar_first=True) for q in quaternion.swapaxes(0, 1).astype(float)]
+    turns = [
+        Rotation.from_quat(q, scalar_first=True) for q in quaternion.swapaxes(0, 1).astype(float)
+    ]
     places = position.swapaxes(0, 1).astype(float)
     found = []
     for i, (name, parent) in enumerate(zip(names, parents, strict=True)):
@@ -180,12 +204,18 @@ def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dic
         "links": motion.link_names.tolist(),
     }
     if arm := motion.arm:
-        about |= {"arm": arm.name, "arm_joints": arm.joint_names.tolist(), "arm_links": arm.link_names.tolist()}
+        about |= {
+            "arm": arm.name,
+            "arm_joints": arm.joint_names.tolist(),
+            "arm_links": arm.link_names.tolist(),
+        }
     return about
 
 
 def identifiers(names: Sequence[str]) -> list[str]:
-    """The names as distinct identifiers, with underscores in place of other characters than letters and digits."""
+    """The names as distinct identifiers, with underscores in place of other characters than letters
+    and digits.
+    """
     plain: list[str] = []
     for name in names:
         word = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -197,25 +227,35 @@ def identifiers(names: Sequence[str]) -> list[str]:
 
 
 class Unwrapped(NamedTuple):
-    """A mesh whose points have texture coordinates; its faces are those of the original, in the same order."""
+    """A mesh whose points have texture coordinates; its faces are those of the original, in the
+    same order.
+    """
 
     source: np.ndarray
-    """(M,) int, index of each point in the original mesh; at a seam each chart has a separate point."""
+    """(M,) int, index of each point in the original mesh; at a seam each chart has a separate
+    point.
+    """
     faces: np.ndarray
     """(F, 3) int."""
     uv: np.ndarray
-    """(M, 2) in [0, 1], v upwards; lengths have the same scale everywhere, except across slanting faces."""
+    """(M, 2) in [0, 1], v upwards; lengths have the same scale everywhere, except across slanting
+    faces.
+    """
 
 
 def unwrapped(vertices: np.ndarray, faces: np.ndarray) -> Unwrapped:
-    """Returns texture coordinates of a mesh (V, 3), (F, 3), projected along the axis closest to each face's normal."""
+    """Returns texture coordinates of a mesh (V, 3), (F, 3), projected along the axis closest to
+    each face's normal.
+    """
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normals).argmax(1)
     side = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0)
     a, b = trimesh.graph.face_adjacency(faces).T
     same = side[a] == side[b]
-    links = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(len(faces), len(faces)))
+    links = coo_array(
+        (np.ones(same.sum(), bool), (a[same], b[same])), shape=(len(faces), len(faces))
+    )
     count, chart = connected_components(links, directed=False)
     of_corner = np.repeat(chart, 3)
     pairs = np.stack([faces.ravel(), of_corner], 1)
@@ -227,13 +267,17 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray) -> Unwrapped:
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, chart_of, flat)
     np.maximum.at(high, chart_of, flat)
-    places, size = _packed(high - low, _MARGIN * float(np.sqrt(np.linalg.norm(normals, axis=1).sum() / 2)))
+    places, size = _packed(
+        high - low, _MARGIN * float(np.sqrt(np.linalg.norm(normals, axis=1).sum() / 2))
+    )
     uv = (flat - low[chart_of] + places[chart_of]) / max(size, 1e-12)
     return Unwrapped(source, inverse.reshape(faces.shape), uv)
 
 
 def _packed(sizes: np.ndarray, margin: float) -> tuple[np.ndarray, float]:
-    """Lower corners (n, 2) of rectangles (n, 2) in rows, the tallest first, and the side of the square around them."""
+    """Lower corners (n, 2) of rectangles (n, 2) in rows, the tallest first, and the side of the
+    square around them.
+    """
     sizes = sizes + margin
     width = max(float(sizes[:, 0].max()), float(np.sqrt(sizes.prod(1).sum())))
     places = np.zeros_like(sizes)

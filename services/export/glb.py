@@ -1,8 +1,9 @@
 """Binary glTF 2.0 with an animation.
 
-One node a link, nested as hand and arm are, with translation and rotation (glTF forbids matrices on animated nodes).
-The hand's are the joints of a skin, by which its surface follows them; the arm's have meshes. glTF is y-up: a root node
-turns the world, so that everything below it keeps congrasp's z-up coordinates.
+One node a link, nested as hand and arm are, with translation and rotation (glTF forbids matrices on
+animated nodes). The hand's are the joints of a skin, by which its surface follows them; the arm's
+have meshes. glTF is y-up: a root node turns the world, so that everything below it keeps congrasp's
+z-up coordinates.
 """
 
 import pathlib
@@ -48,7 +49,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     time = scene.add_values(motion.time, bounds=True)
     for body in bodies(motion):
         number, turns = len(file.nodes), body.quaternions(scalar_first=False)
-        node = gltf.Node(name=body.name, translation=body.translation[0].tolist(), rotation=turns[0].tolist())
+        node = gltf.Node(
+            name=body.name, translation=body.translation[0].tolist(), rotation=turns[0].tolist()
+        )
         file.nodes.append(node)
         file.nodes[body.parent + 1].children.append(number)
         if body.name == OBJECT:
@@ -61,7 +64,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         for name, values in tracks.items():
             target = gltf.AnimationChannelTarget(node=number, path=name)
             grasp.channels.append(gltf.AnimationChannel(sampler=len(grasp.samplers), target=target))
-            grasp.samplers.append(gltf.AnimationSampler(input=time, output=scene.add_values(values)))
+            grasp.samplers.append(
+                gltf.AnimationSampler(input=time, output=scene.add_values(values))
+            )
     _add_skin(scene, skin)
     file.animations = [grasp]
     # A skinned mesh follows its joints alone, so that its node is at the root.
@@ -77,27 +82,42 @@ class _Scene:
     def __init__(self) -> None:
         self.file, self.data = gltf.GLTF2(), bytearray()
 
-    def add_values(self, values: np.ndarray, target: int | None = None, *, bounds: bool = False) -> int:
-        """Adds values (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4); integers (n,) are indices, (n, 4) those of joints."""
+    def add_values(
+        self, values: np.ndarray, target: int | None = None, *, bounds: bool = False
+    ) -> int:
+        """Adds values (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4); integers (n,) are indices, (n, 4)
+        those of joints.
+        """
         whole = np.issubdtype(values.dtype, np.integer)
         number = ("<u4" if values.ndim == 1 else "<u2") if whole else "<f4"
         if values.ndim == 3:
             values = values.swapaxes(1, 2).reshape(-1, 16)  # by columns
         values = np.ascontiguousarray(values, number)
         kind = _KINDS[1 if values.ndim == 1 else values.shape[1]]
-        view = gltf.BufferView(buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target)
+        view = gltf.BufferView(
+            buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target
+        )
         accessor = gltf.Accessor(
-            bufferView=len(self.file.bufferViews), componentType=_NUMBERS[number], count=len(values), type=kind
+            bufferView=len(self.file.bufferViews),
+            componentType=_NUMBERS[number],
+            count=len(values),
+            type=kind,
         )
         if bounds:
-            accessor.min, accessor.max = (np.atleast_1d(end).tolist() for end in (values.min(0), values.max(0)))
+            accessor.min, accessor.max = (
+                np.atleast_1d(end).tolist() for end in (values.min(0), values.max(0))
+            )
         self.file.bufferViews.append(view)
         self.file.accessors.append(accessor)
         self.data += values.tobytes()
         return len(self.file.accessors) - 1
 
-    def add_material(self, name: str, colour: Sequence[float], roughness: float | None = None) -> int:
-        """Adds a material of an sRGB colour, red, green, blue from 0 to 1; glTF takes linear factors."""
+    def add_material(
+        self, name: str, colour: Sequence[float], roughness: float | None = None
+    ) -> int:
+        """Adds a material of an sRGB colour, red, green, blue from 0 to 1; glTF takes linear
+        factors.
+        """
         linear = (np.array(colour) ** GAMMA).tolist()
         surface = gltf.PbrMetallicRoughness(baseColorFactor=[*linear, 1.0], metallicFactor=0.0)
         if roughness is not None:
@@ -113,25 +133,36 @@ class _Scene:
     def attributes(self, **values: np.ndarray) -> gltf.Attributes:
         """Attributes of vertices by their names in the standard."""
         return gltf.Attributes(
-            **{name: self.add_values(v, gltf.ARRAY_BUFFER, bounds=name == "POSITION") for name, v in values.items()}
+            **{
+                name: self.add_values(v, gltf.ARRAY_BUFFER, bounds=name == "POSITION")
+                for name, v in values.items()
+            }
         )
 
-    def primitive(self, attributes: gltf.Attributes, faces: np.ndarray, material: int) -> gltf.Primitive:
+    def primitive(
+        self, attributes: gltf.Attributes, faces: np.ndarray, material: int
+    ) -> gltf.Primitive:
         """Triangles (F, 3) between vertices."""
         indices = self.add_values(faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
         return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
 
 def _object(scene: _Scene, motion: GraspMotion) -> gltf.Primitive:
-    """The object's mesh with normals and the last material, which becomes white if the points have colours."""
+    """The object's mesh with normals and the last material, which becomes white if the points have
+    colours.
+    """
     vertices, faces, colours = object_mesh(motion)
     normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of degenerate faces
+    # Of degenerate faces
+    normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])
     flat = unwrapped(vertices, faces)
     paint = {} if colours is None else {"COLOR_0": colours[flat.source] ** GAMMA}  # linear
     attributes = scene.attributes(
-        POSITION=vertices[flat.source], NORMAL=normals[flat.source], TEXCOORD_0=_downwards(flat.uv), **paint
+        POSITION=vertices[flat.source],
+        NORMAL=normals[flat.source],
+        TEXCOORD_0=_downwards(flat.uv),
+        **paint,
     )
     if paint:
         scene.file.materials[-1].pbrMetallicRoughness.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
@@ -155,17 +186,31 @@ def _part(scene: _Scene, mesh: Mesh) -> gltf.Primitive:
 
 
 def _add_skin(scene: _Scene, skin: Skin) -> None:
-    """Adds the hand's surface as a separate node, whose skin has the links' nodes (from 1 on) as joints."""
+    """Adds the hand's surface as a separate node, whose skin has the links' nodes (from 1 on) as
+    joints.
+    """
     flat = unwrapped(skin.points, skin.faces)
-    own = {name: getattr(skin, name)[flat.source] for name in ("points", "normals", "weights", "material")}
+    own = {
+        name: getattr(skin, name)[flat.source]
+        for name in ("points", "normals", "weights", "material")
+    }
     skin = skin._replace(faces=flat.faces, **own)
     links, weights = skin.influences()
     attributes = scene.attributes(
-        POSITION=skin.points, NORMAL=skin.normals, TEXCOORD_0=_downwards(flat.uv), JOINTS_0=links, WEIGHTS_0=weights
+        POSITION=skin.points,
+        NORMAL=skin.normals,
+        TEXCOORD_0=_downwards(flat.uv),
+        JOINTS_0=links,
+        WEIGHTS_0=weights,
     )
-    primitives = [scene.primitive(attributes, part, number) for number, part in enumerate(skin.parts().values())]
+    primitives = [
+        scene.primitive(attributes, part, number)
+        for number, part in enumerate(skin.parts().values())
+    ]
     inverse = np.tile(np.eye(4), (len(skin.origins), 1, 1))
     inverse[:, :3, 3] = -skin.origins
     joints = [1 + link for link in range(len(skin.origins))]
-    scene.file.skins = [gltf.Skin(name=SKIN, joints=joints, inverseBindMatrices=scene.add_values(inverse))]
+    scene.file.skins = [
+        gltf.Skin(name=SKIN, joints=joints, inverseBindMatrices=scene.add_values(inverse))
+    ]
     scene.file.nodes.append(gltf.Node(name=SKIN, mesh=scene.add_mesh(SKIN, primitives), skin=0))

@@ -1,4 +1,6 @@
-"""A layout for Foxglove that fits a recording: its actors in 3-D, its learning curves, its events."""
+"""A layout for Foxglove that fits a recording: its actors in 3-D, its learning curves, its
+events.
+"""
 
 import pathlib
 from collections.abc import Sequence
@@ -49,26 +51,44 @@ def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
                 if rest[1] == "signals":
                     fields |= set(flatten(parse_json(record.data, "A recording's signals")))
             elif kind == "metrics":
-                metrics.setdefault(record.topic, set()).update(flatten(metrics_of(record)["values"]))
+                metrics.setdefault(record.topic, set()).update(
+                    flatten(metrics_of(record)["values"])
+                )
             else:
                 events = events or record.topic
     if not (actors or metrics):
-        raise CongraspError(f"The recordings in {recording} hold neither episodes nor metrics of a learner.")
+        raise CongraspError(
+            f"The recordings in {recording} hold neither episodes nor metrics of a learner."
+        )
     columns = []
     if actors:
         first = min(actors)
         shown = {
-            title: [f for f in fields if f.replace(".", "/") in actors[first]] for title, fields in SIGNALS.items()
+            title: [f for f in fields if f.replace(".", "/") in actors[first]]
+            for title, fields in SIGNALS.items()
         }
-        plots = [_plot(t, [f"/episode/{first}/signals.{field}" for field in fields]) for t, fields in shown.items()]
-        columns.append(_split("column", [(3.0, _scene(sorted(actors))), *((1.0, plot) for plot in plots if plot)]))
+        plots = [
+            _plot(t, [f"/episode/{first}/signals.{field}" for field in fields])
+            for t, fields in shown.items()
+        ]
+        columns.append(
+            _split(
+                "column", [(3.0, _scene(sorted(actors))), *((1.0, plot) for plot in plots if plot)]
+            )
+        )
     right: list[tuple[float, fl.Content]] = []
     for title, names in CURVES.items():
-        found = [(topic, name) for topic, known in metrics.items() for name in names if name in known]
-        if plot := _plot(title, [f"{topic}.values.{name.replace('/', '.')}" for topic, name in found]):
+        found = [
+            (topic, name) for topic, known in metrics.items() for name in names if name in known
+        ]
+        if plot := _plot(
+            title, [f"{topic}.values.{name.replace('/', '.')}" for topic, name in found]
+        ):
             right.append((1.0, plot))
     if events:
-        right.append((1.0, fl.LogPanel(title="Events", config=fl.LogConfig(topic_to_render=events))))
+        right.append(
+            (1.0, fl.LogPanel(title="Events", config=fl.LogConfig(topic_to_render=events)))
+        )
     if right:
         columns.append(_split("column", right))
     layout = fl.Layout(content=_split("row", [(1.0, column) for column in columns]))
@@ -79,19 +99,29 @@ def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
 
 def _plot(title: str, paths: Sequence[str]) -> fl.PlotPanel | None:
     """A plot of some paths, if there are any."""
-    series = [fl.PlotSeries(value=path, label=path.rpartition(".")[2], enabled=True) for path in paths]
-    return fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series, show_legend=True)) if series else None
+    series = [
+        fl.PlotSeries(value=path, label=path.rpartition(".")[2], enabled=True) for path in paths
+    ]
+    return (
+        fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series, show_legend=True))
+        if series
+        else None
+    )
 
 
 def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
     """The 3-D panel with the actors' scenes."""
     topics = {
-        f"/episode/{actor}/{part}": fl.BaseRendererSceneUpdateTopicSettings(visible=number < _ACTORS)
+        f"/episode/{actor}/{part}": fl.BaseRendererSceneUpdateTopicSettings(
+            visible=number < _ACTORS
+        )
         for number, actor in enumerate(actors)
         for part in _SHOWN
     }
     frames = fl.BaseRendererTransforms(visible=False, show_label=False)
-    camera = fl.ThreeDeeCameraState(distance=0.8, phi=65.0, theta_offset=45.0, target=(0.0, 0.0, 0.1), near=0.01)
+    camera = fl.ThreeDeeCameraState(
+        distance=0.8, phi=65.0, theta_offset=45.0, target=(0.0, 0.0, 0.1), near=0.01
+    )
     config = fl.ThreeDeeConfig(
         camera_state=camera,
         fixed_frame="world",

@@ -1,9 +1,10 @@
 """A LeRobot dataset, version 3.0: one episode per motion.
 
 `observation.state` is the proprioception (joints of arm and fingers, then the wrist's pose),
-`observation.environment_state` the object's pose, `action` the arm's joints one step later, the finger targets, and the
-wrist's pose one step later. The hand is in `meta/hand.urdf`, with an arm the whole robot in `meta/robot.urdf`. With a
-camera there is `observation.images.front` too: one MP4 for all episodes, a frame for every row.
+`observation.environment_state` the object's pose, `action` the arm's joints one step later, the
+finger targets, and the wrist's pose one step later. The hand is in `meta/hand.urdf`, with an arm
+the whole robot in `meta/robot.urdf`. With a camera there is `observation.images.front` too: one MP4
+for all episodes, a frame for every row.
 """
 
 import json
@@ -25,14 +26,27 @@ from congrasp.services.export.frames import facts, skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.shapes import Camera, Shape, arm_shapes, fit, object_shape, skin_shape, table_shape
+from congrasp.services.viz.shapes import (
+    Camera,
+    Shape,
+    arm_shapes,
+    fit,
+    object_shape,
+    skin_shape,
+    table_shape,
+)
 from congrasp.services.viz.sheets import save_video
 
 VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _PLACE = {"chunk_index": 0, "file_index": 0}
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_COUNTERS = {"frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+_COUNTERS = {
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
 _CAMERA = "observation.images.front"
@@ -46,10 +60,12 @@ _COUNTED = 64  # pixels between those that the statistics count
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
-    """Writes motions of one hand and one control step as a dataset folder, optionally with a camera's video.
+    """Writes motions of one hand and one control step as a dataset folder, optionally with a
+    camera's video.
 
     Raises:
-      CongraspError: the motions differ in robot or control step, or the control step is no whole number of frames a
+      CongraspError: the motions differ in robot or control step, or the control step is no whole
+      number of frames a
         second.
     """
     first, fps = motions[0], _frame_rate(motions)
@@ -78,7 +94,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
             row |= _prefixed(f"videos/{_CAMERA}", span)
             row |= _prefixed(f"stats/{_CAMERA}", _statistics(pixels[i], end - start))
         rows.append(row | _prefixed("meta/episodes", _PLACE))
-    _write_parquet(path / "data" / _FILE.format(**_PLACE), pa.table({n: _column(v) for n, v in every.items()}))
+    _write_parquet(
+        path / "data" / _FILE.format(**_PLACE), pa.table({n: _column(v) for n, v in every.items()})
+    )
     _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
     _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(tasks))
     (path / "meta" / ("robot.urdf" if first.arm else "hand.urdf")).write_text(robot_urdf(first))
@@ -93,7 +111,10 @@ def _frame_rate(motions: Sequence[GraspMotion]) -> int:
     if abs(fps * dt - 1) > 1e-6:
         raise CongraspError(f"A control step of {dt} s makes no whole number of frames a second.")
     if any(_robot(motion) != _robot(motions[0]) for motion in motions):
-        raise CongraspError("A dataset has one robot and one control step, but the motions differ.", "Export each set.")
+        raise CongraspError(
+            "A dataset has one robot and one control step, but the motions differ.",
+            "Export each set.",
+        )
     return fps
 
 
@@ -104,24 +125,49 @@ def _prefixed(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
 
 def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
     """Meaning of the dataset's numbers, and origin of its motions."""
-    about = facts(motions[0], frame="world: z up, table's top at z = 0", unit="m, rad, s", quaternion="qw, qx, qy, qz")
+    about = facts(
+        motions[0],
+        frame="world: z up, table's top at z = 0",
+        unit="m, rad, s",
+        quaternion="qw, qx, qy, qz",
+    )
     del about["object"], about["constraints"]
-    about |= {"objects": [motion.object for motion in motions], "success": [motion.success for motion in motions]}
+    about |= {
+        "objects": [motion.object for motion in motions],
+        "success": [motion.success for motion in motions],
+    }
     if motions[0].arm:
         about["arm_base"] = [
-            [*m.arm.link_position[0, 0].tolist(), *m.arm.link_quaternion[0, 0].tolist()] for m in motions if m.arm
+            [*m.arm.link_position[0, 0].tolist(), *m.arm.link_quaternion[0, 0].tolist()]
+            for m in motions
+            if m.arm
         ]
-    about["action"] = "finger targets of the joints' position servos; arm's joints and wrist's pose one step later"
+    about["action"] = (
+        "finger targets of the joints' position servos; arm's joints and wrist's pose one step "
+        "later"
+    )
     return about
 
 
 def _video_feature(fps: int) -> dict[str, Any]:
     """Description of the camera as a feature."""
     width, height = SIZE
-    about = {"height": height, "width": width, "channels": 3, "codec": "h264", "pix_fmt": "yuv420p", "fps": fps}
+    about = {
+        "height": height,
+        "width": width,
+        "channels": 3,
+        "codec": "h264",
+        "pix_fmt": "yuv420p",
+        "fps": fps,
+    }
     about |= {"is_depth_map": False}
     info = {**{f"video.{name}": value for name, value in about.items()}, "has_audio": False}
-    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+    return {
+        "dtype": "video",
+        "shape": [height, width, 3],
+        "names": ["height", "width", "channels"],
+        "info": info,
+    }
 
 
 def _task(motion: GraspMotion) -> str:
@@ -139,7 +185,9 @@ def _robot(motion: GraspMotion) -> tuple[Any, ...]:
     )
 
 
-def _columns(motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
+def _columns(
+    motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]
+) -> dict[str, np.ndarray]:
     """A motion's columns (T, ...) by name; `start` is the number of rows before them."""
     count = len(motion.time)
     arm = motion.arm.joint_position if motion.arm else np.zeros((count, 0))
@@ -147,8 +195,12 @@ def _columns(motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]
     later = np.minimum(np.arange(count) + 1, count - 1)
     return {
         _STATE: np.concatenate([arm, motion.joint_position, wrist], 1).astype(np.float32),
-        _OBJECT: np.concatenate([motion.object_position, motion.object_quaternion], 1).astype(np.float32),
-        _ACTION: np.concatenate([arm[later], motion.joint_target, wrist[later]], 1).astype(np.float32),
+        _OBJECT: np.concatenate([motion.object_position, motion.object_quaternion], 1).astype(
+            np.float32
+        ),
+        _ACTION: np.concatenate([arm[later], motion.joint_target, wrist[later]], 1).astype(
+            np.float32
+        ),
         "timestamp": motion.time.astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, episode),
@@ -165,23 +217,50 @@ def _column(values: np.ndarray) -> pa.Array:
 
 
 def _tasks_table(tasks: Sequence[str]) -> pa.Table:
-    """Tasks in pandas' format of a frame with one column and the tasks as its index, as LeRobot expects them."""
+    """Tasks in pandas' format of a frame with one column and the tasks as its index, as LeRobot
+    expects them.
+    """
     columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        {
+            "name": name,
+            "field_name": name,
+            "pandas_type": kind,
+            "numpy_type": numpy,
+            "metadata": None,
+        }
         for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     ]
-    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": columns,
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table(
+        {
+            "task_index": pa.array(range(len(tasks)), pa.int64()),
+            "task": pa.array(tasks, pa.string()),
+        }
+    )
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
 def _statistics(values: np.ndarray, frames: int = 0) -> dict[str, list[Any]]:
-    """Statistics of a column (T, ...), in the names of the format, or of some pixels (n, 3) of a number of frames."""
+    """Statistics of a column (T, ...), in the names of the format, or of some pixels (n, 3) of a
+    number of frames.
+    """
     columns = values.reshape(len(values), -1).astype(float)
     shape = (-1, 1, 1) if frames else (-1,)
-    found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
+    found = {
+        "min": columns.min(0),
+        "max": columns.max(0),
+        "mean": columns.mean(0),
+        "std": columns.std(0),
+    }
     quantiles = {name: np.quantile(columns, q, axis=0) for name, q in _QUANTILES.items()}
-    first, rest = ({name: x.reshape(shape).tolist() for name, x in part.items()} for part in (found, quantiles))
+    first, rest = (
+        {name: x.reshape(shape).tolist() for name, x in part.items()} for part in (found, quantiles)
+    )
     return {**first, "count": [frames or len(columns)], **rest}
 
 
@@ -206,13 +285,16 @@ def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int)
         ],
     }
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [len(parts)], "names": parts} for name, parts in names.items()
+        name: {"dtype": "float32", "shape": [len(parts)], "names": parts}
+        for name, parts in names.items()
     }
     for name, dtype in {"timestamp": "float32", **_COUNTERS}.items():
         features[name] = {"dtype": dtype, "shape": [1], "names": None}
     return {
         "codebase_version": VERSION,
-        "robot_type": "_".join(["congrasp", *([motion.arm.name] if motion.arm else []), motion.hand]),
+        "robot_type": "_".join(
+            ["congrasp", *([motion.arm.name] if motion.arm else []), motion.hand]
+        ),
         "total_episodes": episodes,
         "total_frames": frames,
         "total_tasks": tasks,
@@ -265,7 +347,10 @@ def _extent(motion: GraspMotion) -> np.ndarray:
     skin = skin_of_motion(motion)
     for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
         hand, thing = _shapes(motion, skin, frame)[:2]
-        found += [hand.vertices, Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices)]
+        found += [
+            hand.vertices,
+            Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices),
+        ]
         found[-1] = found[-1] + thing.position
     return np.concatenate(found)
 
@@ -275,19 +360,33 @@ def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
     skin = skin_of_motion(motion)
     with ThreadPoolExecutor(cores()) as pool:
         frames = range(len(motion.time))
-        yield from pool.map(lambda frame: render_scene(_shapes(motion, skin, frame), camera, SIZE), frames)
+        yield from pool.map(
+            lambda frame: render_scene(_shapes(motion, skin, frame), camera, SIZE), frames
+        )
 
 
 def calibration(camera: Camera) -> dict[str, Any]:
-    """Parameters of the pinhole camera in the convention of computer vision: x right, y down, z forward."""
+    """Parameters of the pinhole camera in the convention of computer vision: x right, y down, z
+    forward.
+    """
     right, up, forward = camera.axes()
     focal = SIZE[1] / 2 / np.tan(np.radians(camera.field_of_view) / 2)
     return {
-        "model": "pinhole, no distortion; x right, y down, z forward; pixel (0, 0) is the upper left one's centre",
+        "model": (
+            "pinhole, no distortion; x right, y down, z forward; pixel (0, 0) is the upper left "
+            "one's centre"
+        ),
         "width": SIZE[0],
         "height": SIZE[1],
-        "intrinsics": [[focal, 0.0, SIZE[0] / 2 - 0.5], [0.0, focal, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]],
-        "camera_to_world": [*np.column_stack([right, -up, forward, camera.position]).tolist(), [0.0, 0.0, 0.0, 1.0]],
+        "intrinsics": [
+            [focal, 0.0, SIZE[0] / 2 - 0.5],
+            [0.0, focal, SIZE[1] / 2 - 0.5],
+            [0.0, 0.0, 1.0],
+        ],
+        "camera_to_world": [
+            *np.column_stack([right, -up, forward, camera.position]).tolist(),
+            [0.0, 0.0, 0.0, 1.0],
+        ],
     }
 
 
@@ -295,6 +394,13 @@ def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
     """Shapes of the hand, the object, the arm, and the table while it is present."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
     mesh = motion.object_vertices, motion.object_faces
-    thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], motion.colours)
+    thing = object_shape(
+        mesh, motion.object_position[frame], motion.object_quaternion[frame], motion.colours
+    )
     arm = arm_shapes(motion.arm, frame) if motion.arm else []
-    return [hand, thing, *arm, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]
+    return [
+        hand,
+        thing,
+        *arm,
+        *([table_shape(motion.object_position[0])] if motion.table[frame] else []),
+    ]

@@ -1,7 +1,9 @@
-"""A grasp motion as one self-describing NPZ file, the source of exports in the formats of this folder's modules.
+"""A grasp motion as one self-describing NPZ file, the source of exports in the formats of this
+folder's modules.
 
-Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
-axis points up and the table's top is at z = 0. T frames, F finger joints, L links, C capsules, K waypoints.
+Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the
+world. The world's z axis points up and the table's top is at z = 0. T frames, F finger joints, L
+links, C capsules, K waypoints.
 """
 
 import dataclasses
@@ -25,7 +27,13 @@ from congrasp.common.io.inputs import check_arrays, file_name, read_npz
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.episode import ARM_ARRAYS, MovedArm, active_constraints, arm_of, arm_of_episode
+from congrasp.services.record.episode import (
+    ARM_ARRAYS,
+    MovedArm,
+    active_constraints,
+    arm_of,
+    arm_of_episode,
+)
 
 FORMAT = 2
 MAX_BYTES = 256 << 20
@@ -38,7 +46,9 @@ _META = "meta"
 _OLDER = {"pose_joints": "pose_q"}
 """Names of goal arrays in files of format 1."""
 _GOALS = {
-    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
+    f"{constraint.name}_{name}": (
+        f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
+    )
     for constraint in CONSTRAINTS
     for name, array in constraint.arrays.items()
 }
@@ -51,11 +61,17 @@ _COLOURS = {
 _OWN = {**_COLOURS, **ARM_ARRAYS}
 """Arrays of motions whose object has colours, or with an arm."""
 FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": ""}
-"""Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are folders."""
+"""Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are
+folders.
+"""
 DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""
 _QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
-_UNIT, _ROUNDED = 1e-3, 1e-2  # largest difference of a quaternion's length from one, and in a recording
+# Largest difference of a quaternion's length from one, and in a recording
+_UNIT, _ROUNDED = (
+    1e-3,
+    1e-2,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,7 +86,9 @@ class GraspMotion:
     object: str
     """Name of the object."""
     success: bool
-    """True if the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
+    """True if the object was held a quarter of a second after table removal; `metrics["held"]`: to
+    the end.
+    """
     control_dt: float
     """Seconds between two frames."""
     constraints: tuple[str, ...]
@@ -85,18 +103,32 @@ class GraspMotion:
     wrist_quaternion: Annotated[np.ndarray, "(T, 4) w x y z, wrist frame to world"]
     joint_position: Annotated[np.ndarray, "(T, F) rad, finger joints in the order of joint_names"]
     joint_target: Annotated[np.ndarray, "(T, F) rad, what the joints' position servos aimed at"]
-    link_position: Annotated[np.ndarray, "(T, L, 3) m, world, origins of the links in the order of link_names"]
-    link_quaternion: Annotated[np.ndarray, "(T, L, 4) w x y z, link frame to world; link 0, the palm, is the wrist"]
-    link_force: Annotated[np.ndarray, "(T, L, 3) N, world, net contact force of the object on each link"]
+    link_position: Annotated[
+        np.ndarray, "(T, L, 3) m, world, origins of the links in the order of link_names"
+    ]
+    link_quaternion: Annotated[
+        np.ndarray, "(T, L, 4) w x y z, link frame to world; link 0, the palm, is the wrist"
+    ]
+    link_force: Annotated[
+        np.ndarray, "(T, L, 3) N, world, net contact force of the object on each link"
+    ]
     object_position: Annotated[np.ndarray, "(T, 3) m, world, the object's centre of mass"]
     object_quaternion: Annotated[np.ndarray, "(T, 4) w x y z, object frame to world"]
-    object_vertices: Annotated[np.ndarray, "(V, 3) m, object frame: axes of its file, origin at its centre of mass"]
+    object_vertices: Annotated[
+        np.ndarray, "(V, 3) m, object frame: axes of its file, origin at its centre of mass"
+    ]
     object_faces: Annotated[np.ndarray, "(E, 3) indices of object_vertices"]
-    object_file_origin: Annotated[np.ndarray, "(3,) m: object frame = object_file_scale * file - object_file_origin"]
+    object_file_origin: Annotated[
+        np.ndarray, "(3,) m: object frame = object_file_scale * file - object_file_origin"
+    ]
     object_file_scale: Annotated[np.ndarray, "() m per unit of the object's file"]
     joint_names: Annotated[np.ndarray, "(F,) text"]
-    joint_link: Annotated[np.ndarray, "(F,) the link that a joint moves; joints of one link act in this order"]
-    joint_axis: Annotated[np.ndarray, "(F, 3) unit, link frame; with all joints at zero links are turned as the wrist"]
+    joint_link: Annotated[
+        np.ndarray, "(F,) the link that a joint moves; joints of one link act in this order"
+    ]
+    joint_axis: Annotated[
+        np.ndarray, "(F, 3) unit, link frame; with all joints at zero links are turned as the wrist"
+    ]
     joint_anchor: Annotated[np.ndarray, "(F, 3) m, wrist frame with all joints at zero"]
     joint_limits: Annotated[np.ndarray, "(F, 2) rad, lower and upper"]
     link_names: Annotated[np.ndarray, "(L,) text"]
@@ -105,45 +137,68 @@ class GraspMotion:
     capsule_ends: Annotated[np.ndarray, "(C, 2, 3) m, link frame"]
     capsule_radius: Annotated[np.ndarray, "(C,) m"]
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
-    surface_avoid: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
+    surface_avoid: Annotated[
+        np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"
+    ]
     colours: Colours | None
     """Colours of the object, in its frame, if it has any."""
     goal: dict[str, np.ndarray]
-    """Goal arrays of the policy's constraints, by constraint and field: `heading_direction`, `pose_q`."""
+    """Goal arrays of the policy's constraints, by constraint and field: `heading_direction`,
+    `pose_q`.
+    """
     arm: MovedArm | None = None
-    """The arm that carries the hand, if there is one. Its wrist deviates from the hand's by its tracking error."""
+    """The arm that carries the hand, if there is one. Its wrist deviates from the hand's by its
+    tracking error.
+    """
 
 
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
-_ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
-_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm"))
+_ARRAYS = {
+    name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")
+}
+_FACTS = tuple(
+    name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm")
+)
 
 
 def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
-    """Returns the motion at another frame rate: for each of its times the nearest frame, at most half a step off.
+    """Returns the motion at another frame rate: for each of its times the nearest frame, at most
+    half a step off.
 
     Raises:
       CongraspError: the rate is above the motion's own, or not above zero.
     """
     own = 1 / motion.control_dt
     if not 0 < fps <= own + 1e-6:
-        raise CongraspError(f"--fps is {fps:g}.", f"The motion has {own:g} frames a second: set at most as many.")
+        raise CongraspError(
+            f"--fps is {fps:g}.", f"The motion has {own:g} frames a second: set at most as many."
+        )
     time = np.arange(int((len(motion.time) - 1) * fps / own + 1e-6) + 1) / fps
     nearest = np.minimum(np.round(time * own).astype(int), len(motion.time) - 1)
     timed = [name for name, meaning in _ARRAYS.items() if meaning.startswith(("(T,", "(T)"))]
     arrays = {name: getattr(motion, name)[nearest] for name in timed}
     arrays["time"] = time.astype(motion.time.dtype)
-    return dataclasses.replace(motion, **arrays, control_dt=1 / fps, arm=motion.arm and motion.arm.at(nearest))
+    return dataclasses.replace(
+        motion, **arrays, control_dt=1 / fps, arm=motion.arm and motion.arm.at(nearest)
+    )
 
 
 def robot_joints(motion: GraspMotion) -> list[str]:
-    """Returns the names of the arm's joints, if there is an arm, and of the hand's, all different."""
+    """Returns the names of the arm's joints, if there is an arm, and of the hand's, all
+    different.
+    """
     arm = motion.arm.joint_names.tolist() if motion.arm else []
-    return [*arm, *(f"hand_{name}" if name in arm else name for name in motion.joint_names.tolist())]
+    return [
+        *arm,
+        *(f"hand_{name}" if name in arm else name for name in motion.joint_names.tolist()),
+    ]
 
 
-def joint_trajectory(motion: GraspMotion, fingers: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Returns the points of a trajectory for a controller: it begins and ends at rest, one second after its start.
+def joint_trajectory(
+    motion: GraspMotion, fingers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Returns the points of a trajectory for a controller: it begins and ends at rest, one second
+    after its start.
 
     Controllers reject a goal whose last point moves, and jump to a point at time zero.
 
@@ -152,17 +207,25 @@ def joint_trajectory(motion: GraspMotion, fingers: np.ndarray) -> tuple[np.ndarr
       fingers: (T, F) angles of the fingers, rad.
 
     Returns:
-      Positions and velocities (T, N) of the joints of `robot_joints`, and T times since the start, ns.
+      Positions and velocities (T, N) of the joints of `robot_joints`, and T times since the start,
+      ns.
     """
-    positions = fingers if motion.arm is None else np.concatenate([motion.arm.joint_position, fingers], 1)
+    positions = (
+        fingers if motion.arm is None else np.concatenate([motion.arm.joint_position, fingers], 1)
+    )
     velocities = np.zeros(positions.shape)
     velocities[1:-1] = (positions[2:] - positions[:-2]) / (2 * motion.control_dt)
     return positions, velocities, [TRAJECTORY_START + round(1e9 * t) for t in motion.time.tolist()]
 
 
 def motion_of_episode(episode: Message) -> GraspMotion:
-    """Returns the motion of an episode, in memory or read from MCAP (`services.record.reader.read_episodes`)."""
-    arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
+    """Returns the motion of an episode, in memory or read from MCAP
+    (`services.record.reader.read_episodes`).
+    """
+    arrays, meta = (
+        {name: np.asarray(value) for name, value in episode.arrays.items()},
+        dict(episode.meta),
+    )
     hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
     arm = arm_of_episode(episode)
@@ -195,16 +258,22 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         **of_hand,
         surface_points=arrays["surface_points"],
         surface_avoid=arrays["surface_avoid"].astype(bool),
-        colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_values" in arrays else None,
+        colours=Colours(arrays["colour_points"], arrays["colour_values"])
+        if "colour_values" in arrays
+        else None,
         goal={
-            name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
+            name.removeprefix("goal/"): value
+            for name, value in arrays.items()
+            if name.removeprefix("goal/") in _GOALS
         },
         arm=arm,
     )
 
 
 def _normalised(quaternions: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4) of length one; those whose length differs by more than `_ROUNDED` are unchanged."""
+    """Quaternions (..., 4) of length one; those whose length differs by more than `_ROUNDED` are
+    unchanged.
+    """
     lengths = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     return quaternions / np.where(np.abs(lengths - 1) <= _ROUNDED, lengths, 1)
 
@@ -220,9 +289,13 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
         "joint_limits": np.array([(joint.lower, joint.upper) for joint in hand.joints]),
         "link_names": np.array([link.name for link in hand.links]),
         "link_parent": np.array([index.get(link.parent, -1) for link in hand.links], np.int32),
-        "capsule_link": np.array([i for i, link in enumerate(hand.links) for _ in link.capsules], np.int32),
+        "capsule_link": np.array(
+            [i for i, link in enumerate(hand.links) for _ in link.capsules], np.int32
+        ),
         "capsule_ends": np.concatenate([capsule_ends(link) for link in hand.links]),
-        "capsule_radius": np.array([capsule.radius for link in hand.links for capsule in link.capsules]),
+        "capsule_radius": np.array(
+            [capsule.radius for link in hand.links for capsule in link.capsules]
+        ),
     }
 
 
@@ -241,10 +314,18 @@ def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
         "units": "m, rad, s, N",
         "quaternions": "(w, x, y, z)",
         "world": "z up, table's top at z = 0",
-        "arrays": {**_ARRAYS, **{name: _OWN[name] for name in own}, **{name: _GOALS[name] for name in motion.goal}},
+        "arrays": {
+            **_ARRAYS,
+            **{name: _OWN[name] for name in own},
+            **{name: _GOALS[name] for name in motion.goal},
+        },
     }
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **own, **motion.goal}
+    arrays: dict[str, Any] = {
+        **{name: getattr(motion, name) for name in _ARRAYS},
+        **own,
+        **motion.goal,
+    }
     arrays[_META] = np.array(json.dumps(meta))
     np.savez_compressed(buffer, **arrays)
     write_atomically(pathlib.Path(path), buffer.getvalue())
@@ -254,7 +335,8 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     """Reads a motion.
 
     Raises:
-      CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged, or a
+      CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or
+      damaged, or a
         quaternion is not normalised.
     """
     remedy = "Run 'congrasp grasp' again."
@@ -269,10 +351,14 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         named = {_OLDER.get(name, name): array for name, array in arrays.items()}
         goal = {name: array for name, array in named.items() if name in _GOALS}
         own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
-        _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
+        _check_arrays(
+            {**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}}
+        )
         colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
         arm = arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
-        motion = GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
+        motion = GraspMotion(
+            **facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm
+        )
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise CongraspError(f"{path} is not a grasp motion ({reason[:200]}).", remedy) from None
@@ -321,23 +407,35 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
     """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`).
 
     Raises:
-      CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor 0.
+      CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor
+      0.
     """
     if not path.exists():
-        raise CongraspError(f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder.")
+        raise CongraspError(
+            f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder."
+        )
     if path.suffix == ".npz":
         if index not in (-1, 0):
-            raise CongraspError(f"{path} is one motion and has no number {index}.", "Remove --index.")
+            raise CongraspError(
+                f"{path} is one motion and has no number {index}.", "Remove --index."
+            )
         return load_motion(path)
     if path.is_file() and path.suffix != ".mcap":
-        raise CongraspError(f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder.")
+        raise CongraspError(
+            f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder."
+        )
     from congrasp.services.record.reader import pick_episode  # with MCAP's packages
 
     return motion_of_episode(pick_episode(path, index, success=success))
 
 
 def export_motions(
-    motions: Sequence[GraspMotion], kind: str, path: pathlib.Path, *, camera: bool = False, force: bool = False
+    motions: Sequence[GraspMotion],
+    kind: str,
+    path: pathlib.Path,
+    *,
+    camera: bool = False,
+    force: bool = False,
 ) -> None:
     """Writes motions in a format.
 
@@ -349,19 +447,28 @@ def export_motions(
       force: replaces an existing file; a folder is never replaced.
 
     Raises:
-      CongraspError: `path` exists already, has another suffix or cannot be written, a motion has invalid poses, or the
+      CongraspError: `path` exists already, has another suffix or cannot be written, a motion has
+      invalid poses, or the
         format cannot hold what was given.
     """
     if len(motions) > 1 and kind not in DATASETS:
-        raise CongraspError(f"A {kind} file holds one motion, but {len(motions)} were given.", "Pass one at a time.")
+        raise CongraspError(
+            f"A {kind} file holds one motion, but {len(motions)} were given.", "Pass one at a time."
+        )
     if camera and kind not in DATASETS:
-        raise CongraspError(f"A {kind} file holds no video.", f"Remove --camera, or pass --to {DATASETS[0]}.")
+        raise CongraspError(
+            f"A {kind} file holds no video.", f"Remove --camera, or pass --to {DATASETS[0]}."
+        )
     if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
         named = path.with_suffix("") if path.suffix and suffix.startswith(path.suffix) else path
         name = path / f"grasp{suffix}" if path.is_dir() else f"{named}{suffix}"
-        raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
+        raise CongraspError(
+            f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}"
+        )
     if path.is_dir():
-        raise CongraspError(f"The folder {path} exists already.", "Remove it or pass another with --out.")
+        raise CongraspError(
+            f"The folder {path} exists already.", "Remove it or pass another with --out."
+        )
     check_free(path, force=force)
     for motion in motions:
         _check(motion, "The motion")
@@ -369,8 +476,12 @@ def export_motions(
     with os_errors_as(f"{path} cannot be written", "Pass another with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workplace:
-            module.write(pathlib.Path(workplace, path.name), motions, **({"camera": True} if camera else {}))
-            written = [(file, path.with_name(file.name)) for file in pathlib.Path(workplace).iterdir()]
+            module.write(
+                pathlib.Path(workplace, path.name), motions, **({"camera": True} if camera else {})
+            )
+            written = [
+                (file, path.with_name(file.name)) for file in pathlib.Path(workplace).iterdir()
+            ]
             for _, target in written:
                 check_free(target, force=force)
             for file, target in written:
@@ -383,11 +494,17 @@ def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
 
 
 def _check(motion: GraspMotion, what: object) -> None:
-    """Raises a CongraspError for quaternions that are not normalised, which recordings may also hold."""
+    """Raises a CongraspError for quaternions that are not normalised, which recordings may also
+    hold.
+    """
     for owner in (motion, motion.arm):
         for name in _QUATERNIONS:
             values = getattr(owner, name, None)
-            if values is not None and not (np.abs(np.linalg.norm(values, axis=-1) - 1) <= _UNIT).all():
+            if (
+                values is not None
+                and not (np.abs(np.linalg.norm(values, axis=-1) - 1) <= _UNIT).all()
+            ):
                 raise CongraspError(
-                    f"{what}'s {name} has quaternions that are not normalised.", "Run 'congrasp grasp' again."
+                    f"{what}'s {name} has quaternions that are not normalised.",
+                    "Run 'congrasp grasp' again.",
                 )

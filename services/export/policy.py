@@ -16,7 +16,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, object_contact, scene_spec
+from congrasp.actors.physics.scene import (
+    HAND_CONTYPE,
+    OBJECT_CONTYPE,
+    TABLE_AWAY,
+    object_contact,
+    scene_spec,
+)
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import WRIST_JOINTS
@@ -33,11 +39,17 @@ from congrasp.services.client.limits import JointLimits
 
 SUFFIXES = {"onnx": ".onnx", "stablehlo": ".stablehlo.zip"}
 _PLATFORMS = ("cpu", "cuda", "tpu")
-_OPSET, _IR_VERSION = 17, 8  # old ones, which every runtime in use supports; the graph needs no newer ones
+# Old ones, which every runtime in use supports; the graph needs no newer ones
+_OPSET, _IR_VERSION = (
+    17,
+    8,
+)
 
 
 def describe(bundle: PolicyBundle) -> dict[str, Any]:
-    """Description of the exported policy for its user, as JSON: every input and output number, in order."""
+    """Description of the exported policy for its user, as JSON: every input and output number, in
+    order.
+    """
     hand, task = get_hand(bundle.spec.hand), bundle.task
     joints = [joint.name for joint in hand.joints]
     frame = grasp_frame(hand)
@@ -46,7 +58,10 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "hand": hand.name,
         "version": bundle.version,
         "bundle": content_hash(encode(bundle.to_message())),
-        "units": "m, rad, s, N; quaternions (w, x, y, z); the world's z axis points up, the table's top is at z = 0",
+        "units": (
+            "m, rad, s, N; quaternions (w, x, y, z); the world's z axis points up, the table's top "
+            "is at z = 0"
+        ),
         "control_dt": task.control_dt,
         "rate_hz": 1.0 / task.control_dt,
         "layout": [[name, size] for name, size in bundle.spec.layout],
@@ -92,10 +107,17 @@ def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
 
 
 def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
-    """Gains and inertia of the wrist's slides (N/m, N.s/m, kg) and hinges (N.m/rad, N.m.s/rad, kg.m^2)."""
+    """Gains and inertia of the wrist's slides (N/m, N.s/m, kg) and hinges (N.m/rad, N.m.s/rad,
+    kg.m^2).
+    """
     gains, (mass, inertia) = hand.wrist, hand.wrist_inertia.tolist()
     return {
-        "position": {"kp": gains.slide_kp, "kv": gains.slide_kv, "inertia": mass, "limit": "wrist_acceleration"},
+        "position": {
+            "kp": gains.slide_kp,
+            "kv": gains.slide_kv,
+            "inertia": mass,
+            "limit": "wrist_acceleration",
+        },
         "rotation": {
             "kp": gains.hinge_kp,
             "kv": gains.hinge_kv,
@@ -106,10 +128,12 @@ def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
 
 
 def motors(hand: Hand) -> list[dict[str, Any]]:
-    """The fingers' motors in the order of their actions, with coefficients, limits and the joints that they move.
+    """The fingers' motors in the order of their actions, with coefficients, limits and the joints
+    that they move.
 
-    A motor's position is the sum of `pulls` times its joints' angles; a joint's target is `ratio` times that of its
-    motor, and `rest`. Most hands have a motor for each joint, with ones and zeros.
+    A motor's position is the sum of `pulls` times its joints' angles; a joint's target is `ratio`
+    times that of its motor, and `rest`. Most hands have a motor for each joint, with ones and
+    zeros.
     """
     own = transmission(hand)
     return [
@@ -128,7 +152,9 @@ def motors(hand: Hand) -> list[dict[str, Any]]:
 
 
 def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
-    """The action's numbers in order: the motor or wrist joint, the scale, and the formula of its target."""
+    """The action's numbers in order: the motor or wrist joint, the scale, and the formula of its
+    target.
+    """
     control = bundle.task.control
     fingers = [
         {
@@ -144,9 +170,12 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
             "joint": name,
             "unit": "m" if i < 3 else "rad",
             "scale": control.wrist_position_scale if i < 3 else control.wrist_rotation_scale,
-            "target": "joint + lead; lead = steady + limit(limit(limit(guidance - joint, L) + scale * action, L) "
-            "- steady, inertia / kp * A), steady = kv / kp * velocity, limit shortens the three slides or hinges "
-            "together; L: guidance_..._limit, A: 'limit' of 'wrist' (0: none), both of the task's control",
+            "target": (
+                "joint + lead; lead = steady + limit(limit(limit(guidance - joint, L) + scale * "
+                "action, L) - steady, inertia / kp * A), steady = kv / kp * velocity, limit "
+                "shortens the three slides or hinges together; L: guidance_..._limit, "
+                "A: 'limit' of 'wrist' (0: none), both of the task's control"
+            ),
         }
         for i, name in enumerate(WRIST_JOINTS)
     ]
@@ -168,7 +197,9 @@ def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> None:
 
 
 def _stablehlo(bundle: PolicyBundle) -> bytes:
-    """A ZIP with `policy.jax` (for `jax.export.deserialize`), `policy.mlirbc` (portable StableHLO) and `meta.json`."""
+    """A ZIP with `policy.jax` (for `jax.export.deserialize`), `policy.mlirbc` (portable StableHLO)
+    and `meta.json`.
+    """
     layout, parameters = bundle.spec.layout, jax.device_get(bundle.inference_parameters)
     size = sum(width for _, width in layout)
     function = jax.jit(lambda observation: mean_action(layout, parameters, observation))
@@ -204,7 +235,9 @@ class _Graph:
         """Adds a layer of the network."""
         kernel = self.constant(f"{layer}.kernel", layers[layer]["kernel"])
         product = self.node("MatMul", [x, kernel], f"{output}.product")
-        return self.node("Add", [product, self.constant(f"{layer}.bias", layers[layer]["bias"])], output)
+        return self.node(
+            "Add", [product, self.constant(f"{layer}.bias", layers[layer]["bias"])], output
+        )
 
     def stack(self, layers: Mapping[str, Any], kind: str, x: str) -> str:
         """Adds the layers of the trunk, or of a cloud's points."""
@@ -215,7 +248,9 @@ class _Graph:
 
 
 def _onnx(bundle: PolicyBundle) -> bytes:
-    """The policy's mean action as a model: `observation` (batch, D) to `action` (batch, A), float32."""
+    """The policy's mean action as a model: `observation` (batch, D) to `action` (batch, A),
+    float32.
+    """
     layout, layers = bundle.spec.layout, bundle.params["actor"]["network"]
     shift, scale = bundle.inference_parameters.normalization
     graph = _Graph()
@@ -228,7 +263,9 @@ def _onnx(bundle: PolicyBundle) -> bytes:
         _slice(graph, "normalised", end - size, end, name)
     parts = list(TRUNK)
     if CLOUD in dict(layout):
-        points = graph.node("Reshape", [CLOUD, graph.constant("points.shape", [0, -1, POINT], np.int64)], "points")
+        points = graph.node(
+            "Reshape", [CLOUD, graph.constant("points.shape", [0, -1, POINT], np.int64)], "points"
+        )
         seen = graph.stack(layers, CLOUD, points)
         parts.append(graph.node("ReduceMax", [seen], "points.most", axes=[1], keepdims=0))
     for bit, name in enumerate(gated(layout)):
@@ -254,13 +291,18 @@ def _onnx(bundle: PolicyBundle) -> bytes:
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR_VERSION,
     )
-    helper.set_model_props(model, {name: json.dumps(value) for name, value in describe(bundle).items()})
+    helper.set_model_props(
+        model, {name: json.dumps(value) for name, value in describe(bundle).items()}
+    )
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
 
 
 def _slice(graph: _Graph, x: str, start: int, end: int, output: str) -> str:
     """Columns `start` to `end` of x."""
-    bounds = [graph.constant(f"{output}.{name}", [value], np.int64) for name, value in (("start", start), ("end", end))]
+    bounds = [
+        graph.constant(f"{output}.{name}", [value], np.int64)
+        for name, value in (("start", start), ("end", end))
+    ]
     axes = graph.constant(f"{output}.axes", [1], np.int64)
     return graph.node("Slice", [x, *bounds, axes], output)

@@ -1,8 +1,9 @@
 """A ROS 2 bag (MCAP).
 
-Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, joints of arm and fingers), `/wrist_trajectory`
-(all frames, the palm in the world), `/joint_states`, `/tf` (frame by frame), `/object` (a marker with the mesh), `/arm`
-(markers with the meshes of the arm's links, if there is one).
+Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, joints of arm and fingers),
+`/wrist_trajectory` (all frames, the palm in the world), `/joint_states`, `/tf` (frame by frame),
+`/object` (a marker with the mesh), `/arm` (markers with the meshes of the arm's links, if there is
+one).
 """
 
 import json
@@ -11,7 +12,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Nodetype, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
@@ -38,16 +47,25 @@ _LATCHED = Qos(
 )
 _TRIANGLES = 11  # a marker's type
 _Content = Mapping[str, Any]
-"""Fields of a message; fields of messages in it are mappings, too, and absent ones are zero, false or empty."""
+"""Fields of a message; fields of messages in it are mappings, too, and absent ones are zero, false
+or empty.
+"""
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
-    """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero means any time."""
+    """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero
+    means any time.
+    """
     (motion,) = motions
     store = get_typestore(Stores.ROS2_HUMBLE)
     position, velocity, stamps = joint_trajectory(motion, motion.joint_position.astype(float))
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        about = facts(motion, frame=f"{_WORLD}: z up; TF frames are the links", unit="m, rad, s", quaternion="by name")
+        about = facts(
+            motion,
+            frame=f"{_WORLD}: z up; TF frames are the links",
+            unit="m, rad, s",
+            quaternion="by name",
+        )
         bag.set_custom_data("congrasp", json.dumps(about))
         for topic, (kind, messages) in _topics(motion, position, velocity, stamps).items():
             qos = [] if topic in _OFTEN else [_LATCHED]
@@ -59,23 +77,34 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 def _topics(
     motion: GraspMotion, position: np.ndarray, velocity: np.ndarray, stamps: Sequence[int]
 ) -> dict[str, tuple[str, Sequence[_Content]]]:
-    """Types and messages of all topics, from the joints' positions and velocities (T, N) at T times in ns."""
+    """Types and messages of all topics, from the joints' positions and velocities (T, N) at T times
+    in ns.
+    """
     frames = _transforms(motion, stamps)
-    palm = next(i for i, transform in enumerate(frames[0]) if transform["header"]["frame_id"] == _WORLD)
+    palm = next(
+        i for i, transform in enumerate(frames[0]) if transform["header"]["frame_id"] == _WORLD
+    )
     wrist, joints = frames[0][palm]["child_frame_id"], robot_joints(motion)
     rows = list(zip(position, velocity, stamps, strict=True))
-    points = [{"positions": q, "velocities": v, "time_from_start": _time(stamp)} for q, v, stamp in rows]
+    points = [
+        {"positions": q, "velocities": v, "time_from_start": _time(stamp)} for q, v, stamp in rows
+    ]
     poses = [
         {"transforms": [frame[palm]["transform"]], "time_from_start": _time(stamp)}
         for frame, stamp in zip(frames, stamps, strict=True)
     ]
     trajectory = {"header": _header(0, wrist), "joint_names": joints, "points": points}
     path = {"header": _header(0, _WORLD), "joint_names": [wrist], "points": poses}
-    states = [{"header": _header(stamp, wrist), "name": joints, "position": q, "velocity": v} for q, v, stamp in rows]
+    states = [
+        {"header": _header(stamp, wrist), "name": joints, "position": q, "velocity": v}
+        for q, v, stamp in rows
+    ]
     corners = motion.object_vertices[motion.object_faces.ravel()]
     thing = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
     if motion.colours:
-        thing["colors"] = [_colour(each) for each in (colours_at(corners, motion.colours) / 255).tolist()]
+        thing["colors"] = [
+            _colour(each) for each in (colours_at(corners, motion.colours) / 255).tolist()
+        ]
     topics: dict[str, tuple[str, Sequence[_Content]]] = {
         "/robot_description": ("std_msgs/msg/String", [{"data": robot_urdf(motion)}]),
         "/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", [trajectory]),
@@ -109,7 +138,9 @@ def _message(store: Typestore, kind: str, content: _Content) -> Any:
         return [value(item, type_of_item, each) for each in given or ()]
 
     fields = store.fielddefs[kind][1]
-    return store.types[kind](**{name: value(node, of, content.get(name)) for name, (node, of) in fields})
+    return store.types[kind](
+        **{name: value(node, of, content.get(name)) for name, (node, of) in fields}
+    )
 
 
 def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
@@ -123,7 +154,10 @@ def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[st
             {
                 "header": _header(stamp, parents[i]),
                 "child_frame_id": body.name,
-                "transform": {"translation": _named("xyz", places[i][t]), "rotation": _named("xyzw", turns[i][t])},
+                "transform": {
+                    "translation": _named("xyz", places[i][t]),
+                    "rotation": _named("xyzw", turns[i][t]),
+                },
             }
             for i, body in enumerate(found)
         ]
@@ -131,7 +165,9 @@ def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[st
     ]
 
 
-def _marker(frame: str, namespace: str, number: int, corners: np.ndarray, colour: Sequence[float]) -> dict[str, Any]:
+def _marker(
+    frame: str, namespace: str, number: int, corners: np.ndarray, colour: Sequence[float]
+) -> dict[str, Any]:
     """Triangles of one colour, with corners (3 E, 3) in a frame, as a marker."""
     return {
         "header": _header(0, frame),

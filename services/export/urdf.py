@@ -35,10 +35,12 @@ class _Joint(NamedTuple):
 
 
 def robot_urdf(motion: GraspMotion) -> str:
-    """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the arm's base.
+    """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the
+    arm's base.
 
-    Links and joints keep their names and frames. URDF has one joint between two links, so that a link with several
-    joints gets intermediate links of its name and a number. Efforts are not those of the robot.
+    Links and joints keep their names and frames. URDF has one joint between two links, so that a
+    link with several joints gets intermediate links of its name and a number. Efforts are not those
+    of the robot.
     """
     arm = motion.arm
     robot = ET.Element("robot", name=f"{arm.name}_{motion.hand}" if arm else motion.hand)
@@ -56,15 +58,26 @@ def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     names = robot_joints(motion)[-len(motion.joint_names) :]
     origins = link_origins(motion)
-    for i, (name, parent) in enumerate(zip(map(str, motion.link_names), motion.link_parent, strict=True)):
+    for i, (name, parent) in enumerate(
+        zip(map(str, motion.link_names), motion.link_parent, strict=True)
+    ):
         moved = np.flatnonzero(motion.joint_link == i)
         joints = [
-            _Joint(names[j], "revolute", motion.joint_axis[j], motion.joint_anchor[j] - origins[i], limits, _SPEED)
+            _Joint(
+                names[j],
+                "revolute",
+                motion.joint_axis[j],
+                motion.joint_anchor[j] - origins[i],
+                limits,
+                _SPEED,
+            )
             for j, limits in zip(moved, motion.joint_limits[moved], strict=True)
         ]
         if parent >= 0:
             place = origins[i] - origins[parent]
-            _add_link(robot, name, str(motion.link_names[parent]), place, Rotation.identity(), joints)
+            _add_link(
+                robot, name, str(motion.link_names[parent]), place, Rotation.identity(), joints
+            )
         _add_capsules(_link(robot, name), motion, i)
 
 
@@ -81,29 +94,56 @@ def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
             limited = np.abs(arm.joint_limits[j]).max() < UNLIMITED
             kind = "prismatic" if slides else "revolute" if limited else "continuous"
             joints.insert(
-                0, _Joint(str(arm.joint_names[j]), kind, axis, anchor, arm.joint_limits[j], arm.joint_speed[j])
+                0,
+                _Joint(
+                    str(arm.joint_names[j]),
+                    kind,
+                    axis,
+                    anchor,
+                    arm.joint_limits[j],
+                    arm.joint_speed[j],
+                ),
             )
             way = -arm.joint_position[0, j] * axis
             turn = Rotation.identity() if slides else Rotation.from_rotvec(way)
             shift = way if slides else anchor - turn.apply(anchor)
             back = back @ pose_matrices(shift[None], turn)[0]
         inverse = turns[parent].inv()
-        local = pose_matrices(inverse.apply(places[i] - places[parent])[None], inverse * turns[i])[0] @ back
-        _add_link(robot, names[i], names[parent], local[:3, 3], Rotation.from_matrix(local[:3, :3]), joints)
+        local = (
+            pose_matrices(inverse.apply(places[i] - places[parent])[None], inverse * turns[i])[0]
+            @ back
+        )
+        _add_link(
+            robot,
+            names[i],
+            names[parent],
+            local[:3, 3],
+            Rotation.from_matrix(local[:3, :3]),
+            joints,
+        )
         _link(robot, names[i])
 
 
 def _add_link(
-    robot: ET.Element, name: str, carrier: str, place: np.ndarray, turn: Rotation, joints: Sequence[_Joint]
+    robot: ET.Element,
+    name: str,
+    carrier: str,
+    place: np.ndarray,
+    turn: Rotation,
+    joints: Sequence[_Joint],
 ) -> None:
-    """Adds the joints between a link and its carrier; `place` and `turn` are its pose there with all joints at zero."""
+    """Adds the joints between a link and its carrier; `place` and `turn` are its pose there with
+    all joints at zero.
+    """
     for number, (joint, kind, axis, anchor, limits, speed) in enumerate(joints):
         ends = number == len(joints) - 1 and np.allclose(anchor, 0, atol=1e-9)
         child = name if ends else f"{name}_{number}"
         element = _joint(robot, joint, kind, carrier, child, place + turn.apply(anchor), turn)
         ET.SubElement(element, "axis", xyz=_numbers(axis))
         lower, upper = map(_number, limits)
-        ET.SubElement(element, "limit", lower=lower, upper=upper, effort="10", velocity=_number(speed))
+        ET.SubElement(
+            element, "limit", lower=lower, upper=upper, effort="10", velocity=_number(speed)
+        )
         if not ends:
             _link(robot, child)
         carrier, place, turn = child, -anchor, Rotation.identity()
@@ -116,18 +156,28 @@ def _link(robot: ET.Element, name: str) -> ET.Element:
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "mass", value=_MASS)
-    ET.SubElement(inertial, "inertia", ixx=_INERTIA, iyy=_INERTIA, izz=_INERTIA, ixy="0", ixz="0", iyz="0")
+    ET.SubElement(
+        inertial, "inertia", ixx=_INERTIA, iyy=_INERTIA, izz=_INERTIA, ixy="0", ixz="0", iyz="0"
+    )
     return link
 
 
 def _joint(
-    robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: np.ndarray, turn: Rotation
+    robot: ET.Element,
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    offset: np.ndarray,
+    turn: Rotation,
 ) -> ET.Element:
     """Adds a joint at an offset (3,) and a rotation in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    with warnings.catch_warnings(action="ignore"):  # of a pitch of 90 degrees, where any roll will do
+    with warnings.catch_warnings(
+        action="ignore"
+    ):  # of a pitch of 90 degrees, where any roll will do
         angles = turn.as_euler("xyz")
     ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(angles))
     return joint

@@ -1,7 +1,8 @@
 """USD as text (.usda) with time samples.
 
-One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object and arm are meshes.
-The hand's surface is skinned: a skeleton of the links with an animation moves it (UsdSkel).
+One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object
+and arm are meshes. The hand's surface is skinned: a skeleton of the links with an animation moves
+it (UsdSkel).
 """
 
 import json
@@ -44,12 +45,16 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     stage.SetEndTimeCode(len(motion.time) - 1)
     stage.SetTimeCodesPerSecond(1 / motion.control_dt)
     stage.SetFramesPerSecond(1 / motion.control_dt)
-    about = facts(motion, frame="z up (upAxis)", unit="m (metersPerUnit = 1)", quaternion="w, x, y, z")
+    about = facts(
+        motion, frame="z up (upAxis)", unit="m (metersPerUnit = 1)", quaternion="w, x, y, z"
+    )
     stage.GetRootLayer().customLayerData = {"congrasp": json.dumps(about)}
     root = UsdGeom.Xform.Define(stage, "/grasp")
     stage.SetDefaultPrim(root.GetPrim())
     found, paths, arm = bodies(motion), [root.GetPath()], arm_meshes(motion)
-    for i, (body, name) in enumerate(zip(found, identifiers([SKIN, *(body.name for body in found)])[1:], strict=True)):
+    for i, (body, name) in enumerate(
+        zip(found, identifiers([SKIN, *(body.name for body in found)])[1:], strict=True)
+    ):
         xform = UsdGeom.Xform.Define(stage, paths[body.parent + 1].AppendChild(name))
         paths.append(xform.GetPath())
         xform.GetPrim().CreateAttribute(_NAME, Sdf.ValueTypeNames.String, True).Set(body.name)
@@ -74,14 +79,18 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 
 def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
-    """Adds the link's capsules in its frame, which are its collision shapes; viewers hide guides."""
+    """Adds the link's capsules in its frame, which are its collision shapes; viewers hide
+    guides.
+    """
     for number, length, radius, middle, turn in capsules(motion, link):
         capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{number}"))
         capsule.CreatePurposeAttr(UsdGeom.Tokens.guide)
         capsule.CreateAxisAttr(UsdGeom.Tokens.z)
         capsule.CreateHeightAttr(length)
         capsule.CreateRadiusAttr(radius)
-        capsule.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(capsule, Usd.TimeCode.Default()))
+        capsule.CreateExtentAttr(
+            UsdGeom.Boundable.ComputeExtentFromPlugins(capsule, Usd.TimeCode.Default())
+        )
         capsule.CreateDisplayColorAttr([COLOURS["link"]])
         capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*middle))
         capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
@@ -95,10 +104,16 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     names: list[str] = []
     for link, name in zip(links, identifiers([link.name for link in links]), strict=True):
         names.append(f"{names[link.parent]}/{name}" if link.parent >= 0 else name)
-    parents = np.array([skin.origins[link.parent] if link.parent >= 0 else np.zeros(3) for link in links])
+    parents = np.array(
+        [skin.origins[link.parent] if link.parent >= 0 else np.zeros(3) for link in links]
+    )
     skeleton.CreateJointsAttr(names)
-    skeleton.CreateBindTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins])
-    skeleton.CreateRestTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents])
+    skeleton.CreateBindTransformsAttr(
+        [Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins]
+    )
+    skeleton.CreateRestTransformsAttr(
+        [Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents]
+    )
     animation.CreateJointsAttr(names)
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
     turns = np.stack([link.quaternions(scalar_first=True) for link in links], 1)
@@ -117,14 +132,23 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     binding.CreateJointIndicesPrimvar(False, 4).Set(influences.ravel().tolist())
     binding.CreateJointWeightsPrimvar(False, 4).Set(weights.ravel().tolist())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
+        [animation.GetPath()]
+    )
     UsdSkel.BindingAPI.Apply(root.GetPrim())
 
 
 def _add_mesh(
-    stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray, colours: Any, *, textured: bool = True
+    stage: Usd.Stage,
+    path: Sdf.Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colours: Any,
+    *,
+    textured: bool = True,
 ) -> UsdGeom.Mesh:
-    """Adds triangles (F, 3), not subdivided, of one sRGB colour (3,) or with that of each vertex (V, 3).
+    """Adds triangles (F, 3), not subdivided, of one sRGB colour (3,) or with that of each vertex
+    (V, 3).
 
     Displayed colours are linear.
     """

@@ -17,25 +17,42 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional
 from congrasp.common.task.sampling.build import clear_of_table
-from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
+from congrasp.common.task.sampling.headings import (
+    INWARD,
+    above,
+    max_width,
+    sample_headings,
+    within_reach,
+)
 from congrasp.common.task.types import Surface
 
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)
-_ACROSS = 0.02  # m per unit of normal difference: the two sides of a thin wall may belong to different regions
+# M per unit of normal difference: the two sides of a thin wall may belong to different regions
+_ACROSS = 0.02
 
 
 def to_attempt(
-    hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
+    hand: Hand,
+    task: TaskConfig,
+    obj: GraspObject,
+    request: GraspRequest,
+    batch: int,
+    rng: np.random.Generator,
 ) -> tuple[RequestedEpisodes, np.ndarray, int]:
     """Samples episodes that attempt a request at an object with its regions.
 
     Returns:
-      The episodes, the resting pose of each (B,), and the number of distinct ones, which come first.
+      The episodes, the resting pose of each (B,), and the number of distinct ones, which come
+      first.
 
     Raises:
       CongraspError: no approach fits the request, or its reference leads through the table.
     """
-    episodes, path, different = repeated(hand, task, obj, request, batch), prescribed(request), batch
+    episodes, path, different = (
+        repeated(hand, task, obj, request, batch),
+        prescribed(request),
+        batch,
+    )
     if path is None:
         position, direction, cross, rests = headings(hand, obj, request, batch, rng)
         found = {"position": position, "direction": direction, "cross": cross}
@@ -47,8 +64,12 @@ def to_attempt(
     return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
 
 
-def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
-    """Episodes of a request for a labelled object, `batch` equal ones in the requested resting pose."""
+def repeated(
+    hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int
+) -> RequestedEpisodes:
+    """Episodes of a request for a labelled object, `batch` equal ones in the requested resting
+    pose.
+    """
     rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
     goal, surface, rest = jax.tree.map(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
@@ -59,30 +80,41 @@ def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspReque
 
 
 def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
-    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
+    """Labelled points of an object, as many as the policy observes, with their normals if it
+    observes them.
+    """
     points = task.surface_points
     normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
-    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
+    return Surface(
+        np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals
+    )
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
     """The object with another avoid region, (512,) bool."""
     return dataclasses.replace(
-        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=avoid.astype(np.int32)
+        obj,
+        part_names=("graspable", "non-graspable"),
+        graspable=np.array([True, False]),
+        labels=avoid.astype(np.int32),
     )
 
 
 def headings(
     hand: Hand, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
+    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the
+    table allows.
 
     Likelier resting poses come more often.
 
     Raises:
       CongraspError: no approach fits the request.
     """
-    direction, position = request.given("heading", "direction"), request.given("heading", "position")
+    direction, position = (
+        request.given("heading", "direction"),
+        request.given("heading", "position"),
+    )
     restricted = request.avoid is not None
     own = outline(hand)
     sample = functools.partial(
@@ -103,7 +135,9 @@ def headings(
             _remedy(request, "make the graspable part larger"),
         )
     options, weights = [], []
-    for r, (cleared, room) in enumerate(zip(*within_reach(found, obj, obj.rest_poses, own), strict=True)):
+    for r, (cleared, room) in enumerate(
+        zip(*within_reach(found, obj, obj.rest_poses, own), strict=True)
+    ):
         if request.rest not in (None, r):
             continue
         if request.above:
@@ -113,11 +147,18 @@ def headings(
         weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
     if not options:
         raise CongraspError(*_no_room(obj, request))
-    free = request.rest is None and not request.above and direction is None and position is None and not restricted
+    free = (
+        request.rest is None
+        and not request.above
+        and direction is None
+        and position is None
+        and not restricted
+    )
     if free and (first := min(r for r, *_ in options)) > 0:
         height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
         raise CongraspError(
-            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in its likeliest "
+            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in "
+            f"its likeliest "
             "resting pose, which leaves the fingers no room over the table.",
             f"Set --rest {first + 1} to grasp it in another resting pose.",
         )
@@ -136,38 +177,53 @@ def _balanced(obj: GraspObject) -> GraspObject:
     if graspable.all() or not graspable.any():
         return obj
     chosen = balanced(graspable)
-    return dataclasses.replace(obj, points=points[chosen], normals=normals[chosen], labels=labels[chosen])
+    return dataclasses.replace(
+        obj, points=points[chosen], normals=normals[chosen], labels=labels[chosen]
+    )
 
 
 def _remedy(request: GraspRequest, otherwise: str) -> str:
-    """Remedy for a request that no approach fits: leave out an option that restricts it, or `otherwise`."""
+    """Remedy for a request that no approach fits: leave out an option that restricts it, or
+    `otherwise`.
+    """
     options = {
         "--rest": request.rest is not None,
         "--heading": request.above or request.given("heading", "direction") is not None,
         "--at": request.given("heading", "position") is not None,
     }
     given = [name for name, is_given in options.items() if is_given]
-    return f"Leave out {' or '.join(given)}, or {otherwise}." if given else f"{otherwise.capitalize()}."
+    return (
+        f"Leave out {' or '.join(given)}, or {otherwise}."
+        if given
+        else f"{otherwise.capitalize()}."
+    )
 
 
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
     """Error and remedy where the table leaves room for no approach."""
     if request.rest is not None:
         return (
-            f"'{obj.name}' cannot be approached under these constraints in resting pose {request.rest + 1}.",
+            f"'{obj.name}' cannot be approached under these constraints in resting pose "
+            f"{request.rest + 1}.",
             _remedy(request, "set another --heading"),
         )
     if request.given("heading", "direction") is None:
-        return (f"'{obj.name}' cannot be approached in any of its resting poses.", _remedy(request, "scale it"))
+        return (
+            f"'{obj.name}' cannot be approached in any of its resting poses.",
+            _remedy(request, "scale it"),
+        )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (
         "In every resting pose, the hand would have to come through the table.",
-        f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
+        f"In its likeliest pose straight down is --heading "
+        f'"{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
     )
 
 
 def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
-    """Wrist positions (n, 3) and last orientation (4,) prescribed by the strongest constraint; None if it is free."""
+    """Wrist positions (n, 3) and last orientation (4,) prescribed by the strongest constraint; None
+    if it is free.
+    """
     for constraint in reversed(CONSTRAINTS):
         if constraint.name in request.constraints:
             path = constraint.wrist_path(request.constraints[constraint.name])
@@ -176,8 +232,11 @@ def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
     return None
 
 
-def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray, rest: int | None) -> np.ndarray:
-    """Resting poses in which a wrist path (n, 3) stays over the table and its last orientation (4,) is not from below.
+def valid_rests(
+    hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray, rest: int | None
+) -> np.ndarray:
+    """Resting poses in which a wrist path (n, 3) stays over the table and its last orientation (4,)
+    is not from below.
 
     Raises:
       CongraspError: there is none, or the requested pose `rest` is not among them.
@@ -185,11 +244,14 @@ def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray
     valid = np.flatnonzero(_clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(
-            f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",
-            "The wrist must stay 2 cm above the table, and the hand must come from above or horizontally.",
+            f"With this reference the hand would be in the table in every resting pose of "
+            f"'{obj.name}'.",
+            "The wrist must stay 2 cm above the table, and the hand must come from above or "
+            "horizontally.",
         )
     if rest is not None and rest not in valid:
         raise CongraspError(
-            f"With this reference the hand would be in the table in resting pose {rest + 1}.", "Leave out --rest."
+            f"With this reference the hand would be in the table in resting pose {rest + 1}.",
+            "Leave out --rest.",
         )
     return valid if rest is None else np.array([rest])

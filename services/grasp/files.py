@@ -12,7 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints, save_motion
+from congrasp.services.export.motion_file import (
+    GraspMotion,
+    joint_trajectory,
+    robot_joints,
+    save_motion,
+)
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.record.episode import MovedArm
 from congrasp.services.record.scene import save_episode
@@ -29,7 +34,13 @@ from congrasp.services.viz.shapes import Camera, Shape, arm_shapes, fit, shape_p
 from congrasp.services.viz.sheets import save_png
 from congrasp.services.viz.views import View, camera_of, episode_shapes, views
 
-MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
+MOTION, RECORDING, PICTURE, VIDEO, RESULT = (
+    "grasp.npz",
+    "grasp.mcap",
+    "grasp.png",
+    "grasp.mp4",
+    "result.json",
+)
 PORTRAIT = "portrait.png"
 """The last frame, 1280 x 720, from two sides."""
 _FORMAT = 4  # of result.json: results of another format are repeated
@@ -46,7 +57,11 @@ ARM_CSV, ARM_TRAJECTORY, ARM_PICTURE = "arm.csv", "arm_trajectory.json", "arm.pn
 _SIZE = (1280, 960)  # pixels
 _AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
 _GREY = (0.75, 0.76, 0.78)
-_EDGE, _UNDER = 0.6, 0.001  # margin of the table around arm and object, and its depth below height zero, m
+# Margin of the table around arm and object, and its depth below height zero, m
+_EDGE, _UNDER = (
+    0.6,
+    0.001,
+)
 
 
 def save_grasp(
@@ -58,14 +73,15 @@ def save_grasp(
     about: dict[str, Any],
     view: View | None = None,
 ) -> None:
-    """Writes a grasp; the result comes last, so that its presence means that all files are complete.
+    """Writes a grasp; the result comes last, so that its presence means that all files are
+    complete.
 
     Args:
       folder: the object's folder.
       found: the grasp.
       film: style of the MP4; None writes none.
-      pictures: also writes the contact sheet, the portrait, the thumbnail and, with an arm, the arm's picture.
-      about: further entries of the result.
+      pictures: also writes the contact sheet, the portrait, the thumbnail and, with an arm, the
+      arm's picture. about: further entries of the result.
       view: viewpoint of pictures and video; the one that shows most of the grasp by default.
 
     Raises:
@@ -88,18 +104,26 @@ def save_grasp(
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
-        filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand enters the picture
+        # The hand enters the picture
+        filmed = [
+            *range(found.first("grasp") // 2, until, _FRAMED),
+            until,
+        ]
         aspect = film.size[0] / film.size[1]
         if arm:
             save_robot_video(folder / VIDEO, arm, episode, film, [*steps[:-1], until], until)
         else:
-            seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays)
+            seen_from = camera_of(
+                episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays
+            )
             save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 
 def _steps_to_draw(first: int, end: int, last: int) -> list[int]:
-    """Up to eight steps to draw: before the grasp begins at `first`, during it, after its `end`, and the last one."""
+    """Up to eight steps to draw: before the grasp begins at `first`, during it, after its `end`,
+    and the last one.
+    """
     reach = [0, first / 2] if first else []
     grasp = np.linspace(first, min(end, last), 6 - len(reach))
     return sorted({round(step) for step in [*reach, *grasp, (end + last) / 2, last]})
@@ -122,9 +146,9 @@ def key_of(*parts: Any) -> str:
 def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) -> None:
     """Writes the joints of arm and hand at every control step: `arm.csv` and `arm_trajectory.json`.
 
-    Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which hold the object.
-    The JSON has the fields of trajectory_msgs/JointTrajectory, and `ros2 topic pub` accepts it as YAML; its points are
-    those of `joint_trajectory`.
+    Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which
+    hold the object. The JSON has the fields of trajectory_msgs/JointTrajectory, and `ros2 topic
+    pub` accepts it as YAML; its points are those of `joint_trajectory`.
 
     Raises:
       CongraspError: a file cannot be written.
@@ -132,7 +156,10 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
     targets = np.clip(motion.joint_target, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
     names, (joints, velocities, since) = robot_joints(motion), joint_trajectory(motion, targets)
     lines = [",".join(["time", *names])]
-    lines += [",".join(f"{x:.6f}" for x in (time, *row)) for time, row in zip(motion.time, joints, strict=True)]
+    lines += [
+        ",".join(f"{x:.6f}" for x in (time, *row))
+        for time, row in zip(motion.time, joints, strict=True)
+    ]
     write_atomically(folder / ARM_CSV, ("\n".join(lines) + "\n").encode())
     points = [
         {
@@ -149,11 +176,18 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
 def save_robot_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step: int) -> None:
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
     shapes = [*_robot_shapes(arm, episode, step), *_grasp_shapes(episode, step)]
-    save_png(path, render_scene(shapes, _robot_camera(arm, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
+    save_png(
+        path, render_scene(shapes, _robot_camera(arm, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE)
+    )
 
 
 def save_robot_video(
-    path: pathlib.Path, arm: MovedArm, episode: Message, film: Film, steps: Sequence[int], until: int | None = None
+    path: pathlib.Path,
+    arm: MovedArm,
+    episode: Message,
+    film: Film,
+    steps: Sequence[int],
+    until: int | None = None,
 ) -> None:
     """Writes an MP4 of an episode with the whole robot.
 
@@ -175,14 +209,18 @@ def save_robot_video(
 
 def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:
     """Returns a camera that shows the whole robot and the object in all of the control steps."""
-    shapes = [shape for step in steps for shape in (*arm_shapes(arm, step), *_grasp_shapes(episode, step))]
+    shapes = [
+        shape for step in steps for shape in (*arm_shapes(arm, step), *_grasp_shapes(episode, step))
+    ]
     points = np.concatenate([shape_points(shape) for shape in shapes])
     base = Rotation.from_quat(arm.link_quaternion[0, 0], scalar_first=True)
     return fit(points, base.apply(_AHEAD), aspect)
 
 
 def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
-    """Returns the arm at a control step of its episode and the table on which arm and object stand."""
+    """Returns the arm at a control step of its episode and the table on which arm and object
+    stand.
+    """
     ends = arm.link_position[0, 0, :2], episode.arrays["object_position"][0][:2]
     radius = float(np.linalg.norm(ends[0] - ends[1])) / 2 + _EDGE
     middle = np.array([*np.mean(ends, axis=0), -_UNDER])
@@ -192,4 +230,6 @@ def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
 
 def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
     """Returns hand and object, without the table of `episode_shapes`."""
-    return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
+    return [
+        shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"
+    ]

@@ -1,4 +1,6 @@
-"""A grasp motion for one object under constraints: several attempts at once, of which the best is kept."""
+"""A grasp motion for one object under constraints: several attempts at once, of which the best is
+kept.
+"""
 
 import collections
 import dataclasses
@@ -47,7 +49,9 @@ ROUNDS = 4
 _UNLIKELY = 0.5
 """Cost of an attempt for each resting pose that `_places` prefers to its initial one."""
 _LIGHTER, _SMALLER, _ENOUGH = 0.25, 0.7, 0.25
-"""Factors on mass and size in the search for the cause of failures, and the share of holds that confirms it."""
+"""Factors on mass and size in the search for the cause of failures, and the share of holds that
+confirms it.
+"""
 _TOUCHED = 0.2
 """Share of contacts in the avoid region at and above which an attempt does not count as a hold."""
 
@@ -79,7 +83,7 @@ class _Round(NamedTuple):
 class Grasper:
     """Grasps one object after another with a policy; all of them share the compiled programs."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         policy: PolicyBundle,
         *,
@@ -101,7 +105,8 @@ class Grasper:
           threads: threads of the physics; 0 for one per core.
           seed: seed of the attempts.
           arm: the arm that must be able to execute the motion.
-          left: grasps with the left hand; the policy's right hand grasps the mirrored object (`common.mirror`).
+          left: grasps with the left hand; the policy's right hand grasps the mirrored object
+          (`common.mirror`).
         """
         if attempts < 1:
             raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
@@ -111,19 +116,37 @@ class Grasper:
         self._hand, self._left = get_hand(policy.spec.hand), left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
         self.task = policy.task.evaluated()
-        self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
+        self._policy, self._attempts_count, self._rounds, self._seed = (
+            policy,
+            attempts,
+            rounds,
+            seed,
+        )
         self._compiled = False
-        self._attempts = Attempts(self._hand, self.task, policy, threads=threads or cores(), phases=phases)
+        self._attempts = Attempts(
+            self._hand, self.task, policy, threads=threads or cores(), phases=phases
+        )
 
     @functools.cached_property
     def identity(self) -> tuple[Any, ...]:
         """Inputs of a grasp other than object and request."""
         policy = bundles.content_hash(encode(self._policy.to_message()))
         arm = self._arm.identity if self._arm else ""
-        return policy, self._attempts_count, self._rounds, self._seed, *self._attempts.phases, self._left, arm
+        return (
+            policy,
+            self._attempts_count,
+            self._rounds,
+            self._seed,
+            *self._attempts.phases,
+            self._left,
+            arm,
+        )
 
     def grasp(
-        self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
+        self,
+        obj: GraspObject,
+        request: GraspRequest | None = None,
+        progress: Progress = lambda what, done, total: None,
     ) -> Grasp:
         """Returns the best grasp of several attempts.
 
@@ -136,7 +159,8 @@ class Grasper:
           UnknownConstraintError: the policy does not know one of the constraints.
           ContradictionError: two of them exclude each other.
           NoReachError: without an arm, no planned approach leads to the grasp.
-          CongraspError: the table obstructs all attempts, or the arm can execute none that holds the object.
+          CongraspError: the table obstructs all attempts, or the arm can execute none that holds
+          the object.
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
@@ -168,36 +192,53 @@ class Grasper:
             raise _no_motion(obj, self._arm.name, attempts, refused)
         assert best is not None
         found = self._motion(best[0], int(best[1].argmin()), attempts, held)
-        return found if held else dataclasses.replace(found, cause=self._cause(obj, request, progress))
+        return (
+            found if held else dataclasses.replace(found, cause=self._cause(obj, request, progress))
+        )
 
     def close(self) -> None:
         """Ends the threads of the physics."""
         self._attempts.close()
 
     def _attempt(
-        self, obj: GraspObject, request: GraspRequest, seed: int | tuple[int, int], what: str, progress: Progress
+        self,
+        obj: GraspObject,
+        request: GraspRequest,
+        seed: int | tuple[int, int],
+        what: str,
+        progress: Progress,
     ) -> _Round:
         """Runs a round of attempts; `what` is its name in the progress."""
         rng, count = np.random.default_rng(seed), self._attempts_count
         episodes, rests, different = to_attempt(self._hand, self.task, obj, request, count, rng)
         progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
         self._compiled = True
-        outcome = self._attempts.run(obj, episodes, lambda step: progress(what, step, self._attempts.steps))
+        outcome = self._attempts.run(
+            obj, episodes, lambda step: progress(what, step, self._attempts.steps)
+        )
         holds = outcome.metrics["held"][:different] > 0
-        return _Round(obj=obj, request=request, episodes=episodes, rests=rests, outcome=outcome, holds=holds)
+        return _Round(
+            obj=obj, request=request, episodes=episodes, rests=rests, outcome=outcome, holds=holds
+        )
 
     def _cost(self, tried: _Round) -> np.ndarray:
         """(n,) cost of each attempt, with that of its resting pose."""
         removal, lift = self.task.approach_steps - 1, self._attempts.phases.lift
         cost = costs(tried.outcome, tuple(tried.request.constraints), removal, lift)
-        return (cost + _UNLIKELY * _places(tried.obj, tried.rests, tried.request))[: len(tried.holds)]
+        return (cost + _UNLIKELY * _places(tried.obj, tried.rests, tried.request))[
+            : len(tried.holds)
+        ]
 
     def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
-        """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller object, else "".
+        """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller
+        object, else "".
 
-        The smaller object has the same mass. It is tried only if the request names no place in the object frame.
+        The smaller object has the same mass. It is tried only if the request names no place in the
+        object frame.
         """
-        lighter = dataclasses.replace(obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia))
+        lighter = dataclasses.replace(
+            obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia)
+        )
         trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
         if prescribed(request) is None and request.given("heading", "position") is None:
             smaller = obj.scaled(_SMALLER, constant_mass=True)
@@ -209,7 +250,10 @@ class Grasper:
             except CongraspError:
                 continue
             if holds.mean() >= _ENOUGH:
-                return f"Its {cause} is the cause: with {how} {holds.sum()} of {len(holds)} attempts hold it."
+                return (
+                    f"Its {cause} is the cause: with {how} {holds.sum()} of {len(holds)} attempts "
+                    f"hold it."
+                )
         return ""
 
     def _on_arm(
@@ -222,7 +266,9 @@ class Grasper:
         refused: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
-        """Returns the best attempt that the arm can execute; `refused` counts the limits that exclude better ones."""
+        """Returns the best attempt that the arm can execute; `refused` counts the limits that
+        exclude better ones.
+        """
         order = [i for i in cost.argsort().tolist() if tried.meets[i]]
         for number, index in enumerate(order):
             progress(f"Moving {arm.name}", number + 1, len(order))
@@ -230,7 +276,9 @@ class Grasper:
                 found = self._motion(tried, index, attempts, held)
                 planned = arm.plan(tried.obj, found.motion)
                 episode = planned.moved.recorded(found.episode)
-                return dataclasses.replace(found, episode=episode, motion=motion_of_episode(episode), arm=planned)
+                return dataclasses.replace(
+                    found, episode=episode, motion=motion_of_episode(episode), arm=planned
+                )
             except Infeasible as limit:
                 refused[str(limit)] += 1
             except NoReachError:
@@ -247,10 +295,14 @@ class Grasper:
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
         }
-        episode = self._attempts.episode(tried.outcome, index, surface_of(self.task, obj), obj, about)
+        episode = self._attempts.episode(
+            tried.outcome, index, surface_of(self.task, obj), obj, about
+        )
         if approach := self._attempts.phases.approach:
             side = self._arm.side if self._arm else None
-            episode = with_planned_reach(episode, self._hand, obj, approach, self._attempts.speed, side)
+            episode = with_planned_reach(
+                episode, self._hand, obj, approach, self._attempts.speed, side
+            )
         if self._left:
             episode = _mirrored(episode, self.hand)
         active = explain(tuple(given), bool(tried.outcome.redirected[index]))
@@ -305,7 +357,8 @@ def grasp(
     progress: Progress = lambda what, done, total: None,
     **constraints: Any,
 ) -> Grasp:
-    """Returns the best grasp motion of an object under constraints; compiled programs are kept for the next call.
+    """Returns the best grasp motion of an object under constraints; compiled programs are kept for
+    the next call.
 
     Example:
       import congrasp
@@ -321,7 +374,8 @@ def grasp(
       attempts: grasps simulated in parallel.
       seed: seed of the attempts.
       progress: called with the progress.
-      **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose, trajectory, fingers, …; each
+      **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose,
+      trajectory, fingers, …; each
         is the text that the command line takes, or a sequence of its words or numbers.
 
     Raises:
@@ -329,7 +383,11 @@ def grasp(
     """
     file = policy_file(None if policy is None else pathlib.Path(policy), right_name(hand)[0])
     grasper = _grasper(file, file.stat().st_mtime_ns if file.exists() else 0, hand, attempts, seed)
-    obj = mesh if isinstance(mesh, GraspObject) else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
+    obj = (
+        mesh
+        if isinstance(mesh, GraspObject)
+        else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
+    )
     request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
     return grasper.grasp(obj, request, progress)
 
@@ -347,19 +405,28 @@ def _mirrored(episode: Message, hand: Hand) -> Message:
     return Message(mirror.fields(episode.arrays), meta)
 
 
-def _no_motion(obj: GraspObject, arm: str, attempts: int, refused: collections.Counter[str]) -> CongraspError:
-    """Error if an arm can execute no attempt that holds the object, with the limits that forbid them."""
+def _no_motion(
+    obj: GraspObject, arm: str, attempts: int, refused: collections.Counter[str]
+) -> CongraspError:
+    """Error if an arm can execute no attempt that holds the object, with the limits that forbid
+    them.
+    """
     if not refused:
-        return CongraspError(f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts.")
+        return CongraspError(
+            f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts."
+        )
     limits = ", ".join(f"{limit} {count}" for limit, count in refused.most_common())
     return CongraspError(
-        f"{arm} can execute none of the {refused.total()} attempts that hold '{obj.name}'. Reasons: {limits}.",
+        f"{arm} can execute none of the {refused.total()} attempts that hold '{obj.name}'. "
+        f"Reasons: {limits}.",
         "Set another --base or --mount, or more --attempts.",
     )
 
 
 def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.ndarray:
-    """(B,) ranks of the resting poses: upright first, then by likelihood; zeros if the request names one."""
+    """(B,) ranks of the resting poses: upright first, then by likelihood; zeros if the request
+    names one.
+    """
     if request.rest is not None:
         return np.zeros_like(rests)
     upright = upright_rest(obj)

@@ -1,4 +1,6 @@
-"""Grasps of many objects in turn: finished ones are skipped, and a failure does not stop the others."""
+"""Grasps of many objects in turn: finished ones are skipped, and a failure does not stop the
+others.
+"""
 
 import dataclasses
 import hashlib
@@ -70,16 +72,34 @@ class Result(NamedTuple):
         facts = self.facts
         outcome = "held" if facts["success"] else "not held"
         if not facts["shape_reliable"]:
-            outcome += ", but its shape is unreliable (see its notes; repair the mesh, or set --time-limit)"
+            outcome += (
+                ", but its shape is unreliable (see its notes; repair the mesh, or set "
+                "--time-limit)"
+            )
         outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
-        errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
+        errors = [
+            f"{what} {_shown(facts, stem)}"
+            for stem, what in _ERRORS.items()
+            if f"{stem}_m" in facts
+        ]
         if "affordance_ratio" in facts:
-            errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the contacts in the avoid region")
+            errors.append(
+                f"{100 * facts['affordance_ratio']:.0f} % of the contacts in the avoid region"
+            )
         lying = [facts["cause"].rstrip(".")] if facts.get("cause") else []
-        lying += [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
+        lying += (
+            [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
+        )
         return "; ".join(
-            [facts["size"], outcome, *lying, best, *errors, f"strongest link {facts['force_link_max']:.1f} N"]
+            [
+                facts["size"],
+                outcome,
+                *lying,
+                best,
+                *errors,
+                f"strongest link {facts['force_link_max']:.1f} N",
+            ]
         )
 
 
@@ -91,7 +111,9 @@ def _shown(facts: dict[str, Any], stem: str) -> str:
     return f"{np.degrees(facts[f'{stem}_rad']):.0f}° and {1000 * facts[f'{stem}_m']:.0f} mm"
 
 
-def find_objects(texts: Sequence[str], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
+def find_objects(
+    texts: Sequence[str], folder: str = "objects"
+) -> tuple[list[ObjectAt], list[Result]]:
     """The objects that a user names (`located`), and errors of names without objects.
 
     Objects of the same name are numbered, since each name becomes that of a folder.
@@ -104,7 +126,8 @@ def find_objects(texts: Sequence[str], folder: str = "objects") -> tuple[list[Ob
         except CongraspError as error:
             errors.append(Result(pathlib.Path(text).name, {}, str(error)))
     return [
-        one._replace(name=name) for one, name in zip(found, distinct_names(one.name for one in found), strict=True)
+        one._replace(name=name)
+        for one, name in zip(found, distinct_names(one.name for one in found), strict=True)
     ], errors
 
 
@@ -113,7 +136,9 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
     try:
         folder = settings.out / file_name(at.name, "the folder of an object")
         given = {
-            name: [_identity(part) for part in ([str(text)] if isinstance(text, str | bool) else text)]
+            name: [
+                _identity(part) for part in ([str(text)] if isinstance(text, str | bool) else text)
+            ]
             for name, text in settings.constraints.items()
             if text
         }
@@ -121,16 +146,27 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         key = key_of(at.digest(), options, given, grasper.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
-        filmed = settings.film is None or (before and json.loads(json.dumps(drawn)) == before.get("drawn"))
-        if before is not None and filmed and (not settings.pictures or (folder / THUMBNAIL).exists()):
+        filmed = settings.film is None or (
+            before and json.loads(json.dumps(drawn)) == before.get("drawn")
+        )
+        if (
+            before is not None
+            and filmed
+            and (not settings.pictures or (folder / THUMBNAIL).exists())
+        ):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)
-        request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints)
+        request = read_request(
+            obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints
+        )
         if settings.rest:
             request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
         if settings.pictures and at.source:
-            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source), request.avoid))
+            save_png(
+                folder / OBJECT,
+                import_sheet(grasper.hand, obj, mesh_of_file(at.source), request.avoid),
+            )
         found = grasper.grasp(obj, request, progress)
         progress("Drawing", 0, 1)
         about = {
@@ -139,7 +175,11 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "object_mass": obj.mass,
             "shape_reliable": obj.shape_reliable,
-            "notes": [*obj.notes, *_notes(at, obj, settings.options), *([found.arm.note()] if found.arm else [])],
+            "notes": [
+                *obj.notes,
+                *_notes(at, obj, settings.options),
+                *([found.arm.note()] if found.arm else []),
+            ],
             "rules": list(found.active),
             "drawn": drawn,
         }
@@ -151,7 +191,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
 
 
 def rest_pose(obj: GraspObject, text: str) -> int:
-    """Returns the index of a resting pose from its number, counted from 1, or `upright`: the file's z axis points up.
+    """Returns the index of a resting pose from its number, counted from 1, or `upright`: the file's
+    z axis points up.
 
     Raises:
       CongraspError: the object has no such resting pose.
@@ -160,12 +201,16 @@ def rest_pose(obj: GraspObject, text: str) -> int:
     if text == "upright":
         if (upright := upright_rest(obj)) is None:
             raise CongraspError(
-                f"'{obj.name}' does not rest with its z axis up in any of its {count} resting poses.",
-                f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} --png rests.png",
+                f"'{obj.name}' does not rest with its z axis up in any of its {count} resting "
+                f"poses.",
+                f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} "
+                f"--png rests.png",
             )
         return upright
     if not text.isdecimal() or len(text) > 4 or not 1 <= int(text) <= count:
-        raise CongraspError(f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright.")
+        raise CongraspError(
+            f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright."
+        )
     return int(text) - 1
 
 
@@ -180,7 +225,9 @@ def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """Loads the object; only scale and mass of the options apply to object files and generated objects."""
+    """Loads the object; only scale and mass of the options apply to object files and generated
+    objects.
+    """
     check_options(options)
     if at.source:
         return at.load(options)
@@ -198,18 +245,31 @@ def _identity(text: str) -> str:
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
     """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
     held = sum(result.held for result in results)
-    rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
+    rows = [
+        {"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts}
+        for r in results
+    ]
     summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}
     write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
-    drawn = [result for result in results if (out / result.name / THUMBNAIL).exists() and not result.error]
+    drawn = [
+        result
+        for result in results
+        if (out / result.name / THUMBNAIL).exists() and not result.error
+    ]
     if drawn:
-        images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
+        images = [
+            np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn
+        ]
         labels = [
-            f"{result.name}: {_verdict(result)}, {result.facts['attempts_held']} of {result.facts['attempts']}"
+            f"{result.name}: {_verdict(result)}, {result.facts['attempts_held']} of "
+            f"{result.facts['attempts']}"
             for result in drawn
         ]
         title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
-        save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))
+        save_png(
+            out / SHEET,
+            contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title),
+        )
 
 
 def _verdict(result: Result) -> str:

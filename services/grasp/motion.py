@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
-"""Scales that make costs of grasps that hold comparable: errors, displacement of the object before table removal (m),
-force of the strongest link (N), and displacement after removal (m)."""
+"""Scales that make costs of grasps that hold comparable: errors, displacement of the object before
+table removal (m), force of the strongest link (N), and displacement after removal (m)."""
 _FIRM = ("clean", *SURVIVAL)
 """Metrics that add a cost of 1 where they are zero."""
 
@@ -41,7 +41,9 @@ class Grasp:
     arm: "ArmMotion | None" = None
     """The motion of the arm, if there is one."""
     cause: str = ""
-    """Sentence on the reason why no attempt holds the object, if it is its weight or width; empty otherwise."""
+    """Sentence on the reason why no attempt holds the object, if it is its weight or width; empty
+    otherwise.
+    """
 
     @property
     def success(self) -> bool:
@@ -90,12 +92,20 @@ class Grasp:
 
 def _errors_of(constraints: tuple[str, ...]) -> list[str]:
     """Names of the metrics that count under these constraints."""
-    names = [spec.name for c in CONSTRAINTS if not c.optional or c.name in constraints for spec in c.errors]
+    names = [
+        spec.name
+        for c in CONSTRAINTS
+        if not c.optional or c.name in constraints
+        for spec in c.errors
+    ]
     return [*names, "moved_at_removal", "force_link_max"]
 
 
-def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float = 0.0) -> np.ndarray:
-    """(B,) cost of each attempt: held to the end first, then held for a quarter of a second, then everything else.
+def costs(
+    outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float = 0.0
+) -> np.ndarray:
+    """(B,) cost of each attempt: held to the end first, then held for a quarter of a second, then
+    everything else.
 
     Args:
       outcome: outcome of the attempts.
@@ -106,6 +116,9 @@ def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
     place = outcome.trace.object_position
     way = place[-1] - place[removal] - [0.0, 0.0, lift]
     values = {**outcome.metrics, "slip": np.linalg.norm(way, axis=-1)}
-    cost = sum(np.minimum(values[name] / _SCALES[name], 10.0) for name in [*_errors_of(constraints), "slip"])
+    cost = sum(
+        np.minimum(values[name] / _SCALES[name], 10.0)
+        for name in [*_errors_of(constraints), "slip"]
+    )
     cost += sum(values[name] == 0 for name in _FIRM)
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)

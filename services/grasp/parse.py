@@ -1,7 +1,8 @@
-"""Constraints from text and files, for one object: a direction, a part, a reference pose, a wrist path.
+"""Constraints from text and files, for one object: a direction, a part, a reference pose, a wrist
+path.
 
-Files give positions in metres in the axes and with the origin of the object's own file. Grasp motions and constraint
-sets, which are in the object frame, are used unchanged.
+Files give positions in metres in the axes and with the origin of the object's own file. Grasp
+motions and constraint sets, which are in the object frame, are used unchanged.
 """
 
 import os
@@ -59,7 +60,9 @@ class Target(NamedTuple):
         return np.stack([w - x, x + w, y - z, z + y], -1)  # after a quarter turn about x
 
     def check_near(self, position: np.ndarray, what: str) -> None:
-        """Raises a CongraspError if a place (3,), object frame, is so far away that its unit must be wrong."""
+        """Raises a CongraspError if a place (3,), object frame, is so far away that its unit must
+        be wrong.
+        """
         with np.errstate(over="ignore"):
             away = float(np.linalg.norm(self.obj.points - position, axis=-1).min())
         if away > _FAR:
@@ -74,29 +77,40 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       obj: the object.
       hand: the hand.
       waypoints: K, of wrist trajectories.
-      **texts: by the names of the constraints' options (`Constraint.options`); None or an empty text omits the option.
-        Text is split at blanks and commas if an option takes several words; a number, and a sequence or an array of
-        words or numbers, equal such a text.
+      **texts: by the names of the constraints' options (`Constraint.options`); None or an empty
+      text omits the option.
+        Text is split at blanks and commas if an option takes several words; a number, and a
+        sequence or an array of words or numbers, equal such a text.
 
     Raises:
-      CongraspError: an option is unknown, cannot be read or does not fit the object; the message names it.
+      CongraspError: an option is unknown, cannot be read or does not fit the object; the message
+      names it.
     """
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):
-        raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}.")
+        raise CongraspError(
+            f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}."
+        )
     plain = {name: _plain(option, texts.get(name)) for name, option in options.items()}
     given = {
-        name: _read(option, plain[name], Target(f"--{name}", obj, hand, waypoints)) for name, option in options.items()
+        name: _read(option, plain[name], Target(f"--{name}", obj, hand, waypoints))
+        for name, option in options.items()
     }
     parsed = {constraint: constraint.parse(given, hand, obj) for constraint in CONSTRAINTS}
     found = {constraint.name: arrays for constraint, arrays in parsed.items() if arrays is not None}
-    regions = [constraint.avoid_region(given, obj) for constraint in CONSTRAINTS if constraint.name in found]
+    regions = [
+        constraint.avoid_region(given, obj)
+        for constraint in CONSTRAINTS
+        if constraint.name in found
+    ]
     avoid = next((region for region in regions if region is not None), None)
     return GraspRequest({"heading": {}, **found}, avoid, above=plain["heading"] == ABOVE)
 
 
 def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
-    """Returns the value of an option, by its kind; None if it is not given. Errors name the option."""
+    """Returns the value of an option, by its kind; None if it is not given. Errors name the
+    option.
+    """
     if not text:
         return None
     if isinstance(text, tuple) or option.kind == "text" or text in option.words:
@@ -104,11 +118,15 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
     try:
         return _READERS[option.kind](text, target)
     except CongraspError as error:
-        raise CongraspError(str(error) if str(error).startswith(target.name) else f"{target.name}: {error}") from None
+        raise CongraspError(
+            str(error) if str(error).startswith(target.name) else f"{target.name}: {error}"
+        ) from None
 
 
 def _plain(option: Option, value: Any) -> str | tuple[str, ...]:
-    """Returns the text of an option, or its words if it takes several; a flag that is off is an empty text."""
+    """Returns the text of an option, or its words if it takes several; a flag that is off is an
+    empty text.
+    """
     if option.switch or value is None:
         return "yes" if value else ""
     if not isinstance(value, str | os.PathLike):
@@ -118,7 +136,9 @@ def _plain(option: Option, value: Any) -> str | tuple[str, ...]:
 
 
 def _words(value: Any) -> list[str]:
-    """The words of a text, a number, or a sequence of such, also nested and of different lengths."""
+    """The words of a text, a number, or a sequence of such, also nested and of different
+    lengths.
+    """
     nested = np.iterable(value) and not isinstance(value, str)
     return [word for part in value for word in _words(part)] if nested else [str(value)]
 
@@ -148,7 +168,9 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     """The normalised vector."""
     largest = np.abs(vector).max()
     if largest < 1e-9:
-        raise CongraspError(f"{name} has no direction: all its numbers are zero.", "Make one of them 1 or -1.")
+        raise CongraspError(
+            f"{name} has no direction: all its numbers are zero.", "Make one of them 1 or -1."
+        )
     return vector / largest / np.linalg.norm(vector / largest)
 
 
@@ -157,7 +179,9 @@ def _part(text: str, target: Target) -> Part:
     path, obj = pathlib.Path(text), target.obj
     names = [word.strip() for word in text.split(",")]
     if path.exists() and set(names) <= set(obj.part_names):
-        raise CongraspError(f"'{text}' is a file here, and a part of '{obj.name}'.", f"Pass ./{text} for the file.")
+        raise CongraspError(
+            f"'{text}' is a file here, and a part of '{obj.name}'.", f"Pass ./{text} for the file."
+        )
     if not path.suffix and not path.exists():
         if unknown := [part for part in names if part not in obj.part_names]:
             known = f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part."
@@ -176,7 +200,11 @@ def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
         motion = _motion(path, target.hand, index)
         last = grasp_part(motion)[1]
         position, quaternion = _wrist_on_object(motion, last)
-        return {"q": motion.joint_position[last], "position": position[last], "quaternion": quaternion[last]}
+        return {
+            "q": motion.joint_position[last],
+            "position": position[last],
+            "quaternion": quaternion[last],
+        }
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, target, index).arrays
         return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
@@ -184,11 +212,15 @@ def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
     joints, names = given["joints"], [joint.name for joint in hand.joints]
     if isinstance(joints, dict):
         if unknown := sorted(set(joints) - set(names)):
-            raise CongraspError(f"the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
+            raise CongraspError(
+                f"the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}."
+            )
         joints = [joints.get(name, 0.0) for name in names]
     q = _floats(joints, (len(names),), f"'joints' of {path}")
     if np.abs(q).max() > 2 * np.pi:
-        raise CongraspError(f"a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
+        raise CongraspError(
+            f"a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians."
+        )
     position = target.placed(_floats(given["position"], (3,), f"'position' of {path}"))
     target.check_near(position, f"the wrist of {path}")
     turn = _unit(_floats(given["quaternion"], (4,), f"'quaternion' of {path}"), "the quaternion")
@@ -205,11 +237,15 @@ def _path(text: str, target: Target) -> dict[str, np.ndarray]:
     if path.suffix == ".npz":
         motion = _motion(path, target.hand, index)
         first, last = grasp_part(motion)
-        position, quaternion = (values[first : last + 1] for values in _wrist_on_object(motion, first))
+        position, quaternion = (
+            values[first : last + 1] for values in _wrist_on_object(motion, first)
+        )
         return _resampled(position, quaternion, target.waypoints, path)
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, target, index).arrays
-        position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
+        position, quaternion = (
+            arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion")
+        )
         return _resampled(position, quaternion, target.waypoints, path)
     if path.suffix.lower() == ".csv":
         position, quaternion = read_csv(path, _LARGEST)
@@ -233,9 +269,13 @@ def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.nd
     target.check_near(position[frame], f"the joint '{joint}' of {path}")
     known = np.ones(len(away), bool)
     try:
-        _, places, turns = approach(path.stem, position, rotation.as_matrix(), away, known, frame, target.waypoints)
+        _, places, turns = approach(
+            path.stem, position, rotation.as_matrix(), away, known, frame, target.waypoints
+        )
     except Dropped as dropped:
-        raise CongraspError(f"{path}: {dropped.reason}.", "Move the skeleton, or name another joint.") from None
+        raise CongraspError(
+            f"{path}: {dropped.reason}.", "Move the skeleton, or name another joint."
+        ) from None
     return {"position": places, "quaternion": turns}
 
 
@@ -250,7 +290,9 @@ def _numbered(text: str) -> tuple[pathlib.Path, int]:
 def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
     """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
     if index:
-        raise CongraspError(f"{path} is one motion and has no number {index}.", "Leave the number out.")
+        raise CongraspError(
+            f"{path} is one motion and has no number {index}.", "Leave the number out."
+        )
     motion = load_motion(path)
     if motion.hand != hand.name:
         raise CongraspError(f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.")
@@ -258,7 +300,9 @@ def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
 
 
 def grasp_part(motion: GraspMotion) -> tuple[int, int]:
-    """The first frame of the grasp itself, and the last one before the lift or the table's removal."""
+    """The first frame of the grasp itself, and the last one before the lift or the table's
+    removal.
+    """
     first, end = grasp_span(motion.about, motion.control_dt, motion.table)
     last = max(end - 1, 0)
     return min(first, last), last
@@ -268,31 +312,47 @@ def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.nd
     """The wrist (T, 3), (T, 4) in the object frame of one frame of the motion."""
     turn = Rotation.from_quat(motion.object_quaternion[frame], scalar_first=True).inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
-    return turn.apply(motion.wrist_position - motion.object_position[frame]), (turn * wrist).as_quat(scalar_first=True)
+    return turn.apply(motion.wrist_position - motion.object_position[frame]), (
+        turn * wrist
+    ).as_quat(scalar_first=True)
 
 
 def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
-    """The constraint set in a file; raises a CongraspError for another hand or object, or without this number."""
+    """The constraint set in a file; raises a CongraspError for another hand or object, or without
+    this number.
+    """
     constraints, hand, obj = constraint_sets.load(path), target.hand, target.obj
     if constraints.meta["hand"] != hand.name:
-        raise CongraspError(f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.")
-    own, wanted = (np.ptp(x, axis=0) for x in (obj.visual_vertices, constraints.arrays["visual/vertices"]))
+        raise CongraspError(
+            f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'."
+        )
+    own, wanted = (
+        np.ptp(x, axis=0) for x in (obj.visual_vertices, constraints.arrays["visual/vertices"])
+    )
     if not np.allclose(own, wanted, rtol=0.02, atol=1e-3):
         scale = float(constraints.meta["object_scale"])
-        its = f"The {hand.name} hand is trained on objects {scale:g} times as large: add --scale {scale:g}."
+        its = (
+            f"The {hand.name} hand is trained on objects {scale:g} times as large: add --scale "
+            f"{scale:g}."
+        )
         raise CongraspError(
-            f"{path} is for an object of {size_in_words(wanted)}; '{obj.name}' has {size_in_words(own)}.",
+            f"{path} is for an object of {size_in_words(wanted)}; '{obj.name}' has "
+            f"{size_in_words(own)}.",
             "Name the set of this object." if scale == 1.0 else its,
         )
     count = constraints.arrays["pose/q"].shape[1]
     if index >= count:
-        raise CongraspError(f"{path} has no number {index}.", f"Its poses and trajectories are 0 to {count - 1}.")
+        raise CongraspError(
+            f"{path} has no number {index}.", f"Its poses and trajectories are 0 to {count - 1}."
+        )
     return constraints
 
 
 def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
     """A JSON file that has these keys."""
-    remedy = f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
+    remedy = (
+        f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
+    )
     given = read_json(path, _LARGEST, remedy)
     for key in keys:
         if not isinstance(given, dict) or key not in given:
@@ -318,7 +378,9 @@ def _resampled(
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
     kept = np.concatenate([[True], np.diff(along) > 1e-6])
     if kept.sum() < 2:
-        raise CongraspError(f"the wrist does not move in {path}.", "Give two different waypoints or more.")
+        raise CongraspError(
+            f"the wrist does not move in {path}.", "Give two different waypoints or more."
+        )
     if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
         raise CongraspError(f"{path} has a quaternion of length zero.")
     position, quaternion, along = position[kept], quaternion[kept], along[kept]
@@ -335,4 +397,6 @@ _READERS: dict[str, Callable[[str, Target], Any]] = {
     "pose": _pose,
     "path": _path,
 }
-"""Readers of an option's text by its kind (`Option.kind`); their arguments are the text and the option's target."""
+"""Readers of an option's text by its kind (`Option.kind`); their arguments are the text and the
+option's target.
+"""

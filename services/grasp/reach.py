@@ -1,8 +1,9 @@
 """Planned approach of the hand from the side to the start of a grasp: smooth and free of contact.
 
-The wrist follows a cubic Bezier curve that ends along the heading. Its share s(x) of the arc length, x = t / T, has
-minimum jerk (Flash and Hogan 1985) from rest to the speed at which the policy takes over:
-s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = v T / length. Rotation and fingers come to rest (m = 0).
+The wrist follows a cubic Bezier curve that ends along the heading. Its share s(x) of the arc
+length, x = t / T, has minimum jerk (Flash and Hogan 1985) from rest to the speed at which the
+policy takes over: s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = v T / length.
+Rotation and fingers come to rest (m = 0).
 """
 
 import itertools
@@ -28,13 +29,23 @@ from congrasp.services.viz.shapes import link_frames, upright
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """Limits of the wrist: m/s, m/s^2 and rad/s."""
 CLEARANCE = 0.01
-"""Least clearance of the hand from object and table, m; near the end of the curve, that of the start of the grasp if
-that is smaller."""
-_NEAR_END = 0.8  # share of the curve beyond which the clearance may be that of the start of the grasp
-_BESIDE, _ABOVE = 0.45, 0.04  # initial distance of wrist and object's centre, and of hand and table, m
-_WAY = 0.22  # least horizontal distance by which the wrist starts further from the object than the grasp does, m
+"""Least clearance of the hand from object and table, m; near the end of the curve, that of the
+start of the grasp if that is smaller."""
+_NEAR_END = (
+    0.8  # share of the curve beyond which the clearance may be that of the start of the grasp
+)
+# Initial distance of wrist and object's centre, and of hand and table, m
+_BESIDE, _ABOVE = (
+    0.45,
+    0.04,
+)
+# Least horizontal distance by which the wrist starts further from the object than the grasp does,
+# m
+_WAY = 0.22
 _BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
-"""The first two for a hand whose arm needs room above the table, m, and the angle by which its fingers point down."""
+"""The first two for a hand whose arm needs room above the table, m, and the angle by which its
+fingers point down.
+"""
 _RELAXED = 0.15  # initial share of the fingers' way from the open to the closed pose
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
@@ -43,7 +54,14 @@ _MOST_STRETCH = 50.0  # largest factor on the requested duration
 _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
-_BEGIN = ("object_position", "object_quaternion", "link_position", "link_quaternion", "q", "goal/heading_direction")
+_BEGIN = (
+    "object_position",
+    "object_quaternion",
+    "link_position",
+    "link_quaternion",
+    "q",
+    "goal/heading_direction",
+)
 
 _OF_STEPS = {name for name, spec in EPISODE.arrays.items() if spec.shape and spec.shape[0] == "T"}
 """Arrays of an episode that have a row for each control step."""
@@ -98,7 +116,7 @@ def _minimum_jerk(x: np.ndarray, end: float) -> np.ndarray:
     return (10 - 4 * end) * x**3 + (7 * end - 15) * x**4 + (6 - 3 * end) * x**5
 
 
-def plan_reach(
+def plan_reach(  # noqa: PLR0913
     hand: Hand,
     obj: GraspObject,
     rest: np.ndarray,
@@ -117,10 +135,11 @@ def plan_reach(
       rest: (7,) pose of the object on the table, world frame.
       heading: (3,) unit vector of the approach, world frame.
       first: the single pose (N = 1) in which the grasp begins.
-      seconds: requested duration; extended where the wrist would exceed `SPEED`, `ACCELERATION` or `TURNING`.
-      dt: length of a control step, s.
+      seconds: requested duration; extended where the wrist would exceed `SPEED`, `ACCELERATION` or
+      `TURNING`. dt: length of a control step, s.
       speed: speed of the wrist at the end, along the heading, m/s.
-      side: azimuth of the arm's base as seen from the object, rad: the hand starts there, and higher. None if there is
+      side: azimuth of the arm's base as seen from the object, rad: the hand starts there, and
+      higher. None if there is
         no arm.
 
     Raises:
@@ -133,7 +152,9 @@ def plan_reach(
     fingers = np.stack([relaxed, first.q[0]])
     axes = axes_in_wrist(hand, (1 - checked[:, None]) * fingers[0] + checked[:, None] * fingers[1])
     end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
-    lowest = (_first_turn(hand, np.array([1.0, 0.0, 0.0]), side).apply(axes[0])[:, 2] - _radii(hand)).min()
+    lowest = (
+        _first_turn(hand, np.array([1.0, 0.0, 0.0]), side).apply(axes[0])[:, 2] - _radii(hand)
+    ).min()
     for curve in _curves(hand, rest, heading, first, fingers, -float(lowest), side):
         steps = math.ceil(_duration(curve, seconds, speed) / dt)
         found = clearances(hand, field, rest, axes, curve.at(x, steps * dt, speed))
@@ -156,7 +177,9 @@ def _curves(
     height: float,
     side: float | None,
 ) -> Iterator[_Curve]:
-    """Curves to try, the simplest first; `fingers` (2, F) at both ends, `height` (m) of the wrist on the table."""
+    """Curves to try, the simplest first; `fingers` (2, F) at both ends, `height` (m) of the wrist
+    on the table.
+    """
     end = first.position[0]
     height += _ABOVE if side is None else _ABOVE_WITH_ARM
     out = float(np.linalg.norm((end - rest[:3])[:2]))
@@ -171,13 +194,20 @@ def _curves(
         turns = Rotation.concatenate([_first_turn(hand, -outward, side), first.rotation[0]])
         s = np.linspace(0, 1, _FINE)[:, None]
         last = end - back / 3 * heading
-        points = (1 - s) ** 3 * begin + 3 * s * (1 - s) ** 2 * middle + 3 * s**2 * (1 - s) * last + s**3 * end
+        points = (
+            (1 - s) ** 3 * begin
+            + 3 * s * (1 - s) ** 2 * middle
+            + 3 * s**2 * (1 - s) * last
+            + s**3 * end
+        )
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         yield _Curve(points, length, Slerp([0, 1], turns), fingers)
 
 
 def _first_turn(hand: Hand, forward: np.ndarray, side: float | None) -> Rotation:
-    """Wrist orientation with the fingers along a level direction (3,), inclined on an arm, and the palm down."""
+    """Wrist orientation with the fingers along a level direction (3,), inclined on an arm, and the
+    palm down.
+    """
     # `upright` has the fingers up and the palm towards +x.
     across = np.cross(forward, [0.0, 0.0, -1.0])
     lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], across, forward], -1))
@@ -186,20 +216,27 @@ def _first_turn(hand: Hand, forward: np.ndarray, side: float | None) -> Rotation
 
 
 def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """(N, P, 3) points on the axes of the hand's capsules in the wrist frame, at finger angles (N, F)."""
+    """(N, P, 3) points on the axes of the hand's capsules in the wrist frame, at finger angles (N,
+    F).
+    """
     share = np.linspace(0, 1, _ALONG)[:, None]
-    along = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])  # (C, _ALONG, 3)
+    # (C, _ALONG, 3)
+    along = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])
     origins = np.array([link_origin(link) for link in hand.links])
     local, links = along - origins[hand.capsule_links][:, None], hand.capsule_links
     found = []
     for angles in q:
         position, quaternion = mujoco_link_poses(hand, angles)
         matrices = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[links]
-        found.append((np.einsum("cij,cpj->cpi", matrices, local) + position[links][:, None]).reshape(-1, 3))
+        found.append(
+            (np.einsum("cij,cpj->cpi", matrices, local) + position[links][:, None]).reshape(-1, 3)
+        )
     return np.array(found)
 
 
-def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndarray, poses: Reach) -> np.ndarray:
+def clearances(
+    hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndarray, poses: Reach
+) -> np.ndarray:
     """(2, N) m between the hand's capsules and the object, and the table.
 
     Args:
@@ -229,7 +266,9 @@ def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
 
 
 def _duration(curve: _Curve, seconds: float, speed: float) -> float:
-    """Duration of the curve in s: as requested, or the shortest one tried in which the wrist keeps to its limits."""
+    """Duration of the curve in s: as requested, or the shortest one tried in which the wrist keeps
+    to its limits.
+    """
     x = np.linspace(0, 1, _FINE)
     for found in seconds * np.geomspace(1.0, _MOST_STRETCH, 100):
         poses, h = curve.at(x, found, speed), found * x[1]
@@ -243,48 +282,81 @@ def _duration(curve: _Curve, seconds: float, speed: float) -> float:
 
 
 def with_planned_reach(
-    episode: Message, hand: Hand, obj: GraspObject, seconds: float, speed: float, side: float | None = None
+    episode: Message,
+    hand: Hand,
+    obj: GraspObject,
+    seconds: float,
+    speed: float,
+    side: float | None = None,
 ) -> Message:
-    """The episode with the planned approach before it; see `plan_reach` for the arguments and errors."""
-    arrays = {name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN}
+    """The episode with the planned approach before it; see `plan_reach` for the arguments and
+    errors.
+    """
+    arrays = {
+        name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN
+    }
     rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
     turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
     first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
-    heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
+    heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(
+        arrays["goal/heading_direction"]
+    )
     dt = float(episode.meta["control_dt"])
-    return with_reach(episode, hand, plan_reach(hand, obj, rest, heading, first, seconds, dt, speed, side))
+    return with_reach(
+        episode, hand, plan_reach(hand, obj, rest, heading, first, seconds, dt, speed, side)
+    )
 
 
 def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
     """The episode with an approach before it; `phases` of its metadata are shifted accordingly.
 
-    During the approach the object rests, there is no contact, and errors are those of the first step.
+    During the approach the object rests, there is no contact, and errors are those of the first
+    step.
     """
     arrays, steps = episode.arrays, len(reach.q)
-    moving = [name for name in arrays if name in _OF_STEPS or f"{name.partition('/')[0]}/*" in _OF_STEPS]
+    moving = [
+        name for name in arrays if name in _OF_STEPS or f"{name.partition('/')[0]}/*" in _OF_STEPS
+    ]
     before = {name: np.repeat(arrays[name][:1], steps, 0) for name in moving}
     for name in before:
         if name.startswith("reward/") or name in ("action", "contact_force"):
             before[name] = np.zeros_like(before[name])
-    frames = [link_frames(hand, *pose) for pose in zip(reach.q, reach.position, reach.rotation, strict=True)]
+    frames = [
+        link_frames(hand, *pose)
+        for pose in zip(reach.q, reach.position, reach.rotation, strict=True)
+    ]
     before["link_position"], before["link_quaternion"] = map(np.stack, zip(*frames, strict=True))
     before["q"] = before["q_target"] = reach.q
     before["u"] = before["u_target"] = _wrist_joints(episode, reach)
-    joined = {name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]]) for name, part in before.items()}
+    joined = {
+        name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]])
+        for name, part in before.items()
+    }
     later = steps * episode.meta["control_dt"]
-    phases = {"approach": 0.0, **{name: begin + later for name, begin in episode.meta["phases"].items()}}
+    phases = {
+        "approach": 0.0,
+        **{name: begin + later for name, begin in episode.meta["phases"].items()},
+    }
     return Message({**arrays, **joined}, {**episode.meta, "phases": phases})
 
 
 def _wrist_joints(episode: Message, reach: Reach) -> np.ndarray:
-    """(N, 6) virtual wrist joints, with the base that follows from joints and pose of the first step."""
+    """(N, 6) virtual wrist joints, with the base that follows from joints and pose of the first
+    step.
+    """
     first = np.asarray(episode.arrays["u"][0], float)
-    turn = Rotation.from_quat(np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True)
-    base = Rotation.from_quat(episode.arrays["link_quaternion"][0, 0], scalar_first=True) * turn.inv()
+    turn = Rotation.from_quat(
+        np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True
+    )
+    base = (
+        Rotation.from_quat(episode.arrays["link_quaternion"][0, 0], scalar_first=True) * turn.inv()
+    )
     origin = episode.arrays["link_position"][0, 0] - base.apply(first[:3])
     turned = (base.inv() * reach.rotation).as_quat(scalar_first=True)
     hinges = np.zeros((len(turned), 3))
     near = first[3:]
     for i in reversed(range(len(turned))):  # from the grasp backwards, so that no angle jumps
-        near = hinges[i] = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))[0]
+        near = hinges[i] = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))[
+            0
+        ]
     return np.concatenate([base.inv().apply(reach.position - origin), hinges], 1)

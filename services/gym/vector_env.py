@@ -24,15 +24,18 @@ from congrasp.services.gym import ID
 from congrasp.services.train.presets import FULL, get_preset
 
 ACTION = 3.0
-"""Bound of the action space, in units of action: five initial standard deviations of the recipe's policy."""
+"""Bound of the action space, in units of action: five initial standard deviations of the recipe's
+policy.
+"""
 
 
 class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """Vector environment of hands that grasp objects under sampled constraints (`actors.env`).
 
-    An episode ends with its time limit while the object is held (truncated), or when it is not held (terminated). Ended
-    environments are reset in the same step: `infos["final_obs"]` (num_envs, D) holds their last observations, and
-    `infos["episode"]` the metrics of ended episodes by name (num_envs,), where `infos["_final_obs"]` is true.
+    An episode ends with its time limit while the object is held (truncated), or when it is not held
+    (terminated). Ended environments are reset in the same step: `infos["final_obs"]` (num_envs, D)
+    holds their last observations, and `infos["episode"]` the metrics of ended episodes by name
+    (num_envs,), where `infos["_final_obs"]` is true.
     """
 
     def __init__(
@@ -46,14 +49,16 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         autoreset: bool = True,
         **task: Any,
     ):
-        """Creates objects, their constraints and the engine; the first calls of `reset` and `step` compile.
+        """Creates objects, their constraints and the engine; the first calls of `reset` and `step`
+        compile.
 
         Args:
           num_envs: number of parallel environments.
           hand: name or file of the hand.
           objects: number of procedural objects, of the families of the hand's training.
           physics: engine, see `congrasp train --physics`.
-          arrays: array type of observations, rewards and flags. JAX arrays stay on the device, and other libraries can
+          arrays: array type of observations, rewards and flags. JAX arrays stay on the device, and
+          other libraries can
             import them through DLPack.
           autoreset: resets ended environments automatically; otherwise all wait for `reset`.
           **task: fields of `TaskConfig` other than those of the hand's training.
@@ -64,7 +69,9 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if num_envs < 1:
             raise CongraspError(f"There are {num_envs} environments.", "Make one or more.")
         config = get_preset(FULL, hand)
-        self.task = dataclasses.replace(config.task, **{"reward": config.curriculum.reward, **_known(task)})
+        self.task = dataclasses.replace(
+            config.task, **{"reward": config.curriculum.reward, **_known(task)}
+        )
         self.hand = get_hand(config.task.hand)
         pool = dataclasses.replace(config.objects, count=objects)
         made = training_set(self.hand, dataclasses.replace(config, task=self.task, objects=pool), 0)
@@ -75,14 +82,22 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._bank, self._autoreset, self._arrays = made.bank, autoreset, arrays
         self._key = jax.random.key(0)
         self.num_envs = num_envs
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED}
+        self.metadata = {
+            "autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED
+        }
         size = sum(count for _, count in layout(self.hand, self.task))
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.single_action_space = gym.spaces.Box(-ACTION, ACTION, (len(self.hand.motors) + 6,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.single_action_space = gym.spaces.Box(
+            -ACTION, ACTION, (len(self.hand.motors) + 6,), np.float32
+        )
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Starts new episodes in all environments; returns observations (num_envs, D).
 
         Args:
@@ -95,12 +110,18 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return self._given_out(self._worker.observe()), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Simulates one control step under actions (num_envs, A): obs, rewards, terminated, truncated, infos."""
+        """Simulates one control step under actions (num_envs, A): obs, rewards, terminated,
+        truncated, infos.
+        """
         rollout = self._worker.collect(jax.numpy.asarray(actions, np.float32), 1)
         observation, infos = rollout.last_observation, {}
         ended = np.asarray(rollout.terminal[0])
         if self._autoreset and ended.any():
-            infos = {"final_obs": self._given_out(observation), "_final_obs": ended, **self._episodes(rollout)}
+            infos = {
+                "final_obs": self._given_out(observation),
+                "_final_obs": ended,
+                **self._episodes(rollout),
+            }
             self._worker.renew(ended, self._drawn())
             observation = self._worker.observe()
         terminated = rollout.terminal[0] & ~rollout.truncated[0]
@@ -121,7 +142,11 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         columns = np.asarray(rollout.episodes).T
         named = zip(episode_fields(self.task), columns, strict=True)
         ended = np.asarray(rollout.has_episode)
-        found = {name.removeprefix("episode/"): column for name, column in named if name.startswith("episode/")}
+        found = {
+            name.removeprefix("episode/"): column
+            for name, column in named
+            if name.startswith("episode/")
+        }
         return {"episode": found, "_episode": ended}
 
     def _given_out(self, array: Any) -> Any:
@@ -130,7 +155,9 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 class GraspEnv(gym.Env[np.ndarray, np.ndarray]):
-    """One hand and one object: a vector environment of size one, which waits for `reset` at the end."""
+    """One hand and one object: a vector environment of size one, which waits for `reset` at the
+    end.
+    """
 
     def __init__(self, **settings: Any):
         """Creates the environment; for the arguments see `GraspVectorEnv`."""
@@ -138,7 +165,9 @@ class GraspEnv(gym.Env[np.ndarray, np.ndarray]):
         self.observation_space = self._vector.single_observation_space
         self.action_space = self._vector.single_action_space
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         """Starts a new episode; returns its first observation (D,)."""
         super().reset(seed=seed)
         observation, infos = self._vector.reset(seed=seed)

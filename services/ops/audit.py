@@ -1,12 +1,13 @@
-"""`congrasp audit`: the outcome of every rollout of a run, from the journals of its actors and its learner.
+"""`congrasp audit`: the outcome of every rollout of a run, from the journals of its actors and its
+learner.
 
-Actors record what they sent, with a checksum, and every reply; the learner records what it used, with a checksum from
-the start of the update, what it dropped, and where its sessions began and ended. Neither reads the other's journal, and
-this module does not use the code that decided.
+Actors record what they sent, with a checksum, and every reply; the learner records what it used,
+with a checksum from the start of the update, what it dropped, and where its sessions began and
+ended. Neither reads the other's journal, and this module does not use the code that decided.
 
-The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are no faults, but are
-counted as not in the journals, and reported as unjudged. A journal without its last lines looks like that of a process
-that was killed.
+The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are
+no faults, but are counted as not in the journals, and reported as unjudged. A journal without its
+last lines looks like that of a process that was killed.
 """
 
 import collections
@@ -46,7 +47,9 @@ class Report(NamedTuple):
     """Outcome of every rollout of a run."""
 
     counts: dict[str, int]
-    """Numbers of rollouts made and accepted, and the outcomes of accepted ones; the last ones are faults."""
+    """Numbers of rollouts made and accepted, and the outcomes of accepted ones; the last ones are
+    faults.
+    """
     faults: list[str]
     """One line for each rollout that was lost, duplicated, corrupted or unmatched."""
     lag_mean: float
@@ -65,7 +68,9 @@ class Report(NamedTuple):
     def exit_code(self) -> int:
         """0 without findings, else that of the most serious kind."""
         damaged = self.damaged or self.counts.get("damaged on disk")
-        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if damaged else set())
+        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | (
+            {"damage"} if damaged else set()
+        )
         if self.missing or self.counts.get(UNJUDGED) or not self.counts["made"]:
             kinds.add("unjudged")
         return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
@@ -95,11 +100,17 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
         kind = "actor" if learners else "learner"
         raise CongraspError(
             f"There is no journal of {'an' if kind == 'actor' else 'a'} {kind} in {folder}.",
-            "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these files.",
+            "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these "
+            "files.",
         )
     notes = [read_journal(path, _is_entry) for path in actors]
     books = [read_uses(path) for path in learners]
-    gaps = _Gaps(*(any(each.lost or each.damaged or each.missing for each in group) for group in (notes, books)))
+    gaps = _Gaps(
+        *(
+            any(each.lost or each.damaged or each.missing for each in group)
+            for group in (notes, books)
+        )
+    )
     return _compare(_made(notes), _outcomes(book.intact for book in books), gaps, [*notes, *books])
 
 
@@ -139,7 +150,9 @@ class _Session:
     version: int
     max_staleness: int
     kept: bool
-    """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp did not."""
+    """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp
+    did not.
+    """
     falls_back: bool
     """It began from a checkpoint older than the newest, which was damaged or missing."""
     started: bool
@@ -204,7 +217,9 @@ def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
     return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
 
 
-def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]) -> Report:
+def _compare(
+    made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]
+) -> Report:
     """Compares every rollout's replies with the actions of the learner's sessions."""
     standing = found.standing
     counts = collections.Counter({"made": len(made)})
@@ -227,12 +242,20 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
                 fault("unmatched", identity, "used, but never sent")
         elif any(use.checksum != made[identity].checksum for use in uses):
             fault("corrupted", identity, "used with different content than sent")
-        if len(uses) > 1 and not gaps.learners:  # the line with which a resume undid one of them may be missing
+        if (
+            len(uses) > 1 and not gaps.learners
+        ):  # the line with which a resume undid one of them may be missing
             fault("duplicated", identity, f"used {len(uses)} times")
     for identity, rollout in made.items():
         outcomes = [outcome for outcome, _ in rollout.answers]
         if "accepted" not in outcomes and "duplicate" not in outcomes:
-            counts["used, answer lost" if identity in standing else outcomes[-1] if outcomes else "unanswered"] += 1
+            counts[
+                "used, answer lost"
+                if identity in standing
+                else outcomes[-1]
+                if outcomes
+                else "unanswered"
+            ] += 1
             continue
         counts["accepted"] += 1
         outcome = _outcome(identity, rollout, found)
@@ -264,7 +287,9 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
         return "dropped"
     if identity in found.spoilt:
         return "damaged on disk"
-    accepted_by = {session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")}
+    accepted_by = {
+        session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")
+    }
     for book in found.books:
         had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
         if not had:
@@ -272,12 +297,18 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
         last, after = book[had[-1]], book[had[-1] + 1 : had[-1] + 2]
         if not after:
             return "waiting" if last.waiting is None or identity in last.waiting else "lost"
-        return _without_trace(identity, rollout.version, last, after[0], undone=identity in found.undone)
+        return _without_trace(
+            identity, rollout.version, last, after[0], undone=identity in found.undone
+        )
     return UNJUDGED
 
 
-def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:
-    """Reason why the session after the last that had a rollout did not recover it; "lost" without a reason."""
+def _without_trace(
+    identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool
+) -> str:
+    """Reason why the session after the last that had a rollout did not recover it; "lost" without a
+    reason.
+    """
     if abs(version - after.version) > after.max_staleness or after.run_id != last.run_id:
         return "undone" if undone else "too old after a restart"
     if not last.kept or identity in last.unwritten or after.falls_back:
@@ -285,11 +316,15 @@ def _without_trace(identity: Identity, version: int, last: _Session, after: _Ses
     return "lost"
 
 
-def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
-    """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and unchanged?
+def audit(
+    run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()
+) -> int:
+    """Compares the journals of a run's actors and of its learner: was every accepted rollout used
+    once, and unchanged?
 
-    Exits with 1 if a rollout was lost, else with 5 for a surplus (a rollout used twice, or made by no actor), else
-    with 6 if a rollout or a journal is damaged, else with 7 if something cannot be judged, for lines are missing.
+    Exits with 1 if a rollout was lost, else with 5 for a surplus (a rollout used twice, or made by
+    no actor), else with 6 if a rollout or a journal is damaged, else with 7 if something cannot be
+    judged, for lines are missing.
 
     Args:
       run_dir: Directory of the run.
@@ -306,17 +341,32 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
         style = "bold red" if name in FAULTS and value else ""
         table.add_row(name, str(value), FAULTS.get(name, ""), style=style)
     table.add_section()
-    table.add_row("damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else "")
-    table.add_row("lines of older versions", str(report.unchecked), "unchecked" if report.unchecked else "")
+    table.add_row(
+        "damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else ""
+    )
+    table.add_row(
+        "lines of older versions", str(report.unchecked), "unchecked" if report.unchecked else ""
+    )
     console.print(table)
-    console.print(f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} versions.")
+    console.print(
+        f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} "
+        f"versions."
+    )
     if report.holes:
-        console.print(f"{report.holes} line(s) are missing in the journals: the disk was full, or their end was cut.")
+        console.print(
+            f"{report.holes} line(s) are missing in the journals: the disk was full, or their end "
+            f"was cut."
+        )
     if report.missing:
-        console.print(f"Lines are missing at {report.missing} place(s) of the journals: they were emptied or cut.")
+        console.print(
+            f"Lines are missing at {report.missing} place(s) of the journals: they were emptied or "
+            f"cut."
+        )
     if report.exit_code == EXIT_CODES["unjudged"]:
         count, accepted = report.counts.get(UNJUDGED, 0), report.counts.get("accepted", 0)
-        console.print(f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}.")
+        console.print(
+            f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}."
+        )
     for line in report.faults[:20]:
         console.print(line)
     return report.exit_code

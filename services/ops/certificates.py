@@ -1,9 +1,11 @@
-"""A private certificate authority, with one certificate for each run, role and number: `human.actor.3`.
+"""A private certificate authority, with one certificate for each run, role and number:
+`human.actor.3`.
 
-The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares whole common names and reads its rules once.
-Listeners therefore allow all numbers below `NUMBERS` from the start, and a certificate issued later works at once. A
-lost certificate is revoked: its common name is added to the file `revoked`, which listeners check. Keys are elliptic
-(P-256), in files readable only by their owner.
+The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares whole common names and
+reads its rules once. Listeners therefore allow all numbers below `NUMBERS` from the start, and a
+certificate issued later works at once. A lost certificate is revoked: its common name is added to
+the file `revoked`, which listeners check. Keys are elliptic (P-256), in files readable only by
+their owner.
 """
 
 import datetime
@@ -57,20 +59,29 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
     """
     if not force and ((folder / CA_FILE).exists() or (folder / CA_KEY_FILE).exists()):
         raise CongraspError(
-            f"{folder} already holds an authority.", "Issue certificates with it, or pass --force to replace it."
+            f"{folder} already holds an authority.",
+            "Issue certificates with it, or pass --force to replace it.",
         )
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(
         [
             x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
             x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, check_name("run", run)),
-            x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),  # distinguishes authorities
+            # Distinguishes authorities
+            x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),
         ]
     )
     usage = x509.KeyUsage(
-        digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
-        data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
-    )  # fmt: skip
+        digital_signature=True,
+        key_cert_sign=True,
+        crl_sign=True,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
     made = (
         _builder(name, name, key.public_key(), CA_DAYS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -97,7 +108,8 @@ def issue(
     """Issues a certificate.
 
     Args:
-      folder: folder of the authority; the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and `tls.key` is
+      folder: folder of the authority; the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and
+      `tls.key` is
         created in it.
       role: one of `ROLES`.
       run: name of the run; by default the authority's.
@@ -114,21 +126,27 @@ def issue(
     """
     if role not in ROLES:
         raise CongraspError(
-            f"There is no role {ascii(role)[:40]} for certificates.", f"Choose one of: {', '.join(ROLES)}."
+            f"There is no role {ascii(role)[:40]} for certificates.",
+            f"Choose one of: {', '.join(ROLES)}.",
         )
     if hosts and role not in LISTENERS:
         raise CongraspError(
-            f"A certificate of the role {role} cannot name hosts.", f"Only {' and '.join(LISTENERS)} can."
+            f"A certificate of the role {role} cannot name hosts.",
+            f"Only {' and '.join(LISTENERS)} can.",
         )
     ca, ca_key = _authority(folder)
-    identity = _free_identity(folder, role, check_name("run", run or read(folder / CA_FILE).run), number, force)
+    identity = _free_identity(
+        folder, role, check_name("run", run or read(folder / CA_FILE).run), number, force
+    )
     key = ec.generate_private_key(ec.SECP256R1())
     common_name = x509.NameAttribute(NameOID.COMMON_NAME, str(identity))
     subject = x509.Name([x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION), common_name])
     builder = _builder(subject, ca.subject, key.public_key(), days, at_most=ca.not_valid_after_utc)
     made = (
         _with_uses(builder, role, hosts)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False
+        )
         .sign(ca_key, hashes.SHA256())
     )
     target = folder / f"{role}.{identity.number}"
@@ -143,37 +161,52 @@ def issue(
     return target
 
 
-def _free_identity(folder: pathlib.Path, role: str, run: str, number: int | None, force: bool) -> Identity:
+def _free_identity(
+    folder: pathlib.Path, role: str, run: str, number: int | None, force: bool
+) -> Identity:
     """Returns the identity of a new certificate; see `issue`."""
     revoked = Credentials(folder, role).revoked()
     taken = lambda i: (folder / f"{role}.{i}").exists() or str(Identity(run, role, i)) in revoked  # noqa: E731
     if number is None:
         number = next((i for i in range(NUMBERS) if not taken(i)), NUMBERS)
     if not 0 <= number < NUMBERS:
-        raise CongraspError(f"{role}.{number} cannot be issued.", f"Numbers range from 0 to {NUMBERS - 1}.")
+        raise CongraspError(
+            f"{role}.{number} cannot be issued.", f"Numbers range from 0 to {NUMBERS - 1}."
+        )
     target, identity = folder / f"{role}.{number}", Identity(run, role, number)
     if target.exists() and not force:
-        raise CongraspError(f"{target} exists already.", "Pass another --number, or --force to replace it.")
+        raise CongraspError(
+            f"{target} exists already.", "Pass another --number, or --force to replace it."
+        )
     if str(identity) in revoked:
         raise CongraspError(f"{identity} is revoked.", "Pass another --number.")
     if len(str(identity)) > _LONGEST_NAME:
-        raise CongraspError(f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name.")
+        raise CongraspError(
+            f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name."
+        )
     return identity
 
 
-def _with_uses(builder: x509.CertificateBuilder, role: str, hosts: Sequence[str]) -> x509.CertificateBuilder:
-    """Restricts a role's certificate to its uses: to connect and, at these hosts and loopback, to listen."""
+def _with_uses(
+    builder: x509.CertificateBuilder, role: str, hosts: Sequence[str]
+) -> x509.CertificateBuilder:
+    """Restricts a role's certificate to its uses: to connect and, at these hosts and loopback, to
+    listen.
+    """
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if role in LISTENERS:
         uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         names = [_host(one) for one in dict.fromkeys((*_LOOPBACK, *hosts))]
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(
+        x509.BasicConstraints(ca=False, path_length=None), critical=True
+    )
     return builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
 
 
 def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = None) -> str:
-    """Revokes a certificate: adds its common name to the list of the authority and in all folders within its folder.
+    """Revokes a certificate: adds its common name to the list of the authority and in all folders
+    within its folder.
 
     Args:
       folder: folder of the authority.
@@ -206,7 +239,9 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     files = [folder / CA_FILE, folder / CERTIFICATE_FILE, *folder.glob(f"*.*/{CERTIFICATE_FILE}")]
     found = [read(path) for path in files if path.exists()]
     if not found:
-        raise CongraspError(f"{folder} holds no certificates.", f"Create them: congrasp certs init {folder}")
+        raise CongraspError(
+            f"{folder} holds no certificates.", f"Create them: congrasp certs init {folder}"
+        )
     return sorted(found, key=lambda one: one.identity or Identity("", "", 0))
 
 
@@ -220,7 +255,9 @@ def _builder(
     """Common fields of all certificates: names, key, serial number and validity."""
     now = datetime.datetime.now(datetime.UTC)
     if not -CA_DAYS <= days <= 2 * CA_DAYS:
-        raise CongraspError(f"A certificate cannot be valid for {days:g} days.", f"Pass at most {2 * CA_DAYS}.")
+        raise CongraspError(
+            f"A certificate cannot be valid for {days:g} days.", f"Pass at most {2 * CA_DAYS}."
+        )
     end = now + datetime.timedelta(days=days)
     return (
         x509.CertificateBuilder()
@@ -242,9 +279,12 @@ def _host(name: str) -> x509.GeneralName:
         pass
     labels = name.removeprefix("*.").split(".")
     if len(name) > 253 or not all(
-        0 < len(label) < 64 and label.replace("-", "a").isalnum() and label.isascii() for label in labels
+        0 < len(label) < 64 and label.replace("-", "a").isalnum() and label.isascii()
+        for label in labels
     ):
-        raise CongraspError(f"{ascii(name)[:70]} is neither a host name nor an address.", "Correct --host.")
+        raise CongraspError(
+            f"{ascii(name)[:70]} is neither a host name nor an address.", "Correct --host."
+        )
     return x509.DNSName(name)
 
 
@@ -253,7 +293,9 @@ def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurve
     try:
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
-        raise CongraspError(f"{folder} holds no authority.", f"Create one: congrasp certs init {folder}") from None
+        raise CongraspError(
+            f"{folder} holds no authority.", f"Create one: congrasp certs init {folder}"
+        ) from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     return load(folder / CA_FILE), key
 

@@ -51,7 +51,10 @@ class Finding(NamedTuple):
 
 
 def examine(
-    connect: str = "", run: str = "quickstart", folder: pathlib.Path = pathlib.Path(), certs: pathlib.Path | None = None
+    connect: str = "",
+    run: str = "quickstart",
+    folder: pathlib.Path = pathlib.Path(),
+    certs: pathlib.Path | None = None,
 ) -> list[Finding]:
     """Runs all checks, without side effects.
 
@@ -76,7 +79,11 @@ def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
         yield from check()
     except Exception as error:
         name = getattr(check, "__name__", "").strip("_<>") or "check"
-        yield Finding(name, False, f"could not be checked: {type(error).__name__}: {str(error).splitlines()[0]}")
+        yield Finding(
+            name,
+            False,
+            f"could not be checked: {type(error).__name__}: {str(error).splitlines()[0]}",
+        )
 
 
 def _python() -> Iterator[Finding]:
@@ -92,7 +99,9 @@ def _packages() -> Iterator[Finding]:
     for text in importlib.metadata.requires("congrasp") or ():
         requirement = Requirement(text)
         extras = ("", "train", "cuda") if gpu else ("", "train")
-        if not requirement.marker or any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+        if not requirement.marker or any(
+            requirement.marker.evaluate({"extra": extra}) for extra in extras
+        ):
             wanted[requirement.name] = requirement.specifier
     have: dict[str, str] = {}
     for name in _PACKAGES:
@@ -105,11 +114,18 @@ def _packages() -> Iterator[Finding]:
                 yield Finding(name, False, f"not installed; run: pip install 'congrasp[{extra}]'")
             continue
         fine, version = not needed or wanted[name].contains(have[name]), wanted.get(name)
-        yield Finding(name, fine, have[name], f"{version} is needed; run: pip install '{name}{version}'")
+        yield Finding(
+            name, fine, have[name], f"{version} is needed; run: pip install '{name}{version}'"
+        )
     for one, other in _PAIRS:
-        versions = [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
+        versions = (
+            [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
+        )
         if versions[0] != versions[1]:
-            text = f"{versions[0]} and {versions[1]} do not match; run: pip install '{other}=={versions[0]}'"
+            text = (
+                f"{versions[0]} and {versions[1]} do not match; run: pip install "
+                f"'{other}=={versions[0]}'"
+            )
             yield Finding(f"{one}, {other}", False, text)
 
 
@@ -118,22 +134,31 @@ def _gpu() -> Iterator[Finding]:
     if not os.path.exists(_NVIDIA):
         yield Finding("gpu", True, "no NVIDIA GPU here; actors use the native engine")
         return
-    query = ["nvidia-smi", "--query-gpu=name,memory.total,memory.used,driver_version", "--format=csv,noheader,nounits"]
+    query = [
+        "nvidia-smi",
+        "--query-gpu=name,memory.total,memory.used,driver_version",
+        "--format=csv,noheader,nounits",
+    ]
     try:
-        lines = subprocess.run(query, capture_output=True, text=True, timeout=30, check=True).stdout.splitlines()
+        lines = subprocess.run(
+            query, capture_output=True, text=True, timeout=30, check=True
+        ).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
         yield Finding("gpu", False, "nvidia-smi does not respond", "install the NVIDIA driver")
         return
     for number, line in enumerate(lines):
         name, memory, used, driver = (part.strip() for part in line.split(","))
         fine = int(driver.split(".")[0]) >= _DRIVER
-        text = f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
+        text = (
+            f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
+        )
         yield Finding(f"gpu {number}", fine, text, f"{_DRIVER} or newer is needed; update it")
 
 
 def _jax() -> Iterator[Finding]:
     """Checks that JAX finds the machine's devices, and that a small program runs."""
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a learner may be using this GPU
+    # A learner may be using this GPU
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
     import jax.numpy as jnp
 
@@ -161,7 +186,9 @@ def _warp() -> Iterator[Finding]:
 
     devices = wp.get_cuda_devices()
     if not devices:
-        yield Finding("warp", False, "no GPU found; run: pip install 'congrasp[cuda]', and update the driver")
+        yield Finding(
+            "warp", False, "no GPU found; run: pip install 'congrasp[cuda]', and update the driver"
+        )
         return
     values = wp.full(4, 3.0, dtype=float, device=devices[0])
     wp.launch(double, dim=4, inputs=[values], device=devices[0])
@@ -176,7 +203,11 @@ def _ports() -> Iterator[Finding]:
     for port in range(_PORT, last + 1):
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
-                yield Finding("ports", True, f"{port} is in use (by another learner?); pass others with --listen")
+                yield Finding(
+                    "ports",
+                    True,
+                    f"{port} is in use (by another learner?); pass others with --listen",
+                )
                 return
     yield Finding("ports", True, f"{_PORT}-{last} are free")
 
@@ -197,10 +228,16 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
             os.fsync(file.fileno())
             speed = _SAMPLE / 1e6 / (time.monotonic() - began)
     except OSError as error:
-        yield Finding("disk", False, f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir")
+        yield Finding(
+            "disk",
+            False,
+            f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir",
+        )
         return
     remedy = f"checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
-    yield Finding("disk", speed >= _LEAST_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy)
+    yield Finding(
+        "disk", speed >= _LEAST_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy
+    )
 
 
 def _clock() -> Iterator[Finding]:
@@ -211,7 +248,9 @@ def _clock() -> Iterator[Finding]:
     behind, remedy = began < 1.7e9, f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
     if behind:
         remedy = "it is years behind; set it (timedatectl set-ntp true)"
-    yield Finding("clock", not behind and drift <= 0.1, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy)
+    yield Finding(
+        "clock", not behind and drift <= 0.1, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy
+    )
 
 
 def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
@@ -222,8 +261,14 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
         yield Finding("certificates", False, str(error))
         return
     for one in found:
-        text = f"{one.name}: valid until {one.expires:%Y-%m-%d}" if one.days > 0 else f"{one.name}: expired"
-        remedy = "run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
+        text = (
+            f"{one.name}: valid until {one.expires:%Y-%m-%d}"
+            if one.days > 0
+            else f"{one.name}: expired"
+        )
+        remedy = (
+            "run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
+        )
         yield Finding("certificate", one.days > _LEAST_DAYS, text, remedy)
 
 
@@ -239,20 +284,29 @@ def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Itera
     except CongraspError as error:
         yield Finding("learner", False, str(error))
         return
-    yield Finding("learner", True, f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}")
+    yield Finding(
+        "learner",
+        True,
+        f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}",
+    )
     offset = status["time"] - (began + ended) / 2
     fine = abs(offset) < _OFFSET + (ended - began) / 2
     remedy = "times in recordings will not match; synchronise both clocks"
-    yield Finding("its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f})", remedy)
+    yield Finding(
+        "its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f})", remedy
+    )
 
 
 def doctor(
-    connect: str = "", run: str = "quickstart", folder: pathlib.Path = pathlib.Path(), certs: pathlib.Path | None = None
+    connect: str = "",
+    run: str = "quickstart",
+    folder: pathlib.Path = pathlib.Path(),
+    certs: pathlib.Path | None = None,
 ) -> int:
     """Check this machine and installation: versions, GPU, ports, disk, clock, certificates.
 
-    Prints one line per check, with a remedy if it failed; the exit code is 1 if any failed. `congrasp train --preset
-    check` then runs physics, messages, log, server and pictures.
+    Prints one line per check, with a remedy if it failed; the exit code is 1 if any failed.
+    `congrasp train --preset check` then runs physics, messages, log, server and pictures.
 
     Args:
       connect: Endpoint of a learner to test; its clock is compared with this machine's.
@@ -269,7 +323,10 @@ def doctor(
         print(f"{'ok  ' if finding.fine else 'BAD '} {finding.what:13s} {finding.text}")
     fine = all(finding.fine for finding in findings)
     if fine:
-        print("Next: congrasp train --preset check --actors 1 (tries physics, messages, log, server and pictures)")
+        print(
+            "Next: congrasp train --preset check --actors 1 (tries physics, messages, log, server "
+            "and pictures)"
+        )
     return 0 if fine else 1
 
 

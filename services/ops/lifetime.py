@@ -1,4 +1,6 @@
-"""Lifetime of a process and its children: signals drain it within a few seconds, and its children end with it."""
+"""Lifetime of a process and its children: signals drain it within a few seconds, and its children
+end with it.
+"""
 
 import contextlib
 import ctypes
@@ -17,10 +19,14 @@ from collections.abc import Callable, Iterator, Sequence
 GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
 CHILD_GRACE = 2.0
-"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
+"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must
+end.
+"""
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-_PARENT = "CONGRASP_PARENT"  # environment variable with which a process makes its children end with it
+_PARENT = (
+    "CONGRASP_PARENT"  # environment variable with which a process makes its children end with it
+)
 _POLL = 0.5
 _LAST = 10_000  # bytes of a log in which its last line is looked for
 _REAP = 0.5  # deadline for the end of all children, s
@@ -46,12 +52,14 @@ class Stop(threading.Event):
 
 @contextlib.contextmanager
 def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop]:
-    """Context with a `Stop` that signals set; outside the main thread, which alone Python signals, nothing sets it.
+    """Context with a `Stop` that signals set; outside the main thread, which alone Python signals,
+    nothing sets it.
 
-    Python runs handlers between two bytecodes of the main thread, which may be inside a compiler for a minute. The
-    interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event. It ends the
-    process if it is still running after `grace` seconds, or at once on a second signal, from the user or from the
-    kernel because the parent has ended (`follow_parent`).
+    Python runs handlers between two bytecodes of the main thread, which may be inside a compiler
+    for a minute. The interpreter's wake-up file descriptor is written at once, so a thread that
+    reads it sets the event. It ends the process if it is still running after `grace` seconds, or at
+    once on a second signal, from the user or from the kernel because the parent has ended
+    (`follow_parent`).
 
     Args:
       grace: seconds from the signal to the forced end.
@@ -103,7 +111,9 @@ def _end(code: int) -> None:
 
 
 def follow_parent() -> None:
-    """Requests SIGTERM from the kernel for the parent's death, if the parent asked for it (Linux only)."""
+    """Requests SIGTERM from the kernel for the parent's death, if the parent asked for it (Linux
+    only).
+    """
     parent = os.environ.pop(_PARENT, None)
     if parent is None or not sys.platform.startswith("linux"):
         return
@@ -114,7 +124,9 @@ def follow_parent() -> None:
 
 
 def command(*words: object, **options: object) -> list[str]:
-    """Arguments of congrasp: words, then options by name; None and False leave one out, and a tuple has many values."""
+    """Arguments of congrasp: words, then options by name; None and False leave one out, and a tuple
+    has many values.
+    """
     arguments = list(map(str, words))
     for name, value in options.items():
         if value is not None and value is not False:
@@ -143,8 +155,11 @@ class Child:
         return [sys.executable, "-m", "congrasp", *self.arguments]
 
     def start(self) -> int:
-        """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
-        # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered frames.
+        """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
+        with its parent.
+        """
+        # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
+        # frames.
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         environment = {**jax, **os.environ, **self.environment, _PARENT: str(os.getpid())}
         with self.log.open("ab") as log:
@@ -189,7 +204,9 @@ def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> No
 
 
 def end_all(children: Sequence[Child]) -> None:
-    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
+    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE`
+    seconds.
+    """
     running = [child.process for child in children if child.process and child.code is None]
     for process in running:
         process.terminate()
@@ -200,7 +217,9 @@ def end_all(children: Sequence[Child]) -> None:
             process.wait()
 
 
-def run_child(child: Child, patience: float, progress: Callable[[str], None] = lambda line: None) -> int | None:
+def run_child(
+    child: Child, patience: float, progress: Callable[[str], None] = lambda line: None
+) -> int | None:
     """Runs a command in a separate process, which has ended on return in any case.
 
     Args:

@@ -1,4 +1,6 @@
-"""Monitoring of a role: its log, in lines for users or one JSON object per line, and its metrics."""
+"""Monitoring of a role: its log, in lines for users or one JSON object per line, and its
+metrics.
+"""
 
 import contextlib
 import dataclasses
@@ -28,7 +30,9 @@ class JsonLines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """One line."""
         entry: dict[str, Any] = {
-            "time": datetime.datetime.fromtimestamp(record.created, datetime.UTC).isoformat(timespec="milliseconds"),
+            "time": datetime.datetime.fromtimestamp(record.created, datetime.UTC).isoformat(
+                timespec="milliseconds"
+            ),
             "level": record.levelname.lower(),
             **self._who,
             "text": record.getMessage(),
@@ -50,14 +54,17 @@ class Lines(logging.Formatter):
 
 @contextlib.contextmanager
 def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[None]:
-    """Context that writes the log of this process to standard output, including warnings of libraries.
+    """Context that writes the log of this process to standard output, including warnings of
+    libraries.
 
-    A full disk loses lines, but does not end the process. After an exception a JSON log continues until `log_error`,
-    for the lines of outer contexts.
+    A full disk loses lines, but does not end the process. After an exception a JSON log continues
+    until `log_error`, for the lines of outer contexts.
     """
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stdout)
     handler.setFormatter(
-        JsonLines(role=role, id=id, run=run) if form == "json" else Lines("%(levelname)s: %(message)s")
+        JsonLines(role=role, id=id, run=run)
+        if form == "json"
+        else Lines("%(levelname)s: %(message)s")
     )
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
@@ -99,14 +106,19 @@ class Watch:
 
 
 def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:
-    """Writes a line; levels: info, warning, error, fatal. Numbers that are not finite are dropped from the fields."""
+    """Writes a line; levels: info, warning, error, fatal. Numbers that are not finite are dropped
+    from the fields.
+    """
     finite = {name: value for name, value in (fields or {}).items() if abs(value) < float("inf")}
     _logger.log(logging.getLevelNamesMapping()[level.upper()], text, extra={"fields": finite})
 
 
 @contextlib.contextmanager
-def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 10.0) -> Iterator[None]:
-    """Context that prints a task and its elapsed time to stderr, after `first` and then every `every` seconds.
+def announced(
+    what: str | Callable[[], str], first: float = 3.0, every: float = 10.0
+) -> Iterator[None]:
+    """Context that prints a task and its elapsed time to stderr, after `first` and then every
+    `every` seconds.
 
     Args:
       what: name of the task, or a function that returns its current name.
@@ -131,7 +143,9 @@ def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 
 
 
 def log_error(text: str) -> bool:
-    """Writes the error that ended a JSON log as its last line; returns False if there is no such log."""
+    """Writes the error that ended a JSON log as its last line; returns False if there is no such
+    log.
+    """
     root = logging.getLogger()
     ended = [handler for handler in root.handlers if isinstance(handler.formatter, JsonLines)]
     if ended:

@@ -16,26 +16,36 @@ _GAUGES = {
     "running": ("tickets_running", "Tickets in use."),
     "capacity": (
         "tickets_capacity",
-        "Tickets that can be granted now; with the running ones, the number of actors that the learner can use.",
+        "Tickets that can be granted now; with the running ones, the number of actors that the "
+        "learner can use.",
     ),
     "missing": ("rollouts_missing", "Gaps in the counts of actors' rollouts."),
-    "rejected": ("requests_rejected", "Requests rejected because their actors had made too many useless ones."),
+    "rejected": (
+        "requests_rejected",
+        "Requests rejected because their actors had made too many useless ones.",
+    ),
 }
 _MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @contextlib.contextmanager
 def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
-    """Context that serves collectors at http://HOST:PORT/metrics, with this process's memory and CPU time.
+    """Context that serves collectors at http://HOST:PORT/metrics, with this process's memory and
+    CPU time.
 
     Raises:
       CongraspError: the port cannot be used.
     """
-    registry = CollectorRegistry()  # collectors need no `describe`: names are not checked for clashes
+    # Collectors need no `describe`: names are not checked for clashes
+    registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     for collector in collectors:
         registry.register(collector)
-    with os_errors_as(f"The metrics cannot be served at {host}:{port}", "Pass another --metrics-port.", PORT_ERRORS):
+    with os_errors_as(
+        f"The metrics cannot be served at {host}:{port}",
+        "Pass another --metrics-port.",
+        PORT_ERRORS,
+    ):
         server, thread = start_http_server(port, host, registry)
     try:
         yield
@@ -64,7 +74,9 @@ class LearnerMetrics:
         except TransportError:
             yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", 0.0)
             return
-        yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", float(status["version"] >= 0))
+        yield GaugeMetricFamily(
+            "congrasp_learner_ready", "Whether it takes rollouts.", float(status["version"] >= 0)
+        )
         yield _gauge("version", "Newest policy version.", status["version"])
         yield _gauge("finished", "Whether the run is over.", status["finished"])
         yield _gauge("counters_balanced", "Whether the counters add up.", not status["warnings"])
@@ -73,9 +85,13 @@ class LearnerMetrics:
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
         yield from self._counters(status["counters"])
-        yield _gauge("roles_unlisted", "Live processes that the status does not list.", status["unlisted"])
+        yield _gauge(
+            "roles_unlisted", "Live processes that the status does not list.", status["unlisted"]
+        )
         yield from self._roles(status["roles"])
-        update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
+        update = _gauge(
+            "update", "Metrics of the last update, by the names of the log.", labels=["figure"]
+        )
         for name, value in self._values.items():
             update.add_metric([name], value)
         yield update
@@ -83,8 +99,12 @@ class LearnerMetrics:
     @staticmethod
     def _counters(counters: Mapping[str, int]) -> Iterator[Metric]:
         """Counters of tickets and rollouts."""
-        tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by outcome.", labels=["outcome"])
-        rollouts = CounterMetricFamily("congrasp_learner_rollouts", "Rollouts by outcome.", labels=["outcome"])
+        tickets = CounterMetricFamily(
+            "congrasp_learner_tickets", "Tickets by outcome.", labels=["outcome"]
+        )
+        rollouts = CounterMetricFamily(
+            "congrasp_learner_rollouts", "Rollouts by outcome.", labels=["outcome"]
+        )
         for name, value in counters.items():
             if name in _GAUGES:
                 yield _gauge(*_GAUGES[name], value)
@@ -99,10 +119,16 @@ class LearnerMetrics:
         for role, number in collections.Counter(role["role"] for role in roles).items():
             alive.add_metric([role], number)
         who = ["actor", "incarnation"]
-        lag = _gauge("actor_lag", "Versions by which an actor's last rollout was behind.", labels=who)
+        lag = _gauge(
+            "actor_lag", "Versions by which an actor's last rollout was behind.", labels=who
+        )
         steps = _gauge("actor_steps_per_second", "Over the last ten seconds.", labels=who)
-        rollouts = CounterMetricFamily("congrasp_learner_actor_rollouts", "Accepted rollouts of an actor.", labels=who)
-        refused = CounterMetricFamily("congrasp_learner_actor_refused", "Rejected requests of an actor.", labels=who)
+        rollouts = CounterMetricFamily(
+            "congrasp_learner_actor_rollouts", "Accepted rollouts of an actor.", labels=who
+        )
+        refused = CounterMetricFamily(
+            "congrasp_learner_actor_refused", "Rejected requests of an actor.", labels=who
+        )
         for role in roles:
             labels = [role["id"], role["incarnation"]]
             if "lag" in role:
@@ -115,9 +141,13 @@ class LearnerMetrics:
         yield from (alive, lag, steps, rollouts, refused)
 
 
-def _gauge(name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None) -> GaugeMetricFamily:
+def _gauge(
+    name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None
+) -> GaugeMetricFamily:
     """Returns a gauge of the learner, with its prefix."""
-    return GaugeMetricFamily(f"congrasp_learner_{name}", help, None if value is None else float(value), labels)
+    return GaugeMetricFamily(
+        f"congrasp_learner_{name}", help, None if value is None else float(value), labels
+    )
 
 
 class ActorMetrics:
@@ -133,8 +163,12 @@ class ActorMetrics:
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of the class."""
         last = dict(self._last)
-        yield CounterMetricFamily("congrasp_actor_rollouts", "Rollouts of this actor.", last.pop("rollouts", 0.0))
-        yield GaugeMetricFamily("congrasp_actor_version", "Version of the acting policy.", last.pop("version", -1.0))
+        yield CounterMetricFamily(
+            "congrasp_actor_rollouts", "Rollouts of this actor.", last.pop("rollouts", 0.0)
+        )
+        yield GaugeMetricFamily(
+            "congrasp_actor_version", "Version of the acting policy.", last.pop("version", -1.0)
+        )
         for name, value in last.items():
             yield GaugeMetricFamily(f"congrasp_actor_{name}", "Of the last rollout.", value)
 
@@ -153,7 +187,10 @@ class ServerMetrics:
             buckets=[1e-3 * bound for bound in _MILLISECONDS],
         )
         self._batch = Histogram(
-            "congrasp_policy_batch", "States in a batch.", registry=None, buckets=[1, 2, 4, 8, 16, 32, 64, 128]
+            "congrasp_policy_batch",
+            "States in a batch.",
+            registry=None,
+            buckets=[1, 2, 4, 8, 16, 32, 64, 128],
         )
         self.health: Callable[[], Mapping[str, Any]] = dict
         """Health of the server, once there is one."""
@@ -179,7 +216,9 @@ class ServerMetrics:
         ):
             if name in health:
                 yield GaugeMetricFamily(f"congrasp_policy_{name}", help, float(health[name]))
-        outcomes = CounterMetricFamily("congrasp_policy_queries", "Queries by outcome.", labels=["outcome"])
+        outcomes = CounterMetricFamily(
+            "congrasp_policy_queries", "Queries by outcome.", labels=["outcome"]
+        )
         with self._lock:
             counts = dict.fromkeys(("answered", "refused", "overloaded", "late"), 0) | self.outcomes
         for outcome, count in counts.items():

@@ -1,4 +1,6 @@
-"""`congrasp status`: queries the status of a live run, checks its counters, and formats them as tables."""
+"""`congrasp status`: queries the status of a live run, checks its counters, and formats them as
+tables.
+"""
 
 import dataclasses
 import json
@@ -21,7 +23,10 @@ from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.wire.codec import Message
 
 _TIMEOUT = 5.0
-_SUMS = {"granted": ("running", "redeemed", "returned", "expired"), "accepted": ("consumed", "dropped", "queued")}
+_SUMS = {
+    "granted": ("running", "redeemed", "returned", "expired"),
+    "accepted": ("consumed", "dropped", "queued"),
+}
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
 _SHOWN = 100  # most processes in a table
@@ -56,22 +61,36 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
     for total, parts in _SUMS.items():
         if counters[total] != sum(counters[part] for part in parts):
             terms = " + ".join(f"{part} {counters[part]}" for part in parts)
-            found.append(f"The counters are inconsistent: {total} {counters[total]} is not {terms}.")
+            found.append(
+                f"The counters are inconsistent: {total} {counters[total]} is not {terms}."
+            )
     if counters["queued"] != queue["length"]:
-        found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
-    return [*found, *filter(None, [status.get("trouble")])]  # a learner of an earlier version tells none
+        found.append(
+            f"{counters['queued']} rollouts are counted as queued, but the queue holds "
+            f"{queue['length']}."
+        )
+    # A learner of an earlier version tells none
+    return [
+        *found,
+        *filter(None, [status.get("trouble")]),
+    ]
 
 
 def tables(status: Mapping[str, Any]) -> Group:
     """Formats the status for a terminal."""
     ended = ", finished" if status["finished"] else ""
-    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}")
+    roles = Table(
+        title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}"
+    )
     refused = any(role.get("refused") for role in status["roles"])
     for column in (*_ROLE, "refused") if refused else _ROLE:
         roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
     for role in status["roles"][:_SHOWN]:
         version = status["version"] if role["role"] == "learner" else role.get("version", "")
-        rates = (f"{role[rate]:.2f}" if rate in role else "" for rate in ("rollouts_per_second", "steps_per_second"))
+        rates = (
+            f"{role[rate]:.2f}" if rate in role else ""
+            for rate in ("rollouts_per_second", "steps_per_second")
+        )
         counts = (version, role.get("lag", ""), role.get("rollouts", ""), *rates)
         who = (Text(ascii(role[name])[1:70].rstrip("'")) for name in ("role", "id", "incarnation"))
         roles.add_row(*who, *map(str, counts), *([str(role.get("refused", ""))] if refused else []))
@@ -94,9 +113,11 @@ def tables(status: Mapping[str, Any]) -> Group:
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets and rollouts.
+    """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets
+    and rollouts.
 
-    The exit code is 1 if there are warnings: counters are inconsistent, or no checkpoint can be written.
+    The exit code is 1 if there are warnings: counters are inconsistent, or no checkpoint can be
+    written.
 
     Examples:
       congrasp status runs/mine --watch
@@ -116,11 +137,15 @@ class Status:
     certs: pathlib.Path | None = None
     """Folder of an observer's certificate (congrasp certs)."""
     json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected."""
+    """Print JSON instead of tables; with --watch one object a line, and null while the learner is
+    disconnected.
+    """
 
     def __call__(self) -> int:
         """Prints the status."""
-        connect, run = (self.connect, self.run) if self.run_dir is None else self._of_folder(self.run_dir)
+        connect, run = (
+            (self.connect, self.run) if self.run_dir is None else self._of_folder(self.run_dir)
+        )
         with urls.connect(connect, "observer", certs=self.certs, run=run) as transport:
             found = ask(transport, run)
             if not self.watch:
@@ -134,7 +159,10 @@ class Status:
             else:
                 with Live(tables(found), auto_refresh=False) as live:
                     for now in follow(transport, run, self.every):
-                        live.update(tables(now) if now else f"The learner of '{run}' is disconnected …", refresh=True)
+                        live.update(
+                            tables(now) if now else f"The learner of '{run}' is disconnected …",
+                            refresh=True,
+                        )
             return 1 if found["warnings"] else 0
 
     def _of_folder(self, run_dir: pathlib.Path) -> tuple[str, str]:
@@ -143,12 +171,14 @@ class Status:
 
         if (self.connect, self.run) != (LEARNER_URL, _RUN):
             raise CongraspError(
-                f"The folder {run_dir} is in place of --connect and --run.", "Give either the folder or these."
+                f"The folder {run_dir} is in place of --connect and --run.",
+                "Give either the folder or these.",
             )
         run, connect = open_run(run_dir).name, learner_url(run_dir)
         if not connect:
             raise CongraspError(
-                f"No learner is running in {run_dir}.", f"Draw its recordings with 'congrasp plot {run_dir}'."
+                f"No learner is running in {run_dir}.",
+                f"Draw its recordings with 'congrasp plot {run_dir}'.",
             )
         return connect, run
 

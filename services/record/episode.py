@@ -2,8 +2,8 @@
 
 The arm has joints, frames of the links, and their meshes with colours.
 
-Quaternions are (w, x, y, z) and rotate a link's frame into the world. T frames, N joints, A links, M meshes,
-V vertices, E triangles.
+Quaternions are (w, x, y, z) and rotate a link's frame into the world. T frames, N joints, A links,
+M meshes, V vertices, E triangles.
 """
 
 import dataclasses
@@ -40,14 +40,22 @@ def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
     """Activity of each block of the observation, by name."""
     if "goal/mask" in arrays:
         return dict(zip(_OLDER, (np.asarray(arrays["goal/mask"]) > 0).tolist(), strict=True))
-    found = {name.removeprefix("active/"): value for name, value in arrays.items() if name.startswith("active/")}
+    found = {
+        name.removeprefix("active/"): value
+        for name, value in arrays.items()
+        if name.startswith("active/")
+    }
     return {name: bool(np.asarray(value)) for name, value in found.items()}
 
 
 def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     """Names of the active constraints, weakest first; the heading is always included."""
     blocks = active_blocks(arrays)
-    return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
+    return tuple(
+        c.name
+        for c in CONSTRAINTS
+        if not c.optional or any(blocks.get(block) for block in c.blocks)
+    )
 
 
 def markers(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, Marker]]:
@@ -55,7 +63,9 @@ def markers(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, Marker]]:
     blocks = [name for name, active in active_blocks(arrays).items() if active]
     for constraint in CONSTRAINTS:
         if not constraint.optional or set(constraint.blocks) & set(blocks):
-            own = constraint.goal(*(arrays[f"goal/{constraint.name}_{field}"] for field in constraint.arrays))
+            own = constraint.goal(
+                *(arrays[f"goal/{constraint.name}_{field}"] for field in constraint.arrays)
+            )
             yield from ((constraint.name, marker) for marker in constraint.markers(own, blocks))
 
 
@@ -73,10 +83,16 @@ def grasp_span(meta: Mapping[str, Any], control_dt: float, table: np.ndarray) ->
 
 
 def phases_of(meta: Mapping[str, Any]) -> dict[str, float]:
-    """Start times of the phases of an episode or a motion (approach, grasp, lift, hold), s, without invalid times."""
+    """Start times of the phases of an episode or a motion (approach, grasp, lift, hold), s, without
+    invalid times.
+    """
     found = meta.get("phases")
     times = found.items() if isinstance(found, dict) else ()
-    return {str(name): float(time) for name, time in times if isinstance(time, int | float) and 0 <= time < _LATEST}
+    return {
+        str(name): float(time)
+        for name, time in times
+        if isinstance(time, int | float) and 0 <= time < _LATEST
+    }
 
 
 class Mesh(NamedTuple):
@@ -98,12 +114,18 @@ class MovedArm:
     name: str
     """Name of the arm."""
     joint_names: Annotated[np.ndarray, "(N,) text"]
-    joint_position: Annotated[np.ndarray, "(T, N) rad, or m of slides, in the order of arm_joint_names"]
+    joint_position: Annotated[
+        np.ndarray, "(T, N) rad, or m of slides, in the order of arm_joint_names"
+    ]
     joint_slides: Annotated[np.ndarray, "(N,) bool, whether a joint is a slide"]
-    joint_link: Annotated[np.ndarray, "(N,) the link that a joint moves; joints of one link act in this order"]
+    joint_link: Annotated[
+        np.ndarray, "(N,) the link that a joint moves; joints of one link act in this order"
+    ]
     joint_axis: Annotated[np.ndarray, "(N, 3) unit, link frame"]
     joint_anchor: Annotated[np.ndarray, "(N, 3) m, link frame"]
-    joint_limits: Annotated[np.ndarray, "(N, 2) rad or m, lower and upper; -1000 and 1000 without limits"]
+    joint_limits: Annotated[
+        np.ndarray, "(N, 2) rad or m, lower and upper; -1000 and 1000 without limits"
+    ]
     joint_speed: Annotated[np.ndarray, "(N,) rad/s or m/s, largest speed"]
     link_names: Annotated[np.ndarray, "(A,) text, the base first"]
     link_parent: Annotated[np.ndarray, "(A,) index of the link that carries it, -1 for the base"]
@@ -122,10 +144,14 @@ class MovedArm:
     def meshes(self) -> tuple[Mesh, ...]:
         """Meshes with triangles, in their order."""
         found = []
-        for m, (link, colour) in enumerate(zip(self.mesh_link.tolist(), self.mesh_colour.tolist(), strict=True)):
+        for m, (link, colour) in enumerate(
+            zip(self.mesh_link.tolist(), self.mesh_colour.tolist(), strict=True)
+        ):
             used, faces = np.unique(self.mesh_faces[self.face_mesh == m], return_inverse=True)
             if len(used):
-                found.append(Mesh(link, tuple(colour), self.mesh_vertices[used], faces.reshape(-1, 3)))
+                found.append(
+                    Mesh(link, tuple(colour), self.mesh_vertices[used], faces.reshape(-1, 3))
+                )
         return tuple(found)
 
     def at(self, frames: np.ndarray) -> "MovedArm":
@@ -134,9 +160,19 @@ class MovedArm:
 
     def recorded(self, episode: Message) -> Message:
         """Returns an episode with the arm."""
-        numbers = {f"{_FOLDER}{name}": values for name, values in self.arrays().items() if values.dtype.kind != "U"}
-        texts = {name: values.tolist() for name, values in self.arrays().items() if values.dtype.kind == "U"}
-        return Message({**episode.arrays, **numbers}, {**episode.meta, _META: {"name": self.name, **texts}})
+        numbers = {
+            f"{_FOLDER}{name}": values
+            for name, values in self.arrays().items()
+            if values.dtype.kind != "U"
+        }
+        texts = {
+            name: values.tolist()
+            for name, values in self.arrays().items()
+            if values.dtype.kind == "U"
+        }
+        return Message(
+            {**episode.arrays, **numbers}, {**episode.meta, _META: {"name": self.name, **texts}}
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns the arrays by the names that they have in files."""
@@ -144,9 +180,13 @@ class MovedArm:
 
 
 _HINTS = get_type_hints(MovedArm, include_extras=True)
-ARM_ARRAYS = {f"{_PREFIX}{name}": hint.__metadata__[0] for name, hint in _HINTS.items() if name != "name"}
+ARM_ARRAYS = {
+    f"{_PREFIX}{name}": hint.__metadata__[0] for name, hint in _HINTS.items() if name != "name"
+}
 """Meaning of each array in files, with its shape."""
-_TIMED = [name.removeprefix(_PREFIX) for name, meaning in ARM_ARRAYS.items() if meaning.startswith("(T,")]
+_TIMED = [
+    name.removeprefix(_PREFIX) for name, meaning in ARM_ARRAYS.items() if meaning.startswith("(T,")
+]
 
 
 def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm:
@@ -161,7 +201,11 @@ def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm
       ValueError, KeyError: an array is missing, or does not match its meaning.
     """
     sizes = check_arrays(
-        arrays, ARM_ARRAYS, indices=tuple(f"{_PREFIX}{name}" for name in _INDICES), largest=1e6, sizes={"T": frames}
+        arrays,
+        ARM_ARRAYS,
+        indices=tuple(f"{_PREFIX}{name}" for name in _INDICES),
+        largest=1e6,
+        sizes={"T": frames},
     )
     arm = MovedArm(name, **{key.removeprefix(_PREFIX): arrays[key] for key in ARM_ARRAYS})
     for key, letter in _INDICES.items():
@@ -184,7 +228,10 @@ def arm_of_episode(episode: Message) -> MovedArm | None:
     try:
         texts = dict(episode.meta[_META])
         name = str(texts.pop("name"))
-        own = {key: np.array(value) for key, value in episode.arrays.items() if key.startswith(_FOLDER)}  # writable
+        # Writable
+        own = {
+            key: np.array(value) for key, value in episode.arrays.items() if key.startswith(_FOLDER)
+        }
         arrays = {key.removeprefix(_FOLDER): value for key, value in own.items()}
         arrays |= {key: np.array(value, str) for key, value in texts.items()}
         return arm_of(name, arrays, len(episode.arrays["table"]))

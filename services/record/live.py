@@ -22,8 +22,16 @@ from congrasp.services.record.writer import Channel, Entry
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
 _APP = "foxglove.dev"
 """Domain of the app in a browser."""
-_HEAD, _HEAD_SECONDS = 16 << 10, 10.0  # bytes of a request's head, and the time in which it must arrive
-_BACKLOG, _BYTES = 20000, 256 << 20  # entries queued for their time; the newest beyond this are dropped
+# Bytes of a request's head, and the time in which it must arrive
+_HEAD, _HEAD_SECONDS = (
+    16 << 10,
+    10.0,
+)
+# Entries queued for their time; the newest beyond this are dropped
+_BACKLOG, _BYTES = (
+    20000,
+    256 << 20,
+)
 _TOPICS = 4096  # open channels; beyond this the one that was silent for longest is closed
 _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 
@@ -31,12 +39,13 @@ _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 class LiveServer(Closing):
     """A WebSocket server; a sink of `services.record.recorder.Recorder`.
 
-    An episode arrives as a whole after its end; its entries are sent at their times, so that the viewer plays it. A
-    late subscriber receives the last message of latched channels.
+    An episode arrives as a whole after its end; its entries are sent at their times, so that the
+    viewer plays it. A late subscriber receives the last message of latched channels.
     """
 
     def __init__(self, port: int):
-        """Listens on the loopback interface: programs of this machine and the Foxglove app can watch the run.
+        """Listens on the loopback interface: programs of this machine and the Foxglove app can
+        watch the run.
 
         Args:
           port: TCP port; 0 uses a free one (see `port`).
@@ -64,11 +73,17 @@ class LiveServer(Closing):
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 live._incoming.put(channel.topic)
 
-        # Behind the gate, at an address of the loopback interface that other sites in a browser do not know.
-        inside = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
+        # Behind the gate, at an address of the loopback interface that other sites in a browser do
+        # not know.
+        inside = (
+            f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}."
+            f"{secrets.randbelow(254) + 1}"
+        )
         inside = inside if sys.platform == "linux" else _HOST
         with os_errors_as(
-            f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live.", PORT_ERRORS
+            f"The live view cannot listen on {_HOST}:{port}",
+            "Pass another port with --live.",
+            PORT_ERRORS,
         ):
             outside = socket.create_server((_HOST, port))
         self._server = foxglove.start_server(
@@ -146,7 +161,9 @@ class LiveServer(Closing):
             self._topics.pop(channel.topic)[1].close()
         elif len(self._topics) >= _TOPICS:
             self._topics.popitem(last=False)[1][1].close()
-        schema = self._sdk.Schema(name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema)
+        schema = self._sdk.Schema(
+            name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema
+        )
         opened = self._sdk.Channel(
             channel.topic, schema=schema, message_encoding=channel.encoding, context=self._context
         )
@@ -154,7 +171,9 @@ class LiveServer(Closing):
 
 
 class _Gate:
-    """Passes connections on to the server of the SDK, which answers any site that a browser shows."""
+    """Passes connections on to the server of the SDK, which answers any site that a browser
+    shows.
+    """
 
     def __init__(self, outside: socket.socket, inside: tuple[str, int]):
         """Accepts connections of a listening socket, for the server at an address."""
@@ -184,12 +203,16 @@ class _Gate:
         """Passes on the connection of an allowed client, and answers others with the reason."""
         with (
             contextlib.closing(writer),
-            contextlib.suppress(OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.CancelledError),
+            contextlib.suppress(
+                OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.CancelledError
+            ),
         ):
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
             if fault := _fault(head.decode("latin-1")):
                 body = f"{fault}\n".encode()
-                writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body))
+                writer.write(
+                    b"HTTP/1.1 403 Forbidden\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body)
+                )
                 await writer.drain()
                 return
             to_reader, to_writer = await asyncio.open_connection(*self._inside)
@@ -209,15 +232,22 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 def _fault(head: str) -> str:
     """Reason why a request is refused; empty if it comes from this machine or from the app.
 
-    A site's name may resolve to this machine (DNS rebinding), so Host must name the loopback interface; a browser sends
-    the site as Origin.
+    A site's name may resolve to this machine (DNS rebinding), so Host must name the loopback
+    interface; a browser sends the site as Origin.
     """
     fields = (line.partition(":") for line in head.split("\r\n")[1:])
     headers = {name.strip().lower(): value.strip() for name, _, value in fields}
     host, origin = headers.get("host", ""), headers.get("origin", "file://")
     if re.sub(r":\d*$", "", host).strip("[]") not in _LOOPBACK:
-        return "The live view answers only under a name of the loopback interface: open ws://127.0.0.1 with its port."
+        return (
+            "The live view answers only under a name of the loopback interface: open "
+            "ws://127.0.0.1 with its port."
+        )
     site = urllib.parse.urlsplit(origin)
     name = site.hostname or ""
-    own = site.scheme not in ("", "http", "https") or name in _LOOPBACK or f".{name}".endswith(f".{_APP}")
+    own = (
+        site.scheme not in ("", "http", "https")
+        or name in _LOOPBACK
+        or f".{name}".endswith(f".{_APP}")
+    )
     return "" if own else "Another site asked for the live view: open it in the Foxglove app."

@@ -1,6 +1,8 @@
-"""Colours of hand, object and constraints in every picture, recording and export: red, green, blue from 0 to 1.
+"""Colours of hand, object and constraints in every picture, recording and export: red, green, blue
+from 0 to 1.
 
-Meshes with the colours of an object are subdivided finely enough for vertex colours to show a texture.
+Meshes with the colours of an object are subdivided finely enough for vertex colours to show a
+texture.
 """
 
 import functools
@@ -17,7 +19,13 @@ SKIN: Colour = (0.70, 0.73, 0.79)
 FLESH: Colour = (0.86, 0.65, 0.54)
 JOINT: Colour = (0.30, 0.32, 0.37)
 """Colour of robots' joints."""
-MATERIALS = {"flesh": FLESH, "nail": (0.94, 0.77, 0.70), "sleeve": (0.22, 0.28, 0.38), "link": SKIN, "joint": JOINT}
+MATERIALS = {
+    "flesh": FLESH,
+    "nail": (0.94, 0.77, 0.70),
+    "sleeve": (0.22, 0.28, 0.38),
+    "link": SKIN,
+    "joint": JOINT,
+}
 """Colours of the materials in `common.hands.skin.MATERIALS`."""
 OBJECT: Colour = (0.95, 0.62, 0.24)
 TABLE: Colour = (0.80, 0.79, 0.77)
@@ -59,16 +67,24 @@ def finer(
       Vertices (V', 3) float32 and faces (F', 3) int32.
     """
     corners = np.asarray(vertices, float)[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+        ).sum()
+        / 2
+    )
     longest = max(edge, 2.2 * float(np.sqrt(area / most)))
     if len(faces) >= most:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
-    points, found = np.unique(bisected(corners, longest, most).reshape(-1, 3), axis=0, return_inverse=True)
+    points, found = np.unique(
+        bisected(corners, longest, most).reshape(-1, 3), axis=0, return_inverse=True
+    )
     return points.astype(np.float32), found.reshape(-1, 3).astype(np.int32)
 
 
 def bisected(corners: np.ndarray, longest: float, most: float = np.inf) -> np.ndarray:
-    """Bisects triangles at their longest sides until no side is longer than `longest`, or there are `most` triangles.
+    """Bisects triangles at their longest sides until no side is longer than `longest`, or there are
+    `most` triangles.
 
     Args:
       corners: (F, 3, C) positions of the corners, m, and further values, which are interpolated.
@@ -84,17 +100,26 @@ def bisected(corners: np.ndarray, longest: float, most: float = np.inf) -> np.nd
         first = (sides[cut].argmax(1)[:, None] + np.arange(3)) % 3
         start, end, across = np.take_along_axis(corners[cut], first[..., None], 1).swapaxes(0, 1)
         middle = (start + end) / 2
-        corners = np.concatenate([np.stack([start, middle, across], 1), np.stack([middle, end, across], 1)])
+        corners = np.concatenate(
+            [np.stack([start, middle, across], 1), np.stack([middle, end, across], 1)]
+        )
         count += len(cut)
     return np.concatenate([*small, corners])
 
 
-def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def painted(
+    vertices: np.ndarray, faces: np.ndarray, colours: Colours
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB (`colours_at`).
 
     Results of the last few objects are cached; the arrays are read-only.
     """
-    kinds = (vertices, float), (faces, np.int64), (colours.points, float), (colours.values, np.uint8)
+    kinds = (
+        (vertices, float),
+        (faces, np.int64),
+        (colours.points, float),
+        (colours.values, np.uint8),
+    )
     return _painted(*(np.asarray(array, kind).tobytes() for array, kind in kinds))
 
 
@@ -102,7 +127,9 @@ def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[
 def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`painted` by the content of its arrays, as a cache key."""
     kinds = float, np.int64, float, np.uint8
-    corners, faces, *own = (np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True))
+    corners, faces, *own = (
+        np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True)
+    )
     vertices, faces = finer(corners, faces, _OWN_EDGE, _OWN_MOST_FACES)
     found = vertices, faces, colours_at(vertices, Colours(*own))
     for array in found:
@@ -111,12 +138,17 @@ def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def region_colours(points: np.ndarray, avoid: np.ndarray) -> Colours:
-    """Colours of surface points (P, 3), m, in the avoid region (P,) bool or the graspable region."""
-    return Colours(points, np.round(255 * np.where(avoid[:, None], AVOID, GRASPABLE)).astype(np.uint8))
+    """Colours of surface points (P, 3), m, in the avoid region (P,) bool or the graspable
+    region.
+    """
+    return Colours(
+        points, np.round(255 * np.where(avoid[:, None], AVOID, GRASPABLE)).astype(np.uint8)
+    )
 
 
 def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
-    """(n, 3) uint8 sRGB at points (n, 3) of a surface: means of the nearest known points, by their distances.
+    """(n, 3) uint8 sRGB at points (n, 3) of a surface: means of the nearest known points, by their
+    distances.
 
     The single nearest one would give edges between two colours teeth.
     """

@@ -1,8 +1,10 @@
-"""Reads recordings, complete, cut off or damaged: a killed writer's file is readable up to its last flush.
+"""Reads recordings, complete, cut off or damaged: a killed writer's file is readable up to its last
+flush.
 
 Damaged chunks of an MCAP file are dropped and counted, later ones are read. The layout is that of
-https://mcap.dev/spec: records of an opcode (1 byte), a length (8) and content. A chunk's content has a CRC-32 of its
-uncompressed records. After an invalid record, reading resumes at the next Zstandard chunk.
+https://mcap.dev/spec: records of an opcode (1 byte), a length (8) and content. A chunk's content
+has a CRC-32 of its uncompressed records. After an invalid record, reading resumes at the next
+Zstandard chunk.
 """
 
 import collections
@@ -37,7 +39,8 @@ DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError,
 """Exceptions of the `mcap` package on damaged files."""
 _FRAME = struct.Struct("<BQ")
 _ZSTD = b"\x04\x00\x00\x00zstd"
-_ZSTD_AT = _FRAME.size + 28  # in a chunk's record; times, size and CRC precede it, the data's length follows
+# In a chunk's record; times, size and CRC precede it, the data's length follows
+_ZSTD_AT = _FRAME.size + 28
 _HEAD = _ZSTD_AT + len(_ZSTD) + 8
 _FOOTER, _CRC = struct.Struct("<QQI"), struct.Struct("<I")
 _LIMIT = 512 << 20  # limit of a record, and of an inflated chunk, bytes
@@ -64,10 +67,15 @@ class Dropped:
         more = ", …" if len(self.places) > _PLACES else ""
         where = ", ".join(map(str, self.places[:_PLACES])) + more
         at = f", at byte {where}" if where else ""
-        return f"damaged in {len(self.places)} place(s){at}; at least {self.messages} message(s) were dropped"
+        return (
+            f"damaged in {len(self.places)} place(s){at}; at least {self.messages} message(s) were "
+            f"dropped"
+        )
 
 
-def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | None, Channel, McapMessage]]:
+def read_messages(  # noqa: C901
+    file: BinaryIO, dropped: Dropped
+) -> Iterator[tuple[Schema | None, Channel, McapMessage]]:
     """Yields messages with their channels, in the order of writing.
 
     Args:
@@ -81,7 +89,9 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
     while position < size:
         opcode, records, end = _record_at(file, position, size)
         chunked |= opcode == Opcode.CHUNK
-        if opcode == Opcode.MESSAGE and chunked:  # not covered by a checksum: another record with a damaged opcode
+        if (
+            opcode == Opcode.MESSAGE and chunked
+        ):  # not covered by a checksum: another record with a damaged opcode
             records = None
         if records is None:
             found = end if end is not None else _next_chunk(file, position + 1, size)
@@ -116,7 +126,9 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
         position = end
 
 
-def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[McapRecord] | None, int | None]:
+def _record_at(
+    file: BinaryIO, position: int, size: int
+) -> tuple[int, list[McapRecord] | None, int | None]:
     """Returns a record's opcode, its records (None if damaged), and its end (None if unknown)."""
     head = _read(file, position, _HEAD)
     if head == MCAP0_MAGIC and position + len(head) == size:
@@ -129,7 +141,9 @@ def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[Mcap
         # Opcode and length, which no checksum covers, are not needed if the rest is consistent.
         inner = position + _HEAD + int.from_bytes(head[-8:], "little")
         for each in (inner, end):
-            if each <= min(size, position + _LIMIT) and (records := _chunk(_read(file, position, each - position))):
+            if each <= min(size, position + _LIMIT) and (
+                records := _chunk(_read(file, position, each - position))
+            ):
                 return Opcode.CHUNK, records, each
         return Opcode.CHUNK, None, end if inner == end <= size else None
     if not Opcode.HEADER <= opcode <= Opcode.DATA_END or end > min(size, position + _LIMIT):
@@ -150,7 +164,10 @@ def _chunk(whole: bytes) -> list[McapRecord] | None:
     try:
         chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[_FRAME.size :])))
         compressed = chunk.compression == "zstd"
-        if compressed and max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data)) > _LIMIT:
+        if (
+            compressed
+            and max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data)) > _LIMIT
+        ):
             return None
         return breakup_chunk(chunk, validate_crc=True)
     except DAMAGE:
@@ -169,7 +186,9 @@ def _parse(opcode: int, content: bytes) -> list[McapRecord] | None:
 
 
 def _next_chunk(file: BinaryIO, start: int, end: int) -> int | None:
-    """Returns the start of the next Zstandard chunk with consistent lengths; None if there is none before `end`."""
+    """Returns the start of the next Zstandard chunk with consistent lengths; None if there is none
+    before `end`.
+    """
     first = start
     while start < end:
         block = _read(file, start, min(_BLOCK, end - start))
@@ -191,16 +210,22 @@ def _is_cut(file: BinaryIO, position: int, size: int) -> bool:
     if len(head) < _FRAME.size:
         return True
     opcode, length = _FRAME.unpack(head)
-    return bool(Opcode.HEADER <= opcode <= Opcode.DATA_END) and position + _FRAME.size + length > size
+    return (
+        bool(Opcode.HEADER <= opcode <= Opcode.DATA_END) and position + _FRAME.size + length > size
+    )
 
 
 def intact_summary(file: BinaryIO) -> Summary | None:
-    """Returns the summary at the end of a finished file; None if it is missing or does not match its checksum."""
+    """Returns the summary at the end of a finished file; None if it is missing or does not match
+    its checksum.
+    """
     end = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
     try:
         start, _, crc = _FOOTER.unpack_from(_read(file, max(0, end), FOOTER_SIZE), _FRAME.size)
         # The checksum covers the summary and the footer up to the checksum itself.
-        covered = _read(file, start, end + FOOTER_SIZE - _CRC.size - start) if 0 < start < end else b""
+        covered = (
+            _read(file, start, end + FOOTER_SIZE - _CRC.size - start) if 0 < start < end else b""
+        )
         file.seek(0)
         return make_reader(file).get_summary() if covered and zlib.crc32(covered) == crc else None
     except DAMAGE:
@@ -225,23 +250,32 @@ class Record(NamedTuple):
 
 
 def log_files(path: pathlib.Path) -> list[pathlib.Path]:
-    """The recordings at `path`, a file or a folder (with those below it), in the order of their names.
+    """The recordings at `path`, a file or a folder (with those below it), in the order of their
+    names.
 
     Raises:
       CongraspError: there are no recordings.
     """
     if not path.exists():
-        raise CongraspError(f"There is no file or folder {path}.", "Pass a run's folder or an MCAP file.")
+        raise CongraspError(
+            f"There is no file or folder {path}.", "Pass a run's folder or an MCAP file."
+        )
     if path.is_file():
         return [path]
-    found = sorted([*path.rglob("*.mcap"), *path.rglob(f"*.mcap{PART}")], key=lambda file: (file.name, file))
+    found = sorted(
+        [*path.rglob("*.mcap"), *path.rglob(f"*.mcap{PART}")], key=lambda file: (file.name, file)
+    )
     if not found:
-        raise CongraspError(f"There is no recording (*.mcap) in {path}.", "Pass a run's folder or an MCAP file.")
+        raise CongraspError(
+            f"There is no recording (*.mcap) in {path}.", "Pass a run's folder or an MCAP file."
+        )
     return found
 
 
 def read_records(
-    path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True, warn: Callable[[str], None] = _log.warning
+    path: pathlib.Path,
+    wanted: Callable[[str], bool] = lambda topic: True,
+    warn: Callable[[str], None] = _log.warning,
 ) -> Iterator[Record]:
     """Yields the messages of one file in the order of writing, as far as the file is intact.
 
@@ -257,11 +291,15 @@ def read_records(
     with os_errors_as(f"{path} cannot be read"), open_file(path) as file:
         start = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(start):
-            raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
+            raise CongraspError(
+                f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'."
+            )
         for schema, channel, message in read_messages(file, dropped):
             if wanted(channel.topic):
                 name = schema.name if schema else ""
-                yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
+                yield Record(
+                    channel.topic, name, channel.message_encoding, message.log_time, message.data
+                )
     if text := str(dropped):
         warn(f"{path} is {text}.")
 
@@ -275,8 +313,9 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
     """Reads every metric of a run's recordings, by `<role>/<name>/<metric>`.
 
     Returns:
-      For each metric its steps (n,), rising (updates, else versions, else seconds since the first message), and values
-      (n,). If a run was resumed from a checkpoint, the later value of a step is used.
+      For each metric its steps (n,), rising (updates, else versions, else seconds since the first
+      message), and values (n,). If a run was resumed from a checkpoint, the later value of a step
+      is used.
     """
     series: dict[str, dict[float, float]] = collections.defaultdict(dict)
     first: int | None = None
@@ -294,21 +333,27 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def metrics_of(record: Record) -> dict[str, Any]:
-    """Returns the object of a record of metrics: `values` {name: number, or a group}, and further numbers.
+    """Returns the object of a record of metrics: `values` {name: number, or a group}, and further
+    numbers.
 
     Raises:
       CongraspError: the record is not valid.
     """
     found = parse_json(record.data, f"A record of {ascii(record.topic)[:100]}")
     values = found.get("values") if isinstance(found, dict) else None
-    steps = [found.get(name, 0) for name in ("update", "version")] if isinstance(found, dict) else []
-    if not isinstance(values, dict) or not all(isinstance(n, int | float) for n in [*flatten(values).values(), *steps]):
+    steps = (
+        [found.get(name, 0) for name in ("update", "version")] if isinstance(found, dict) else []
+    )
+    if not isinstance(values, dict) or not all(
+        isinstance(n, int | float) for n in [*flatten(values).values(), *steps]
+    ):
         raise CongraspError(f"A record of {ascii(record.topic)[:100]} has no metrics.")
     return found
 
 
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
-    """Yields the recorded episodes at `path`, a file or a folder, as sent by the actors, in the order of recording.
+    """Yields the recorded episodes at `path`, a file or a folder, as sent by the actors, in the
+    order of recording.
 
     Raises:
       CongraspError: an episode is not valid.
@@ -346,7 +391,8 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Me
 
 
 def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
-    """Yields the recorded rollouts at `path`, a file or a folder, as sent by the actors, in the order of recording.
+    """Yields the recorded rollouts at `path`, a file or a folder, as sent by the actors, in the
+    order of recording.
 
     Axes are (T, B, ...); `meta["layout"]` lists the blocks of an observation with their sizes.
     """

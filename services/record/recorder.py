@@ -1,11 +1,12 @@
-"""Records the messages that a run publishes under `log/**`, in a separate thread, without blocking the run.
+"""Records the messages that a run publishes under `log/**`, in a separate thread, without blocking
+the run.
 
-Kinds of `congrasp/<run>/log/<kind>/<role>/<name>`: `metrics` (meta: time, update or version, values), `event` (time,
-level, text), `version` (any scalars), `rollout` (some worlds of an actor's rollout, opaque) and `episode` (see
-`services.record.scene`).
+Kinds of `congrasp/<run>/log/<kind>/<role>/<name>`: `metrics` (meta: time, update or version,
+values), `event` (time, level, text), `version` (any scalars), `rollout` (some worlds of an actor's
+rollout, opaque) and `episode` (see `services.record.scene`).
 
-Sinks take the recorder's entries: MCAP files, live viewers and, for the metrics of learners, TensorBoard and Weights &
-Biases.
+Sinks take the recorder's entries: MCAP files, live viewers and, for the metrics of learners,
+TensorBoard and Weights & Biases.
 """
 
 import collections
@@ -49,12 +50,22 @@ Name = tuple[str, str]
 _NAMES = 64  # names of one identity
 _IDENTITIES = 1024
 _IDLE = 60.0  # seconds after which a silent name may be replaced
-_PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes per second of an identity's entries, and their burst
+# Bytes per second of an identity's entries, and their burst
+_PER_SECOND, _MOST = (
+    16 << 20,
+    256 << 20,
+)
 _AHEAD = 60_000_000_000
 """Longest queue of an actor's episodes in ns; later ones are dropped."""
 _TIMES = 2**62
 """Limit of times, ns since 1970."""
-_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
+_LEVELS = {
+    "debug": Log.DEBUG,
+    "info": Log.INFO,
+    "warning": Log.WARNING,
+    "error": Log.ERROR,
+    "fatal": Log.FATAL,
+}
 FLUSH_SECONDS = 0.5
 """Seconds between two flushes; a killed recorder loses no more than these."""
 _TOPIC = "/metrics/learner/"
@@ -63,11 +74,13 @@ _TOPIC = "/metrics/learner/"
 class LogBudget:
     """Budgets of the logs of one identity: number of names, and bytes per second. Not thread-safe.
 
-    An identity is a role and, for actors, a certificate. The excess over a budget is dropped; the logs of others are
-    not affected.
+    An identity is a role and, for actors, a certificate. The excess over a budget is dropped; the
+    logs of others are not affected.
     """
 
-    def __init__(self, on_forget: Callable[[Name], None], clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self, on_forget: Callable[[Name], None], clock: Callable[[], float] = time.monotonic
+    ):
         """Starts without names.
 
         Args:
@@ -97,7 +110,9 @@ class LogBudget:
         heard[who] = now
         heard.move_to_end(who)
         if self._level(identity, now) <= 0:
-            raise CongraspError(f"One certificate publishes more than {_PER_SECOND >> 20} MiB of logs a second.")
+            raise CongraspError(
+                f"One certificate publishes more than {_PER_SECOND >> 20} MiB of logs a second."
+            )
 
     def charge(self, who: Name, size: int) -> None:
         """Charges a publisher for recorded bytes."""
@@ -115,7 +130,8 @@ def _identity(who: Name) -> Name:
 
 
 class Converter:
-    """State across messages: fields of schemas, slots of actors, and the end of each actor's episode.
+    """State across messages: fields of schemas, slots of actors, and the end of each actor's
+    episode.
 
     All of it is bounded, separately for every identity (`LogBudget`).
     """
@@ -141,7 +157,9 @@ class Converter:
         Raises:
           CongraspError: it is not a valid log message, or exceeds its sender's budget.
         """
-        if now < self._now:  # the clock was set back: what is still playing keeps its remaining time
+        if (
+            now < self._now
+        ):  # the clock was set back: what is still playing keeps its remaining time
             self._ends = {name: end - (self._now - now) for name, end in self._ends.items()}
         self._now = now
         *_, kind, role, name = ("", "", *key.split("/"))
@@ -150,16 +168,24 @@ class Converter:
         who = check_name("role", role), check_name("role", name)
         self._budget.admit(who)
         try:
-            entries = list(self._kinds[kind](role, name, Message(message.arrays, finite(message.meta)), now))
+            entries = list(
+                self._kinds[kind](role, name, Message(message.arrays, finite(message.meta)), now)
+            )
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise CongraspError(f"It is not a valid {kind} message ({type(error).__name__}).") from None
+            raise CongraspError(
+                f"It is not a valid {kind} message ({type(error).__name__})."
+            ) from None
         self._budget.charge(who, sum(len(entry.data) for entry in entries))
         return entries
 
     def _forget(self, who: Name) -> None:
         """Drops the state of a silent publisher."""
         role, name = who
-        for topic in (f"/metrics/{role}/{name}", f"/version/{role}/{name}", f"/episode/{name}/signals"):
+        for topic in (
+            f"/metrics/{role}/{name}",
+            f"/version/{role}/{name}",
+            f"/episode/{name}/signals",
+        ):
             self._json.forget(topic)
         self._slots.pop(name, None)
         self._ends.pop(name, None)
@@ -168,7 +194,9 @@ class Converter:
         """Yields the numbers of an update or a rollout."""
         validate(_timed(message, now), METRICS)
         values = {check_field(key): float(value) for key, value in message.meta["values"].items()}
-        yield self._json.entry(f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)})
+        yield self._json.entry(
+            f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)}
+        )
 
     def _version(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
         """Yields a published version."""
@@ -192,9 +220,13 @@ class Converter:
         # An episode that arrives while the previous one is playing waits for its end.
         start = max(now, self._ends.get(name, 0))
         if start > now + _AHEAD:
-            raise CongraspError(f"The previous episodes are still playing for {(start - now) / 1e9:.0f} s.")
+            raise CongraspError(
+                f"The previous episodes are still playing for {(start - now) / 1e9:.0f} s."
+            )
         taken = set(self._slots.values())
-        slot = self._slots.setdefault(name, next(i for i in range(len(taken) + 1) if i not in taken))
+        slot = self._slots.setdefault(
+            name, next(i for i in range(len(taken) + 1) if i not in taken)
+        )
         yield from episode_entries(name, message, start, slot, self._json)
         self._ends[name] = start + duration(message)
 
@@ -229,7 +261,7 @@ class Recorder(Closing):
       error: reason why recording stopped; empty while it continues.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         transport: Transport,
         run: str,
@@ -239,7 +271,9 @@ class Recorder(Closing):
         sinks: Sequence[Sink] = (),
         depth: int = 512,
         max_seconds: float = 600.0,
-        warn: Callable[[str], None] = lambda text: print(f"congrasp: {text}", file=sys.stderr, flush=True),
+        warn: Callable[[str], None] = lambda text: print(
+            f"congrasp: {text}", file=sys.stderr, flush=True
+        ),
     ):
         """Subscribes; `start` begins writing.
 
@@ -249,12 +283,14 @@ class Recorder(Closing):
           directory: folder for the files; None only serves the sinks.
           name: prefix of the files' names.
           sinks: additional receivers of every entry.
-          depth: messages buffered if they arrive faster than they are written; beyond it the oldest are dropped.
-          max_seconds: see `LogWriter`.
+          depth: messages buffered if they arrive faster than they are written; beyond it the oldest
+          are dropped. max_seconds: see `LogWriter`.
           warn: called with one line for each problem.
         """
         begin = file_name(name, "a recording")
-        self._writer = LogWriter(directory, begin, run=run, max_seconds=max_seconds) if directory else None
+        self._writer = (
+            LogWriter(directory, begin, run=run, max_seconds=max_seconds) if directory else None
+        )
         self._subscription = transport.subscribe(Keys(run).logs, depth=depth)
         self._sinks, self._warn = tuple(sinks), warn
         self._convert = Converter()
@@ -265,7 +301,9 @@ class Recorder(Closing):
 
     @property
     def dropped(self) -> int:
-        """Number of messages lost in transit, or because they arrived faster than they could be written."""
+        """Number of messages lost in transit, or because they arrived faster than they could be
+        written.
+        """
         return self._subscription.dropped
 
     @property
@@ -279,7 +317,9 @@ class Recorder(Closing):
         return self
 
     def close(self, timeout: float = 5.0) -> None:
-        """Writes received messages, finishes the file and ends the thread, within `timeout` seconds."""
+        """Writes received messages, finishes the file and ends the thread, within `timeout`
+        seconds.
+        """
         self._deadline = time.monotonic() + 0.8 * timeout
         self._stop.set()
         if self._thread.ident is not None:
@@ -328,11 +368,14 @@ class Recorder(Closing):
             action(self._writer)
         except Exception as error:
             reason = (
-                error.strerror if isinstance(error, OSError) and error.strerror else f"{type(error).__name__}: {error}"
+                error.strerror
+                if isinstance(error, OSError) and error.strerror
+                else f"{type(error).__name__}: {error}"
             )
             where = self._writer.files[-1] if self._writer.files else "the first file"
             self.error = (
-                f"Recording stopped, because {where} could not be written ({reason}). Earlier messages are kept, "
+                f"Recording stopped, because {where} could not be written ({reason}). Earlier "
+                f"messages are kept, "
                 "and the run continues."
             )
             self._writer.abandon()
@@ -340,7 +383,9 @@ class Recorder(Closing):
 
 
 class MetricWriters:
-    """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not used again."""
+    """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not
+    used again.
+    """
 
     def __init__(self, writers: Mapping[str, "_TensorBoard | _WeightsAndBiases"]):
         """Creates a sink with writers by name."""
@@ -367,13 +412,16 @@ class MetricWriters:
             except Exception as error:  # a failed writer must not end the training
                 del self._writers[name]
                 text = (
-                    f"congrasp: {name} receives no more metrics ({type(error).__name__}: {error}); the run continues."
+                    f"congrasp: {name} receives no more metrics ({type(error).__name__}: {error}); "
+                    f"the run continues."
                 )
                 print(text, file=sys.stderr, flush=True)
 
 
 class _TensorBoard:
-    """Event files, one folder per learner; written synchronously, so that there is no thread to wait for."""
+    """Event files, one folder per learner; written synchronously, so that there is no thread to
+    wait for.
+    """
 
     def __init__(self, folder: pathlib.Path):
         self._folder = folder
@@ -388,8 +436,12 @@ class _TensorBoard:
         if file is None:
             file = self._files[learner] = self._begin(learner)
             # A resumed run repeats steps: TensorBoard purges those of an earlier file from here on.
-            file.write_event(Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START)))
-        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
+            file.write_event(
+                Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START))
+            )
+        summary = Summary(
+            value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        )
         file.write_event(Event(wall_time=seconds, step=step, summary=summary))
         file.flush()
 
@@ -407,7 +459,9 @@ class _TensorBoard:
 
 
 class _WeightsAndBiases:
-    """A run of Weights & Biases; offline it is stored in the run's folder and uploaded with `wandb sync`."""
+    """A run of Weights & Biases; offline it is stored in the run's folder and uploaded with `wandb
+    sync`.
+    """
 
     def __init__(self, folder: pathlib.Path, run: str, config: Mapping[str, Any], *, offline: bool):
         import wandb
@@ -427,7 +481,9 @@ class _WeightsAndBiases:
     def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
         """Writes the scalars of an update."""
         prefix = "" if learner == "0" else f"learner-{learner}/"
-        self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
+        self._run.log(
+            {**{f"{prefix}{name}": value for name, value in values.items()}, "update": step}
+        )
 
     def close(self) -> None:
         """Finishes."""
@@ -439,15 +495,19 @@ class _WeightsAndBiases:
 
 @contextlib.contextmanager
 def recorded(
-    transport: Transport, config: RunConfig, run_dir: pathlib.Path, logs: pathlib.Path, names: Sequence[MetricWriter]
+    transport: Transport,
+    config: RunConfig,
+    run_dir: pathlib.Path,
+    logs: pathlib.Path,
+    names: Sequence[MetricWriter],
 ) -> Iterator[Recorder]:
     """Context that records a run, and passes its metrics to writers.
 
     Args:
       transport: an endpoint of the run.
       config: the run's configuration.
-      run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
-      logs: folder of the recordings.
+      run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights &
+      Biases to `wandb`. logs: folder of the recordings.
       names: names of the writers.
 
     Raises:
@@ -459,7 +519,12 @@ def recorded(
             writers[name] = _TensorBoard(run_dir / name)
         else:
             offline = name == "wandb-offline"
-            writers[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
+            writers[name] = _WeightsAndBiases(
+                run_dir, config.name, dataclasses.asdict(config), offline=offline
+            )
     combined = MetricWriters(writers)
-    with contextlib.closing(combined), Recorder(transport, config.name, logs, sinks=[combined]) as recorder:
+    with (
+        contextlib.closing(combined),
+        Recorder(transport, config.name, logs, sinks=[combined]) as recorder,
+    ):
         yield recorder

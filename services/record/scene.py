@@ -1,7 +1,8 @@
-"""An episode as a 3-D scene: link frames, the hand's surface, object, constraints, contacts and signals, step by step.
+"""An episode as a 3-D scene: link frames, the hand's surface, object, constraints, contacts and
+signals, step by step.
 
-Each actor has a separate frame in a row under `world`. Constant parts of an episode are sent once, at its start; link
-frames, contacts and signals follow at each control step.
+Each actor has a separate frame in a row under `world`. Constant parts of an episode are sent once,
+at its start; link frames, contacts and signals follow at each control step.
 """
 
 import contextlib
@@ -47,7 +48,13 @@ from congrasp.services.record.palette import (
     colours_at,
 )
 from congrasp.services.record.palette import MATERIALS as COLOURS
-from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel, protobuf_channel
+from congrasp.services.record.writer import (
+    Entry,
+    JsonChannels,
+    LogWriter,
+    opaque_channel,
+    protobuf_channel,
+)
 
 _OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
 _MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
@@ -67,11 +74,12 @@ class Part(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
-    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is sent once.
+    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is
+    sent once.
 
-    A human hand's skin deforms, but its points at every step would make a recording many times as large. A triangle of
-    skin therefore belongs to every link with a noticeable weight on it, so that the parts of two links overlap at a
-    bent joint.
+    A human hand's skin deforms, but its points at every step would make a recording many times as
+    large. A triangle of skin therefore belongs to every link with a noticeable weight on it, so
+    that the parts of two links overlap at a bent joint.
     """
     skin = _skin(hand)
     strongest = np.eye(len(hand.links), dtype=bool)[skin.weights[skin.faces].sum(1).argmax(-1)]
@@ -90,7 +98,9 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
 
 @functools.lru_cache(maxsize=16)
 def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Points (n, 3) on the parts of each link, in its frame, and their colours (n, 3), for viewers without meshes."""
+    """Points (n, 3) on the parts of each link, in its frame, and their colours (n, 3), for viewers
+    without meshes.
+    """
     parts = surface_parts(hand)
     area = sum(_mesh(part).area for own in parts for part in own)
     found = []
@@ -98,7 +108,9 @@ def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         points, colours = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for part in own:
             mesh = _mesh(part)
-            points.append(trimesh.sample.sample_surface(mesh, round(_POINTS * mesh.area / area), seed=0)[0])
+            points.append(
+                trimesh.sample.sample_surface(mesh, round(_POINTS * mesh.area / area), seed=0)[0]
+            )
             colours.append(np.tile(part.colour, (len(points[-1]), 1)))
         found.append((np.concatenate(points), np.concatenate(colours)))
     return tuple(found)
@@ -112,7 +124,9 @@ def _skin(hand: Hand) -> Skin:
 
 
 def _light(corners: np.ndarray, kept: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate points."""
+    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate
+    points.
+    """
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     if kept < 1.0:
         mesh = mesh.simplify_quadric_decimation(face_count=max(4, int(kept * len(mesh.faces))))
@@ -147,7 +161,8 @@ def check_episode(episode: Message) -> None:
     """Validates an episode from an untrusted peer.
 
     Raises:
-      CongraspError: the episode is invalid; the text names the array or the entry, and the violated rule.
+      CongraspError: the episode is invalid; the text names the array or the entry, and the violated
+      rule.
     """
     hand = known_hand(episode.meta.get("hand"))
     sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))
@@ -163,8 +178,12 @@ def check_episode(episode: Message) -> None:
         raise CongraspError("The episode has colour_points without colour_values, or the reverse.")
     for name in ("visual_vertices", "colour_points"):
         if np.abs(episode.arrays.get(name, 0.0)).max() > LARGEST:
-            raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's centre.")
-    if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
+            raise CongraspError(
+                f"The episode's {name} are more than {LARGEST:g} m from the object's centre."
+            )
+    if any(
+        array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")
+    ):
         raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
     arm_of_episode(episode)
     if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
@@ -184,7 +203,9 @@ def save_episode(path: pathlib.Path, actor: str, episode: Message) -> None:
         writer.files[-1].rename(path)
 
 
-def episode_entries(actor: str, episode: Message, start: int, slot: int, channels: JsonChannels) -> Iterator[Entry]:
+def episode_entries(
+    actor: str, episode: Message, start: int, slot: int, channels: JsonChannels
+) -> Iterator[Entry]:
     """Yields all entries of a recorder for one episode.
 
     Args:
@@ -202,7 +223,12 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     hand, arm = known_hand(episode.meta["hand"]), arm_of_episode(episode)
     step = round(1e9 * episode.meta["control_dt"])
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
-    yield _protobuf(f"{topic}/scene", start, _static_scene(hand, arm, actor, arrays, episode.meta, start), latched=True)
+    yield _protobuf(
+        f"{topic}/scene",
+        start,
+        _static_scene(hand, arm, actor, arrays, episode.meta, start),
+        latched=True,
+    )
     yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
     for link, (points, colours) in zip(hand.links, surface_points(hand), strict=True):
         # Rerun draws point clouds but no scenes; a topic holds one frame's cloud.
@@ -212,7 +238,9 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
         now = start + i * step
         yield _protobuf(f"{topic}/tf", now, _transforms(hand, arm, actor, arrays, i, slot, now))
         yield _protobuf(f"{topic}/contacts", now, _contacts(actor, arrays, i, now, step))
-        yield channels.entry(f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"]))
+        yield channels.entry(
+            f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"])
+        )
 
 
 def duration(episode: Message) -> int:
@@ -227,17 +255,35 @@ def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> 
 
 
 def _transforms(
-    hand: Hand, arm: MovedArm | None, actor: str, arrays: Mapping[str, np.ndarray], i: int, slot: int, now: int
+    hand: Hand,
+    arm: MovedArm | None,
+    actor: str,
+    arrays: Mapping[str, np.ndarray],
+    i: int,
+    slot: int,
+    now: int,
 ) -> FrameTransforms:
     """Frames of the actor, its links and its object at step i."""
     message = FrameTransforms()
     poses = [("world", actor, np.array([SPACING * slot, 0.0, 0.0]), _NO_TURN)]
     for k, link in enumerate(hand.links):
-        poses.append((actor, f"{actor}/{link.name}", arrays["link_position"][i, k], arrays["link_quaternion"][i, k]))
-    poses.append((actor, f"{actor}/object", arrays["object_position"][i], arrays["object_quaternion"][i]))
+        poses.append(
+            (
+                actor,
+                f"{actor}/{link.name}",
+                arrays["link_position"][i, k],
+                arrays["link_quaternion"][i, k],
+            )
+        )
+    poses.append(
+        (actor, f"{actor}/object", arrays["object_position"][i], arrays["object_quaternion"][i])
+    )
     if arm:
         links = zip(arm.link_names, arm.link_position[i], arm.link_quaternion[i], strict=True)
-        poses += [(actor, f"{actor}/arm/{name}", position, quaternion) for name, position, quaternion in links]
+        poses += [
+            (actor, f"{actor}/arm/{name}", position, quaternion)
+            for name, position, quaternion in links
+        ]
     for parent, child, position, quaternion in poses:
         transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
         transform.timestamp.FromNanoseconds(now)
@@ -247,7 +293,12 @@ def _transforms(
 
 
 def _static_scene(
-    hand: Hand, arm: MovedArm | None, actor: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], now: int
+    hand: Hand,
+    arm: MovedArm | None,
+    actor: str,
+    arrays: Mapping[str, np.ndarray],
+    meta: Mapping[str, Any],
+    now: int,
 ) -> SceneUpdate:
     """Hand, arm, object and constraints; first removes those of the previous episode."""
     update = SceneUpdate()
@@ -269,7 +320,9 @@ def _static_scene(
         own = Colours(arrays["colour_points"], arrays["colour_values"])
         for colour in (colours_at(arrays["visual_vertices"], own) / 255).tolist():
             _set_colour(body.colors.add(), (*colour, 1.0))
-    text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))
+    text = _entity(update, "label", frame, now).texts.add(
+        billboard=True, font_size=0.015, text=_label(meta)
+    )
     _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])
     _set_colour(text.color, (0.15, 0.17, 0.2, 1.0))
     _add_constraints(update, hand, frame, arrays, now)
@@ -278,11 +331,18 @@ def _static_scene(
 
 def _label(meta: Mapping[str, Any]) -> str:
     """Text above the object."""
-    return f"{meta['object']}, version {meta['version']}, {'success' if meta['success'] else 'no success'}"
+    return (
+        f"{meta['object']}, version {meta['version']}, "
+        f"{'success' if meta['success'] else 'no success'}"
+    )
 
 
-def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int) -> None:
-    """Adds markers of the active constraints; the avoid region is in the cloud of surface points."""
+def _add_constraints(
+    update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int
+) -> None:
+    """Adds markers of the active constraints; the avoid region is in the cloud of surface
+    points.
+    """
     for name, marker in markers(arrays):
         if isinstance(marker, Paint):
             continue
@@ -344,7 +404,9 @@ def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> Poi
     return cloud
 
 
-def _contacts(actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int) -> SceneUpdate:
+def _contacts(
+    actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int
+) -> SceneUpdate:
     """Table and contact forces of one step, with a short lifetime."""
     update = SceneUpdate()
     if arrays["table"][i]:
@@ -359,13 +421,21 @@ def _contacts(actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, st
         strength = float(np.linalg.norm(force))
         if strength > _FORCE_LEAST:
             length = min(_FORCE_LENGTH * strength, _FORCE_MAX)
-            _add_arrow(entity, arrays["link_position"][i, k], force / strength, length, 0.004, _FORCE)
+            _add_arrow(
+                entity, arrays["link_position"][i, k], force / strength, length, 0.004, _FORCE
+            )
     return update
 
 
-def _signals(hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: float) -> dict[str, Any]:
+def _signals(
+    hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: float
+) -> dict[str, Any]:
     """Numbers of one step: seconds, rewards, forces, joints, the object's height."""
-    terms = {name.removeprefix("reward/"): float(a[i]) for name, a in arrays.items() if name.startswith("reward/")}
+    terms = {
+        name.removeprefix("reward/"): float(a[i])
+        for name, a in arrays.items()
+        if name.startswith("reward/")
+    }
     joints = [joint.name for joint in hand.joints]
     force = np.linalg.norm(arrays["contact_force"][i], axis=-1)
     return {
@@ -382,15 +452,21 @@ def _signals(hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: f
     }
 
 
-def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0) -> SceneEntity:
-    """Adds an entity that moves with its frame; without a lifetime it stays until it is replaced or removed."""
+def _entity(
+    update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0
+) -> SceneEntity:
+    """Adds an entity that moves with its frame; without a lifetime it stays until it is replaced or
+    removed.
+    """
     entity = update.entities.add(id=name, frame_id=frame, frame_locked=True)
     entity.timestamp.FromNanoseconds(now)
     entity.lifetime.FromNanoseconds(lifetime)
     return entity
 
 
-def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Rgba) -> TriangleListPrimitive:
+def _add_triangles(
+    entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Rgba
+) -> TriangleListPrimitive:
     """Adds a mesh (V, 3), (E, 3) in the entity's frame."""
     mesh = entity.triangles.add()
     mesh.pose.orientation.w = 1.0
@@ -408,7 +484,9 @@ def _add_capsules(entity: SceneEntity, link: Link, colour: Rgba) -> None:
         if length > 0:
             cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
             _set_vector(cylinder.pose.position, (start + end) / 2)
-            _set_quaternion(cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], (end - start) / length))
+            _set_quaternion(
+                cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], (end - start) / length)
+            )
             _set_vector(cylinder.size, [2 * capsule.radius, 2 * capsule.radius, length])
             _set_colour(cylinder.color, colour)
             _add_sphere(entity, end, capsule.radius, colour)
@@ -425,11 +503,19 @@ def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: 
 
 
 def _add_arrow(
-    entity: SceneEntity, start: np.ndarray, direction: np.ndarray, length: float, width: float, colour: Rgba
+    entity: SceneEntity,
+    start: np.ndarray,
+    direction: np.ndarray,
+    length: float,
+    width: float,
+    colour: Rgba,
 ) -> None:
     """Adds an arrow of some length and width (m) along a unit direction."""
     arrow = entity.arrows.add(
-        shaft_length=0.7 * length, shaft_diameter=width, head_length=0.3 * length, head_diameter=2 * width
+        shaft_length=0.7 * length,
+        shaft_diameter=width,
+        head_length=0.3 * length,
+        head_diameter=2 * width,
     )
     _set_vector(arrow.pose.position, start)
     _set_quaternion(arrow.pose.orientation, _turn_onto([1.0, 0.0, 0.0], direction))

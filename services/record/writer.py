@@ -1,8 +1,9 @@
 """Output of a recorder: entries on channels, for a live viewer or an MCAP file.
 
-Metrics and signals are JSON with a JSON schema, so that viewers can plot them; events and scenes are Foxglove's
-Protobuf messages, which Rerun also reads; rollouts and raw episodes are the bytes of `common.wire.codec`. MCAP files
-survive a kill: they are flushed often, rotated, and renamed to `*.mcap` only when finished.
+Metrics and signals are JSON with a JSON schema, so that viewers can plot them; events and scenes
+are Foxglove's Protobuf messages, which Rerun also reads; rollouts and raw episodes are the bytes of
+`common.wire.codec`. MCAP files survive a kill: they are flushed often, rotated, and renamed to
+`*.mcap` only when finished.
 """
 
 import collections
@@ -28,14 +29,21 @@ ROLLOUT_SCHEMA = "congrasp.Rollout"
 """Name of the schema of rollouts."""
 
 _FIELDS, _GROWTHS = 512, 32
-"""Limits of a topic's fields, and of the growth of its schema, which is written in full each time."""
+"""Limits of a topic's fields, and of the growth of its schema, which is written in full each
+time.
+"""
 _LONGEST_NAME, _DEEPEST = 128, 8
 
 CONVENTIONS = {
     "units": "metres, radians, seconds, newtons, kilograms",
     "quaternions": "(w, x, y, z) in JSON and x-safetensors; by field name in Foxglove's messages",
-    "frames": "world: z up, table's top at z = 0; <actor>/<link> and <actor>/object as in the simulation",
-    "joints": "finger joints by name, in the order of the hand's 'q'; wrist x, y, z, then intrinsic x-y-z angles",
+    "frames": (
+        "world: z up, table's top at z = 0; <actor>/<link> and <actor>/object as in the simulation"
+    ),
+    "joints": (
+        "finger joints by name, in the order of the hand's 'q'; wrist x, y, z, then intrinsic "
+        "x-y-z angles"
+    ),
 }
 """Metadata of every file: meaning of the numbers."""
 PART = ".part"
@@ -56,7 +64,9 @@ class Channel:
     schema_encoding: str
     schema: bytes
     latched: bool = False
-    """Sent rarely and needed by late subscribers: a live viewer that subscribes receives the last message."""
+    """Sent rarely and needed by late subscribers: a live viewer that subscribes receives the last
+    message.
+    """
 
 
 class Entry(NamedTuple):
@@ -72,7 +82,9 @@ class Entry(NamedTuple):
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
     """Returns a channel of one of Foxglove's messages, with the descriptors that readers need."""
     own: Any = kind  # hashable, although its type does not declare it
-    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched)
+    return Channel(
+        topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched
+    )
 
 
 @functools.cache
@@ -88,7 +100,8 @@ def opaque_channel(topic: str, name: str) -> Channel:
 
 
 class JsonChannels:
-    """Channels of JSON objects whose schemas grow with new fields, since a field must be in the schema to be plotted.
+    """Channels of JSON objects whose schemas grow with new fields, since a field must be in the
+    schema to be plotted.
 
     The numbers of fields and of changes are limited; further fields are dropped.
     """
@@ -100,17 +113,24 @@ class JsonChannels:
         self._growths: collections.Counter[str] = collections.Counter()
 
     def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
-        """Returns the object as an entry, without fields that are NaN or infinite, which JSON cannot represent."""
+        """Returns the object as an entry, without fields that are NaN or infinite, which JSON
+        cannot represent.
+        """
         plain = finite(value)
         fields = self._fields.setdefault(topic, {})
         known = _known(fields, plain)
-        if self._growths[topic] >= _GROWTHS or _count(fields) + _count(plain) - _count(known) > _FIELDS:
+        if (
+            self._growths[topic] >= _GROWTHS
+            or _count(fields) + _count(plain) - _count(known) > _FIELDS
+        ):
             plain = known
         if _merge(fields, plain) or topic not in self._channels:
             self._growths[topic] += 1
             # Schemas are identified by name, so every topic has a separate one.
             schema = json.dumps(_schema(fields)).encode()
-            self._channels[topic] = Channel(topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema)
+            self._channels[topic] = Channel(
+                topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema
+            )
         return Entry(self._channels[topic], time, json.dumps(plain, separators=(",", ":")).encode())
 
     def forget(self, topic: str) -> None:
@@ -122,14 +142,17 @@ class JsonChannels:
 def check_field(name: str) -> str:
     """Returns a field's name; raises a CongraspError if it is too long, or nested too deep."""
     if len(name) > _LONGEST_NAME or name.count("/") > _DEEPEST:
-        raise CongraspError(f"{ascii(name)[:60]} is too long or nested too deep for the name of a metric.")
+        raise CongraspError(
+            f"{ascii(name)[:60]} is too long or nested too deep for the name of a metric."
+        )
     return name
 
 
 def nest(values: Mapping[str, float]) -> dict[str, Any]:
     """Converts `{"term/contact": 1}` to `{"term": {"contact": 1}}`; the inverse of `flatten`.
 
-    A name that is also a prefix of another (`loss` and `loss/policy`) becomes that group's empty name.
+    A name that is also a prefix of another (`loss` and `loss/policy`) becomes that group's empty
+    name.
     """
     tree: dict[str, Any] = {}
     groups = {name.rsplit("/", i)[0] for name in values for i in range(1, name.count("/") + 1)}
@@ -163,7 +186,9 @@ def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
             grown |= _merge(known, item) if isinstance(known, dict) else False
         elif name not in fields:
             is_number = isinstance(item, int | float)
-            fields[name] = "boolean" if isinstance(item, bool) else "number" if is_number else "string"
+            fields[name] = (
+                "boolean" if isinstance(item, bool) else "number" if is_number else "string"
+            )
             grown = True
     return grown
 
@@ -172,7 +197,9 @@ def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any
     """Returns the part of an object in known fields."""
     kept = {name: item for name, item in value.items() if name in fields}
     return {
-        name: _known(fields[name], item) if isinstance(item, Mapping) and isinstance(fields[name], dict) else item
+        name: _known(fields[name], item)
+        if isinstance(item, Mapping) and isinstance(fields[name], dict)
+        else item
         for name, item in kept.items()
     }
 
@@ -184,7 +211,10 @@ def _count(fields: Mapping[str, Any]) -> int:
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
     """JSON schema of known fields."""
-    properties = {name: _schema(kind) if isinstance(kind, dict) else {"type": kind} for name, kind in fields.items()}
+    properties = {
+        name: _schema(kind) if isinstance(kind, dict) else {"type": kind}
+        for name, kind in fields.items()
+    }
     return {"type": "object", "properties": properties}
 
 
@@ -220,7 +250,11 @@ class LogWriter:
         with os_errors_as(f"The folder {directory} cannot be created"):
             directory.mkdir(parents=True, exist_ok=True)
         self._directory, self._name, self._run = directory, name, run
-        self._max_bytes, self._max_ns, self._open_file = max_bytes, round(1e9 * max_seconds), open_file
+        self._max_bytes, self._max_ns, self._open_file = (
+            max_bytes,
+            round(1e9 * max_seconds),
+            open_file,
+        )
         self._number = 0
         self._file: IO[bytes] | None = None
         self._path = directory
@@ -236,7 +270,9 @@ class LogWriter:
             return
         time = entries[0].time
         # A clock that was set back must not keep a file open forever.
-        if self._file and (self._file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns):
+        if self._file and (
+            self._file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
+        ):
             self.close()
         if self._file is None:
             self._begin(time)

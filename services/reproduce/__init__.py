@@ -1,1 +1,3 @@
-"""Reproduces the paper's tables: trains missing policies, evaluates, and writes a page, JSON and LaTeX."""
+"""Reproduces the paper's tables: trains missing policies, evaluates, and writes a page, JSON and
+LaTeX.
+"""

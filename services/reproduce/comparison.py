@@ -15,24 +15,42 @@ from congrasp.common.io.inputs import read_file
 from congrasp.services.evaluate.paper import TABLES, PaperLine, paper_lines
 from congrasp.services.evaluate.report import Picture, embedded, template
 from congrasp.services.evaluate.scores import UNITS, Row
-from congrasp.services.evaluate.table import NONE, PLAUSIBILITY, RATE, RATES, Columns, Styled, Table, percent, verdict
+from congrasp.services.evaluate.table import (
+    NONE,
+    PLAUSIBILITY,
+    RATE,
+    RATES,
+    Columns,
+    Styled,
+    Table,
+    percent,
+    verdict,
+)
 from congrasp.services.reproduce.plan import RequiredPolicy, Result
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
 _OPTIONAL = {3: (3,), 9: (8, 9, 10)}
-"""Columns that are left out if the first of them is empty: objects, and errors if the paper has none."""
+"""Columns that are left out if the first of them is empty: objects, and errors if the paper has
+none.
+"""
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
 _LARGEST_PICTURE = 32 << 20
 _CONDITIONS = (
-    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
+    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models "
+    "differ.",
     "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
-    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
-    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
+    "Procedural objects that are never used in training replace the objects of the paper's table "
+    "of hands, and "
+    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the "
+    "paper gives no "
     "bounds.",
-    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
-    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
-    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
+    "References of the table of hands are grasps of this project's reference policies, generated "
+    "as in the paper.",
+    "Success is the paper's: the object has not fallen a quarter of a second after the table is "
+    "removed. The "
+    "paper does not report whether it is held for two seconds, nor whether fingers penetrate "
+    "anything.",
 )
 """Differences that apply to every table."""
 
@@ -57,11 +75,15 @@ class Cell:
     ours: float | None = None
     low: float | None = None
     high: float | None = None
-    """95 % interval: of a rate with objects as clusters, 1.96 standard errors around a mean error."""
+    """95 % interval: of a rate with objects as clusters, 1.96 standard errors around a mean
+    error.
+    """
     difference: float | None = None
     """Our figure minus the paper's."""
     nearest: float | None = None
-    """Nearest figure that is not comparable: same hand, method and constraint with procedural references."""
+    """Nearest figure that is not comparable: same hand, method and constraint with procedural
+    references.
+    """
     reason: str = ""
     """Reason if there is no comparable figure."""
 
@@ -75,7 +97,9 @@ class Cell:
         return verdict(-self.high, -self.low, -self.paper)  # a smaller error is better
 
 
-def compare(results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]) -> list[Cell]:
+def compare(
+    results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]
+) -> list[Cell]:
     """Returns a cell for every figure of the paper and every comparable result.
 
     Args:
@@ -85,11 +109,20 @@ def compare(results: Sequence[Result], absent: Mapping[RequiredPolicy, str], han
     """
     cells: list[Cell] = []
     for line in paper_lines():
-        matching = [found for result in results if result.source == line.source for found in _rows(result, line)]
-        near = [row for result in results if result.source == "hands" for _, row in _rows(result, line)]
+        matching = [
+            found
+            for result in results
+            if result.source == line.source
+            for found in _rows(result, line)
+        ]
+        near = [
+            row for result in results if result.source == "hands" for _, row in _rows(result, line)
+        ]
         reason = "" if matching else _reason(line, results, absent, hands)
         for quantity, paper in {SUCCESS: line.figures.success, **line.figures.errors}.items():
-            cell = Cell(line.table, line.constraint, line.hand, line.method, line.group, quantity, paper)
+            cell = Cell(
+                line.table, line.constraint, line.hand, line.method, line.group, quantity, paper
+            )
             if not matching:
                 nearest = _figure(near[0], quantity) if near else None
                 cells.append(dataclasses.replace(cell, nearest=nearest, reason=reason))
@@ -127,7 +160,9 @@ def _figure(row: Row, quantity: str) -> float | None:
 
 
 def _filled(cell: Cell, data: str, row: Row) -> Cell:
-    """Returns the cell with our figure; without a successful episode there is no error to compare."""
+    """Returns the cell with our figure; without a successful episode there is no error to
+    compare.
+    """
     cell = dataclasses.replace(cell, data=data, episodes=row.episodes)
     if (ours := _figure(row, cell.quantity)) is None:
         return dataclasses.replace(cell, reason="no episode succeeded")
@@ -138,7 +173,10 @@ def _filled(cell: Cell, data: str, row: Row) -> Cell:
 
 
 def _reason(
-    line: PaperLine, results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]
+    line: PaperLine,
+    results: Sequence[Result],
+    absent: Mapping[RequiredPolicy, str],
+    hands: Sequence[str],
 ) -> str:
     """Reason why no result is comparable with a line."""
     if line.hand not in hands:
@@ -147,7 +185,8 @@ def _reason(
         return f"no policy of the method '{line.method}': {reason}"
     if line.source in CAPTURED_DATA and not any(result.source == line.source for result in results):
         return (
-            f"needs captured constraints of {CAPTURED_DATA[line.source]}, which may not be redistributed; "
+            f"needs captured constraints of {CAPTURED_DATA[line.source]}, which may not be "
+            f"redistributed; "
             "--captured uses your copy"
         )
     return "not evaluated"
@@ -160,8 +199,10 @@ def summary(cells: Sequence[Cell]) -> str:
     above = sum(cell.ours >= cell.paper for cell in compared if cell.ours is not None)
     verdicts = collections.Counter(cell.verdict for cell in compared)
     return (
-        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one. It is at or above the "
-        f"paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, and below it in "
+        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one. It is "
+        f"at or above the "
+        f"paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, and "
+        f"below it in "
         f"{verdicts['worse']}."
     )
 
@@ -180,25 +221,44 @@ def not_comparable(cells: Sequence[Cell]) -> Table:
         (
             "nearest success here, procedural references",
             lambda cell: (
-                NONE if cell.nearest is None else f"{percent(cell.nearest)} ({percent(cell.paper)} in the paper)"
+                NONE
+                if cell.nearest is None
+                else f"{percent(cell.nearest)} ({percent(cell.paper)} in the paper)"
             ),
         ),
     )
-    return Table.of("", [cell for cell in cells if cell.ours is None and cell.quantity == SUCCESS], columns)
+    return Table.of(
+        "", [cell for cell in cells if cell.ours is None and cell.quantity == SUCCESS], columns
+    )
 
 
 def tables(cells: Sequence[Cell]) -> list[Table]:
-    """Returns all of the paper's tables, with a row for each constraint, hand, method, size and data set."""
+    """Returns all of the paper's tables, with a row for each constraint, hand, method, size and
+    data set.
+    """
     found: list[Table] = []
     for name, title in TABLES.items():
         lines = dict[tuple[str, ...], list[Cell]]()
         for cell in cells:
             if cell.table == name:
-                lines.setdefault((cell.constraint, cell.hand, cell.method, cell.group, cell.data), []).append(cell)
+                lines.setdefault(
+                    (cell.constraint, cell.hand, cell.method, cell.group, cell.data), []
+                ).append(cell)
         table = Table.of(title, lines.values(), _COLUMNS)
-        hidden = {i for key, group in _OPTIONAL.items() if {row[key] for row in table.rows} <= {NONE} for i in group}
+        hidden = {
+            i
+            for key, group in _OPTIONAL.items()
+            if {row[key] for row in table.rows} <= {NONE}
+            for i in group
+        }
         shown = [i for i in range(len(_COLUMNS)) if i not in hidden]
-        found.append(Table(title, [table.columns[i] for i in shown], [[row[i] for i in shown] for row in table.rows]))
+        found.append(
+            Table(
+                title,
+                [table.columns[i] for i in shown],
+                [[row[i] for i in shown] for row in table.rows],
+            )
+        )
     return found
 
 
@@ -211,7 +271,8 @@ def _joined(show: Callable[[Cell], str]) -> Callable[[list[Cell]], str]:
         if set(texts) <= {NONE}:
             return NONE
         return " / ".join(
-            f"{text} {UNITS[error.quantity]}".strip() for text, error in zip(texts, line[1:], strict=True)
+            f"{text} {UNITS[error.quantity]}".strip()
+            for text, error in zip(texts, line[1:], strict=True)
         )
 
     return cell
@@ -235,7 +296,9 @@ def _difference(cell: Cell) -> str:
     """Formats a signed difference in percentage points, or in the error's unit."""
     if cell.difference is None:
         return NONE
-    return f"{100 * cell.difference:+.1f}" if cell.quantity == SUCCESS else f"{cell.difference:+.3f}"
+    return (
+        f"{100 * cell.difference:+.1f}" if cell.quantity == SUCCESS else f"{cell.difference:+.3f}"
+    )
 
 
 def _styled(style: str, cell: Callable[[list[Cell]], str]) -> Callable[[list[Cell]], str]:
@@ -249,7 +312,10 @@ _COLUMNS: Columns[list[Cell]] = (
     ("method", lambda line: line[0].method),
     ("objects", _objects),
     ("episodes", lambda line: str(line[0].episodes or NONE)),
-    ("success, %", lambda line: Styled(percent(line[0].ours, line[0].low, line[0].high, ""), line[0].verdict)),
+    (
+        "success, %",
+        lambda line: Styled(percent(line[0].ours, line[0].low, line[0].high, ""), line[0].verdict),
+    ),
     ("paper", _styled("paper", lambda line: percent(line[0].paper, unit=""))),
     ("difference", lambda line: _difference(line[0])),
     ("error", _styled("errors", _joined(_error))),
@@ -289,7 +355,9 @@ def write(account: Account, out: pathlib.Path) -> None:
       CongraspError: a file cannot be written, or jinja2 is not installed.
     """
     shown, absent = tables(account.cells), not_comparable(account.cells)
-    policies = [(policy.hand, policy.method, Styled(what, "text")) for policy, what in account.policies]
+    policies = [
+        (policy.hand, policy.method, Styled(what, "text")) for policy, what in account.policies
+    ]
     text = page().render(
         title="The paper's tables",
         summary=summary(account.cells),
@@ -304,7 +372,9 @@ def write(account: Account, out: pathlib.Path) -> None:
         failures=account.failures,
     )
     write_atomically(out / PAGE, text.encode())
-    write_atomically(out / LATEX, "\n".join(table.latex(account.conditions) for table in shown).encode())
+    write_atomically(
+        out / LATEX, "\n".join(table.latex(account.conditions) for table in shown).encode()
+    )
     write_atomically(out / JSON, json.dumps(to_json(account), indent=2).encode())
 
 
@@ -322,7 +392,8 @@ def to_json(account: Account) -> dict[str, Any]:
         "policies": [policy._asdict() | {"what": what} for policy, what in account.policies],
         "cells": [dataclasses.asdict(cell) for cell in account.cells],
         "not_comparable": [
-            dict(zip(("line", "reason", "nearest"), row, strict=True)) for row in not_comparable(account.cells).rows
+            dict(zip(("line", "reason", "nearest"), row, strict=True))
+            for row in not_comparable(account.cells).rows
         ],
         "different_everywhere": _different(account.results),
         "failures": account.failures,
@@ -335,8 +406,12 @@ def to_json(account: Account) -> dict[str, Any]:
 
 
 def _different(results: Sequence[Result]) -> list[str]:
-    """Differences that apply to every table, and for each hand the share of headings that its rules keep."""
-    rules = dict.fromkeys(result.about["heading_rules"] for result in results if result.about["heading_rules"])
+    """Differences that apply to every table, and for each hand the share of headings that its rules
+    keep.
+    """
+    rules = dict.fromkeys(
+        result.about["heading_rules"] for result in results if result.about["heading_rules"]
+    )
     return [*_CONDITIONS, *rules]
 
 
@@ -349,7 +424,10 @@ def _times(seconds: Mapping[str, float]) -> str:
 def _details(results: Sequence[Result]) -> list[Table]:
     """Rates of rows without a counterpart in the paper, and the plausibility of all."""
     measured = [
-        (result, row) for result in results for row in result.rows if row.plausibility.get("hand_hand_mm") is not None
+        (result, row)
+        for result in results
+        for row in result.rows
+        if row.plausibility.get("hand_hand_mm") is not None
     ]
     plausibility = (PLAUSIBILITY[0], ("held 2 s", RATE["held 2 s"]), *PLAUSIBILITY[1:])
     return [

@@ -60,18 +60,24 @@ class Result(NamedTuple):
     """Source of its episodes (`services.evaluate.paper`)."""
     rows: list[Row]
     about: Mapping[str, Any]
-    """Further content of its JSON file: policy, settings, pictures, references, skipped rows, seconds."""
+    """Further content of its JSON file: policy, settings, pictures, references, skipped rows,
+    seconds.
+    """
     fresh: bool
     """True if it was evaluated in this session."""
 
 
 def policies(hands: Sequence[str], methods: Sequence[str]) -> list[RequiredPolicy]:
-    """Returns the full system of every hand, then the other methods of the first hand, learning or not."""
+    """Returns the full system of every hand, then the other methods of the first hand, learning or
+    not.
+    """
     full = [RequiredPolicy(hand, "ours") for hand in hands]
     return full + [RequiredPolicy(hands[0], method) for method in BASELINES if method in methods]
 
 
-def parts(needed: Sequence[RequiredPolicy], captured: Sequence[pathlib.Path], *, noise: bool) -> list[Part]:
+def parts(
+    needed: Sequence[RequiredPolicy], captured: Sequence[pathlib.Path], *, noise: bool
+) -> list[Part]:
     """Returns all parts; the first policy is the one with every table.
 
     Args:

@@ -1,4 +1,6 @@
-"""Flow of `congrasp reproduce`: trains missing policies, evaluates every part, writes the result."""
+"""Flow of `congrasp reproduce`: trains missing policies, evaluates every part, writes the
+result.
+"""
 
 import dataclasses
 import gc
@@ -29,7 +31,14 @@ from congrasp.services.evaluate.report import count_causes, curves_of
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.evaluate.tables import Captured, Found, captured, evaluate_tables
 from congrasp.services.reproduce.comparison import Account, compare, page, write
-from congrasp.services.reproduce.plan import BASELINES, Part, RequiredPolicy, Result, parts, policies
+from congrasp.services.reproduce.plan import (
+    BASELINES,
+    Part,
+    RequiredPolicy,
+    Result,
+    parts,
+    policies,
+)
 from congrasp.services.train import processes
 from congrasp.services.viz.sheets import save_png
 
@@ -38,7 +47,11 @@ RUNS = "policies"
 OBJECTS, CONSTRAINTS = "objects", "constraints"
 """Folders of a captured data set, with the default names of `congrasp constraints import`."""
 _LARGEST = 1 << 28
-_CAPTURED_TABLES = {"cross": ("cross",), "captured": ("single", "composed"), "": ("single", "composed")}
+_CAPTURED_TABLES = {
+    "cross": ("cross",),
+    "captured": ("single", "composed"),
+    "": ("single", "composed"),
+}
 _SOURCES = {"objects": "objects", "noise": ""}
 _PICTURED = 2
 _PARTS = ".parts"
@@ -92,10 +105,16 @@ def to_train(request: Request) -> list[RequiredPolicy]:
     if request.quick:
         return []
     found = policies(request.hands, request.methods)
-    return [policy for policy in found if get_method(policy.method).learns and _file(request, policy) is None]
+    return [
+        policy
+        for policy in found
+        if get_method(policy.method).learns and _file(request, policy) is None
+    ]
 
 
-def reproduce(request: Request, track: Track, note: Callable[[str], None] = lambda text: None) -> Account:
+def reproduce(
+    request: Request, track: Track, note: Callable[[str], None] = lambda text: None
+) -> Account:
     """Trains, evaluates and writes; a failure does not stop the rest.
 
     Args:
@@ -113,7 +132,9 @@ def reproduce(request: Request, track: Track, note: Callable[[str], None] = lamb
     found, failures = _policies(request, failed), list(failed.values())
     # Not earlier: trainings have the whole device memory until this process initialises its engine.
     request = dataclasses.replace(request, physics=resolve_physics(request.physics))
-    whole = parts(policies(request.hands, request.methods), request.captured, noise=not request.quick)
+    whole = parts(
+        policies(request.hands, request.methods), request.captured, noise=not request.quick
+    )
     wanted = [part for part in whole if part.policy in found.entrants]
     results: list[Result] = []
     advance = track("Parts", len(wanted))
@@ -127,15 +148,19 @@ def reproduce(request: Request, track: Track, note: Callable[[str], None] = lamb
         advance(done)
     if not results:
         raise CongraspError(
-            "Nothing could be evaluated.", failures[0] if failures else "Pass --hands with a hand that has a policy."
+            "Nothing could be evaluated.",
+            failures[0] if failures else "Pass --hands with a hand that has a policy.",
         )
     account = _account(request, found, results, failures)
     write(account, request.out)
     return account
 
 
-def train_all(request: Request, wanted: Sequence[RequiredPolicy], track: Track) -> dict[RequiredPolicy, str]:
-    """Trains policies in turn, each in a separate run, resuming from its last checkpoint if there is one.
+def train_all(
+    request: Request, wanted: Sequence[RequiredPolicy], track: Track
+) -> dict[RequiredPolicy, str]:
+    """Trains policies in turn, each in a separate run, resuming from its last checkpoint if there
+    is one.
 
     Returns:
       Reasons for failed trainings; the others succeeded.
@@ -145,7 +170,9 @@ def train_all(request: Request, wanted: Sequence[RequiredPolicy], track: Track) 
         run_dir = request.runs / policy.name
         track(f"Training {policy.name} (log: {run_dir}.log)", None)
         try:
-            processes.train_in_background(run_dir, policy.training, request.options, patience=request.patience)
+            processes.train_in_background(
+                run_dir, policy.training, request.options, patience=request.patience
+            )
         except CongraspError as error:
             failures[policy] = str(error)
     return failures
@@ -160,7 +187,9 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
       CongraspError: the part cannot be evaluated.
     """
     file = request.out / "tables" / f"{part.name}.json"
-    settings = {name: getattr(request, name) for name in ("episodes", "pool", "many", "physics", "seed")}
+    settings = {
+        name: getattr(request, name) for name in ("episodes", "pool", "many", "physics", "seed")
+    }
     settings |= {"friction": NOMINAL_FRICTION, "table": part.table, "data": str(part.data or "")}
     settings["content"] = content_hash(encode(entrant.policy.to_message()))
     if (kept := _read(file, part, settings)) is not None:
@@ -168,7 +197,11 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
     began = time.monotonic()
     experiment, data = _experiment(part, entrant, request, track)
     tables = _CAPTURED_TABLES[data.paper] if data else (part.table,)
-    pools = procedural_pools(min(request.many, MANY), request.physics, "figures") if part.table == "objects" else None
+    pools = (
+        procedural_pools(min(request.many, MANY), request.physics, "figures")
+        if part.table == "objects"
+        else None
+    )
     found = evaluate_tables(experiment, tables, pools, file.with_suffix(_PARTS), keep=part.pictured)
     about: dict[str, Any] = {
         "policy": facts(entrant),
@@ -187,7 +220,9 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
     return Result(part, about["source"], found.rows, about, True)
 
 
-def _experiment(part: Part, entrant: Entrant, request: Request, track: Track) -> tuple[Experiment, Captured | None]:
+def _experiment(
+    part: Part, entrant: Entrant, request: Request, track: Track
+) -> tuple[Experiment, Captured | None]:
     """Returns the experiment of a part, and its captured data if it has some."""
     many = part.table == "objects"
     own = Experiment(
@@ -202,16 +237,24 @@ def _experiment(part: Part, entrant: Entrant, request: Request, track: Track) ->
         return own, None
     data = _captured(part.data, track)
     if data.hand != entrant.hand:
-        raise CongraspError(f"The constraint sets in {part.data} are for the hand '{data.hand}', not '{entrant.hand}'.")
-    return dataclasses.replace(own, objects=data.objects, constraints=data.bank, paper=data.paper), data
+        raise CongraspError(
+            f"The constraint sets in {part.data} are for the hand '{data.hand}', not "
+            f"'{entrant.hand}'."
+        )
+    return dataclasses.replace(
+        own, objects=data.objects, constraints=data.bank, paper=data.paper
+    ), data
 
 
 def _captured(folder: pathlib.Path, track: Track) -> Captured:
-    """Returns all constraint sets of a captured data set, since no policy of a reproduction was trained with them."""
+    """Returns all constraint sets of a captured data set, since no policy of a reproduction was
+    trained with them.
+    """
     for name in (OBJECTS, CONSTRAINTS):
         if not (folder / name).is_dir():
             raise CongraspError(
-                f"{folder} has no folder '{name}'.", "Run 'congrasp constraints import' in it, or pass another folder."
+                f"{folder} has no folder '{name}'.",
+                "Run 'congrasp constraints import' in it, or pass another folder.",
             )
     return captured(folder / CONSTRAINTS, "all", objects_of(folder / OBJECTS, track=track))
 
@@ -229,7 +272,9 @@ def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result
 
 
 def _draw(part: Part, found: Found, folder: pathlib.Path) -> list[dict[str, str]]:
-    """Draws failures and successes of every row; returns title, caption and file of each picture."""
+    """Draws failures and successes of every row; returns title, caption and file of each
+    picture.
+    """
     pictures = list[dict[str, str]]()
     results = found.of(Variation) if part.pictured else []
     for name, sheet, causes in failure_sheets(found.experiment, results, _PICTURED, _PICTURED):
@@ -244,7 +289,9 @@ def _outcome(result: Result) -> str:
     """One line about a part."""
     if not result.fresh:
         return "evaluated before"
-    rates = ", ".join(f"{row.constraint} {100 * row.success:.1f} %" for row in result.rows if not row.group)
+    rates = ", ".join(
+        f"{row.constraint} {100 * row.success:.1f} %" for row in result.rows if not row.group
+    )
     return f"{rates} ({result.about['seconds']:.0f} s)"
 
 
@@ -258,7 +305,9 @@ def _file(request: Request, policy: RequiredPolicy) -> pathlib.Path | None:
 
 
 def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Policies:
-    """Reads the available policies; methods without learning use the full system's hand and geometry."""
+    """Reads the available policies; methods without learning use the full system's hand and
+    geometry.
+    """
     found = _Policies({}, {})
     for policy in policies(request.hands, request.methods):
         learns = get_method(policy.method).learns
@@ -270,20 +319,33 @@ def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Polici
         elif policy in failed:
             found.absent[policy] = failed[policy]
         else:
-            found.absent[policy] = "not trained with --quick" if request.quick else "it was not trained"
+            found.absent[policy] = (
+                "not trained with --quick" if request.quick else "it was not trained"
+            )
     for method in set(BASELINES) - set(request.methods):
         found.absent[RequiredPolicy(request.hands[0], method)] = "not requested"
     return found
 
 
-def _account(request: Request, found: _Policies, results: Sequence[Result], failures: Sequence[str]) -> Account:
+def _account(
+    request: Request, found: _Policies, results: Sequence[Result], failures: Sequence[str]
+) -> Account:
     """Collects the content of the page."""
-    trainings = {policy: processes.training_seconds(request.runs / policy.name) or 0.0 for policy in found.entrants}
-    seconds = {"training": sum(trainings.values()), "evaluation": sum(result.about["seconds"] for result in results)}
+    trainings = {
+        policy: processes.training_seconds(request.runs / policy.name) or 0.0
+        for policy in found.entrants
+    }
+    seconds = {
+        "training": sum(trainings.values()),
+        "evaluation": sum(result.about["seconds"] for result in results),
+    }
     where = []
     for policy, one in found.entrants.items():
         took = f", trained in {trainings[policy] / 60:.0f} min" if trainings[policy] else ""
-        version = f"{one.file.name}, version {one.policy.version}, {one.policy.transitions:,} environment steps"
+        version = (
+            f"{one.file.name}, version {one.policy.version}, {one.policy.transitions:,} "
+            f"environment steps"
+        )
         where.append((policy, version + took if get_method(policy.method).learns else "needs none"))
     where += [(policy, f"none: {reason}") for policy, reason in found.absent.items()]
     curves = [
@@ -293,8 +355,12 @@ def _account(request: Request, found: _Policies, results: Sequence[Result], fail
         for curve in itertools.islice(curves_of(request.runs / policy.name), 1)
     ]
     conditions = (
-        f"{request.episodes} episodes a row on {request.pool} held-out procedural objects, {request.many} on many "
-        f"objects, {engine_title(request.physics)}, friction {NOMINAL_FRICTION:g}, seed {request.seed}."
+        f"{request.episodes} episodes a row on {request.pool} held-out procedural objects, "
+        f"{request.many} on many "
+        f"objects, {engine_title(request.physics)}, friction {NOMINAL_FRICTION:g}, seed "
+        f"{request.seed}."
     )
     cells = compare(results, found.absent, request.hands)
-    return Account(list(results), cells, where, list(failures), conditions, request.command, curves, seconds)
+    return Account(
+        list(results), cells, where, list(failures), conditions, request.command, curves, seconds
+    )

@@ -1,8 +1,9 @@
-"""Batches queries that arrive together: a bounded queue and a worker thread, which a single query bypasses.
+"""Batches queries that arrive together: a bounded queue and a worker thread, which a single query
+bypasses.
 
-Peers take turns in the queue, and each has a limited share of it, so that a flood from one does not exclude the others.
-While several peers send queries, batches are small and the peers share each equally, so that a long query, answered in
-parts, delays the others by no more than a small batch.
+Peers take turns in the queue, and each has a limited share of it, so that a flood from one does not
+exclude the others. While several peers send queries, batches are small and the peers share each
+equally, so that a long query, answered in parts, delays the others by no more than a small batch.
 """
 
 import collections
@@ -59,13 +60,14 @@ class _Part(NamedTuple, Generic[T, R]):
 class Batcher(Generic[T, R]):
     """Runs a function on batches of submitted items, one batch at a time.
 
-    If nothing is running or queued, an item runs in the submitting thread, since waking another costs a single caller
-    more than the work. All others wait for the worker, which takes the queued items. It waits at most `window` seconds
-    until there are as many as in the last batch, so that synchronous callers stay synchronous.
+    If nothing is running or queued, an item runs in the submitting thread, since waking another
+    costs a single caller more than the work. All others wait for the worker, which takes the queued
+    items. It waits at most `window` seconds until there are as many as in the last batch, so that
+    synchronous callers stay synchronous.
 
     Args:
-      run: function of a batch and its queueing times in seconds; returns one result or exception for each item.
-      size: limit of the weight of a batch.
+      run: function of a batch and its queueing times in seconds; returns one result or exception
+      for each item. size: limit of the weight of a batch.
       window: longest wait for further items, s.
       depth: limit of the queue; further items are refused with `OverloadedError`.
       share: limit of one peer's queued items; by default `depth`.
@@ -90,8 +92,14 @@ class Batcher(Generic[T, R]):
         self._window = window
         self._depth = depth
         self._share = depth if share is None else share
-        self._queues: collections.OrderedDict[str, collections.deque[_Waiting[T, R]]] = collections.OrderedDict()
-        self._latest, self._several_until = "", -math.inf  # peer, and the time at which it counts as alone
+        self._queues: collections.OrderedDict[str, collections.deque[_Waiting[T, R]]] = (
+            collections.OrderedDict()
+        )
+        # Peer, and the time at which it counts as alone
+        self._latest, self._several_until = (
+            "",
+            -math.inf,
+        )
         self._changed = threading.Condition()
         self._running = False
         self._expected = 1
@@ -103,9 +111,13 @@ class Batcher(Generic[T, R]):
         """Raises an `OverloadedError` if the peer may not queue another item."""
         with self._changed:
             if len(self) >= self._depth:
-                raise OverloadedError(f"Overloaded: {self._depth} queries are queued.", "Try again later.")
+                raise OverloadedError(
+                    f"Overloaded: {self._depth} queries are queued.", "Try again later."
+                )
             if len(self._queues.get(peer, ())) >= self._share:
-                raise OverloadedError(f"Overloaded: {self._share} of your queries are queued.", "Try again later.")
+                raise OverloadedError(
+                    f"Overloaded: {self._share} of your queries are queued.", "Try again later."
+                )
 
     def __len__(self) -> int:
         """Number of queued items."""
@@ -125,7 +137,10 @@ class Batcher(Generic[T, R]):
             if self._closed:
                 raise CongraspError("The server is shutting down.")
             if peer != self._latest:
-                self._several_until, self._latest = (now + _ALONE) if self._latest else -math.inf, peer
+                self._several_until, self._latest = (
+                    (now + _ALONE) if self._latest else -math.inf,
+                    peer,
+                )
             alone = not self._running and not self._queues and self._expected == 1
             alone = alone and waiting.weight <= self._limits()[0]
             if alone:
@@ -158,7 +173,8 @@ class Batcher(Generic[T, R]):
         for waiting, _ in batch:
             if waiting.deadline < now:
                 late = (
-                    f"Too late: the query was queued for {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
+                    f"Too late: the query was queued for {1e3 * (now - waiting.arrival):.0f} ms, "
+                    f"beyond its deadline."
                 )
                 self._fail(waiting, LateError(late))
         batch = [part for part in batch if part.whole.deadline >= now]
@@ -172,7 +188,11 @@ class Batcher(Generic[T, R]):
             self._running = False
             self._changed.notify()
         for (waiting, item), result in zip(batch, results, strict=True):
-            if self._parts is not None and item is not waiting.item and not isinstance(result, Exception):
+            if (
+                self._parts is not None
+                and item is not waiting.item
+                and not isinstance(result, Exception)
+            ):
                 waiting.results.append(result)
                 if waiting.taken < waiting.weight:
                     continue
@@ -191,7 +211,11 @@ class Batcher(Generic[T, R]):
             if self._closed:
                 return []
             until = min(queue[0].arrival for queue in self._queues.values()) + self._window
-            while len(self) < self._expected and (rest := until - time.monotonic()) > 0 and not self._closed:
+            while (
+                len(self) < self._expected
+                and (rest := until - time.monotonic()) > 0
+                and not self._closed
+            ):
                 self._changed.wait(rest)
             batch = self._take()
             self._running, self._expected = True, len(batch)
@@ -205,7 +229,9 @@ class Batcher(Generic[T, R]):
         return room, max(1, room // max(1, len(self._queues)))
 
     def _take(self) -> list[_Part[T, R]]:
-        """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the lock."""
+        """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the
+        lock.
+        """
         batch: list[_Part[T, R]] = []
         room, most = self._limits()
         turns = collections.Counter[str]()

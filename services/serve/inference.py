@@ -1,4 +1,6 @@
-"""The policy as one compiled function from a batch of flat queries to joint targets, for a server and this process."""
+"""The policy as one compiled function from a batch of flat queries to joint targets, for a server
+and this process.
+"""
 
 import functools
 import itertools
@@ -36,7 +38,9 @@ class Inference(NamedTuple):
     """Reply of the policy to a query of n states."""
 
     vectors: np.ndarray
-    """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
+    """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist
+    targets (m and rad).
+    """
     active: list[list[str]]
     """For each state, the active constraints and the reasons, in sentences."""
 
@@ -56,8 +60,12 @@ class PolicyFunction:
         self.layout = Layout(hand, task)
         self._compiled = _compiled(hand, task)
 
-    def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> dict[int, float]:
-        """Compiles batches of these sizes; returns the seconds that one of each takes from then on."""
+    def warm_up(
+        self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES
+    ) -> dict[int, float]:
+        """Compiles batches of these sizes; returns the seconds that one of each takes from then
+        on.
+        """
         self.layout.estimate_normals(np.zeros((1, self.layout.size), np.float32))
         seconds = {}
         for size in sizes:
@@ -68,15 +76,22 @@ class PolicyFunction:
                 seconds[size] = time.perf_counter() - began
         return seconds
 
-    def __call__(self, weights: InferenceParameters, queries: Sequence[Query]) -> list[Inference | Exception]:
+    def __call__(
+        self, weights: InferenceParameters, queries: Sequence[Query]
+    ) -> list[Inference | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; an invalid query gets an error."""
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
-        batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
+        batch = np.zeros(
+            (next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32
+        )
         np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
         self.layout.estimate_normals(batch[: ends[-1]])
         found = np.asarray(self._compiled(weights, batch))
         starts = [0, *ends[:-1]]
-        return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
+        return [
+            self._answer(query, found[a:b])
+            for query, a, b in zip(queries, starts, ends, strict=True)
+        ]
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`, as JSON."""
@@ -99,14 +114,22 @@ class PolicyFunction:
     def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
         """Returns the answer to one query, or its error."""
         size = len(self.layout.hand.motors) + len(self.layout.hand.joints) + 12
-        vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
+        vectors, redirected, aligned, checks = (
+            found[:, :size],
+            found[:, size],
+            found[:, size + 1],
+            found[:, size + 2 :],
+        )
         if error := self.layout.find_error(query, checks):
             return error
         if not np.isfinite(vectors).all():
-            return CongraspError("The policy's action for this query is not finite.", "Check the state's magnitudes.")
+            return CongraspError(
+                "The policy's action for this query is not finite.", "Check the state's magnitudes."
+            )
         if not aligned.all():
             return ContradictionError(
-                "The constraints contradict each other: the trajectory ends nearer to the avoid region than to the "
+                "The constraints contradict each other: the trajectory ends nearer to the avoid "
+                "region than to the "
                 "graspable region of the affordance.",
                 "Change the trajectory or the affordance.",
             )
@@ -124,7 +147,9 @@ def _compiled(hand: Hand, task: TaskConfig) -> Any:
 
 
 def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
-    """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), as one array (B, ...)."""
+    """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), as one
+    array (B, ...).
+    """
     hand, task = layout.hand, layout.task
     fields, checks = layout.complete(vectors)
     asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(layout.known) if c.optional}
@@ -144,7 +169,8 @@ class LocalPolicy(EpisodePolicy):
     """The `Policy` of a bundle."""
 
     def __init__(self, bundle: PolicyBundle):
-        """Compiles `act`, so that no control step waits for it; `act_each` is compiled at its first call.
+        """Compiles `act`, so that no control step waits for it; `act_each` is compiled at its first
+        call.
 
         Args:
           bundle: the policy, which determines the hand.
@@ -168,14 +194,17 @@ class LocalPolicy(EpisodePolicy):
                 raise answer
         except CongraspError as error:
             raise error_of(error.code, str(error)) from None
-        return answer.reply({"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)})
+        return answer.reply(
+            {"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)}
+        )
 
 
 def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
     """Loads the policy of a file, or the pretrained one of a hand, in this process.
 
     Args:
-      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand (`human:left` for the left).
+      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand
+      (`human:left` for the left).
 
     Raises:
       CongraspError: there is no such file or hand, or the file is damaged.

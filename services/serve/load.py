@@ -67,17 +67,26 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     *frame, (rest,) = headings(found, obj, GraspRequest(), 1, np.random.default_rng(seed))
     position, direction, cross = (axis[0].astype(np.float32) for axis in frame)
     goals = {"heading": {"position": position, "direction": direction, "cross": cross}}
-    points, pose = (np.asarray(x, np.float32) for x in (obj.points[: task.surface_points], obj.rest_poses[rest]))
-    asked = goal_of(found, task, GraspRequest(goals)), Surface(points, np.zeros(len(points), bool)), pose
+    points, pose = (
+        np.asarray(x, np.float32) for x in (obj.points[: task.surface_points], obj.rest_poses[rest])
+    )
+    asked = (
+        goal_of(found, task, GraspRequest(goals)),
+        Surface(points, np.zeros(len(points), bool)),
+        pose,
+    )
     begin = jax.jit(initial_hand, static_argnums=(0, 1))
-    q, *wrist = (np.asarray(value)[0] for value in begin(found, task, *jax.tree.map(lambda x: x[None], asked)))
+    q, *wrist = (
+        np.asarray(value)[0]
+        for value in begin(found, task, *jax.tree.map(lambda x: x[None], asked))
+    )
     world = tuple(wrist), (pose[:3], pose[3:])
     request = GraspRequest(goals, surface=points, q=q, wrist=world[0], object_pose=world[1])
     state = {"q": q, "u": np.zeros(6), "object_position": pose[:3], "object_quaternion": pose[3:]}
     return Example(found.name, obj.name, request, state)
 
 
-def measure(
+def measure(  # noqa: PLR0913
     connect: str,
     name: str,
     episode: Example,
@@ -88,16 +97,19 @@ def measure(
     states: int = 1,
     rate: float = 0.0,
 ) -> dict[str, float]:
-    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
+    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is
+    not counted.
 
-    With `states` > 1 each query holds that many, and each state counts as an answer. Each client sends `rate` queries a
-    second, spread over the second, or its next query after the answer if that is 0. The measurement begins when all
-    clients have had their first answer.
+    With `states` > 1 each query holds that many, and each state counts as an answer. Each client
+    sends `rate` queries a second, spread over the second, or its next query after the answer if
+    that is 0. The measurement begins when all clients have had their first answer.
     """
     share = max(1, repeat // concurrency)
 
     def connected(_: int) -> PolicyClient:
-        client = stack.enter_context(PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs))
+        client = stack.enter_context(
+            PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs)
+        )
         client.reset(episode.request)
         client.act(episode.state)
         return client
@@ -106,7 +118,9 @@ def measure(
         times, failed, overloaded, state = [], 0, 0, episode.state
         for number in range(share):
             if rate:
-                time.sleep(max(0.0, began + (number + index / concurrency) / rate - time.perf_counter()))
+                time.sleep(
+                    max(0.0, began + (number + index / concurrency) / rate - time.perf_counter())
+                )
             try:
                 answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
                 times.append(answer.round_trip_ms)
@@ -116,7 +130,10 @@ def measure(
                 failed += 1
         return times, failed, overloaded
 
-    with contextlib.ExitStack() as stack, concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
+    with (
+        contextlib.ExitStack() as stack,
+        concurrent.futures.ThreadPoolExecutor(concurrency) as pool,
+    ):
         clients = list(pool.map(connected, range(concurrency)))
         began = time.perf_counter()
         results = list(pool.map(ask, range(concurrency), clients))
@@ -137,10 +154,12 @@ def one_answer(policy: Policy, episode: Example) -> str:
     answer = policy.act(episode.state)
     with np.printoptions(precision=3, suppress=True):
         return (
-            f"object       {episode.object}, constraints: {', '.join(episode.request.constraints)}\n"
+            f"object       {episode.object}, constraints: "
+            f"{', '.join(episode.request.constraints)}\n"
             f"active       {' '.join(answer.active)}\n"
             f"q_target     {answer.q_target} rad\n"
             f"u_target     {answer.u_target} m, rad\n"
             f"version      {answer.version}\n"
-            f"timing       {answer.round_trip_ms:.2f} ms round trip, {answer.server_ms:.2f} ms in the server"
+            f"timing       {answer.round_trip_ms:.2f} ms round trip, {answer.server_ms:.2f} ms in "
+            f"the server"
         )

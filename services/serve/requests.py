@@ -1,21 +1,24 @@
 """Queries of the live policy: their layout, validation, and completion.
 
-A query is one array `packed` (n, S) of float32: a row for each of n states under the same constraints. Its metadata
-have the names of the `constraints`, the digest of the `layout`, and the `timeout` in seconds. One vector is transferred
-to the device at once, since the overhead of a transfer equals that of thirty times its size. The layout is part of
-`Policy.metadata`. `services.client.policy.Packer` writes and checks the fields; absent ones are zero.
+A query is one array `packed` (n, S) of float32: a row for each of n states under the same
+constraints. Its metadata have the names of the `constraints`, the digest of the `layout`, and the
+`timeout` in seconds. One vector is transferred to the device at once, since the overhead of a
+transfer equals that of thirty times its size. The layout is part of `Policy.metadata`.
+`services.client.policy.Packer` writes and checks the fields; absent ones are zero.
 
-The fields, without batch axis, are those of `common.task.types.SceneState`, the object's `surface_points` with
-`surface_avoid`, and the goal arrays of the constraints.
+The fields, without batch axis, are those of `common.task.types.SceneState`, the object's
+`surface_points` with `surface_avoid`, and the goal arrays of the constraints.
 
-For a policy with history (`TaskConfig.observation` "tracked") there are also `past_q`, `past_u`, `past_q_target`,
-`past_u_target`, `past_object_position` and `past_object_quaternion` of earlier control steps, newest first.
+For a policy with history (`TaskConfig.observation` "tracked") there are also `past_q`, `past_u`,
+`past_q_target`, `past_u_target`, `past_object_position` and `past_object_quaternion` of earlier
+control steps, newest first.
 
-For a policy with a camera ("camera") `cloud` (N, 3) replaces `surface_points` and all fields of the object's pose and
-velocity. Cloud and constraints are in the world frame.
+For a policy with a camera ("camera") `cloud` (N, 3) replaces `surface_points` and all fields of the
+object's pose and velocity. Cloud and constraints are in the world frame.
 
-For a policy that observes normals (`TaskConfig.surface_normals`) there are `surface_normals` (N, 3), outward unit
-vectors. Zeros are estimated from the points, those of a cloud toward `camera_position` (3,), world frame.
+For a policy that observes normals (`TaskConfig.surface_normals`) there are `surface_normals` (N,
+3), outward unit vectors. Zeros are estimated from the points, those of a cloud toward
+`camera_position` (3,), world frame.
 
 The reply is one array `packed` with a row for each state: action, finger targets, wrist targets.
 """
@@ -65,7 +68,8 @@ class Layout:
     """Names, shapes and offsets of a query's fields for one hand and task.
 
     Attributes:
-      shapes: shapes by field name: state, earlier control steps if the policy observes them, goal, surface, and flags
+      shapes: shapes by field name: state, earlier control steps if the policy observes them, goal,
+      surface, and flags
         of the requested constraints.
       size: length S of the flat vector.
       digest: identifies the layout.
@@ -84,16 +88,32 @@ class Layout:
         self.hand = hand
         self.task = task
         self.known = known(task)
-        self._arrays = {f"{c.name}_{name}": (c, name, array) for c in self.known for name, array in c.arrays.items()}
+        self._arrays = {
+            f"{c.name}_{name}": (c, name, array)
+            for c in self.known
+            for name, array in c.arrays.items()
+        }
         self._neutral = {
-            f"{c.name}_{name}": value for c in self.known for name, value in c.neutral(hand, task)._asdict().items()
+            f"{c.name}_{name}": value
+            for c in self.known
+            for name, value in c.neutral(hand, task)._asdict().items()
         }
         self.points = CLOUD if task.observation == "camera" else "surface_points"
-        self._state = [n for n in SceneState._fields if not (self.points == CLOUD and n.startswith("object_"))]
-        self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in self._state}
-        self._past = [f"past_{n}" for n in Readings._fields if n in self._state] if task.observation != "full" else []
+        self._state = [
+            n for n in SceneState._fields if not (self.points == CLOUD and n.startswith("object_"))
+        ]
+        self.shapes = {
+            name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in self._state
+        }
+        self._past = (
+            [f"past_{n}" for n in Readings._fields if n in self._state]
+            if task.observation != "full"
+            else []
+        )
         steps = (task.history - 1,)
-        self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
+        self.shapes |= {
+            name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past
+        }
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
         self.shapes |= {self.points: (points, 3), "surface_avoid": (points,)}
         if task.surface_normals:
@@ -105,7 +125,11 @@ class Layout:
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
-        own = [name for name, (_, _, array) in self._arrays.items() if array.kind in ("direction", "quaternion")]
+        own = [
+            name
+            for name, (_, _, array) in self._arrays.items()
+            if array.kind in ("direction", "quaternion")
+        ]
         self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
         past = [name for name in self._past if "quaternion" in name]
         self._directions = [*(name for name in self._state if "quaternion" in name), *past, *own]
@@ -117,16 +141,23 @@ class Layout:
         """Layout for clients, as JSON.
 
         Returns:
-          `size` of the vector; `fields`, offset and shape of each; `constraints`, the fields that each one needs;
-          `states`, the most in one query; `settle`, m, see `SensingConfig`.
+          `size` of the vector; `fields`, offset and shape of each; `constraints`, the fields that
+          each one needs; `states`, the most in one query; `settle`, m, see `SensingConfig`.
         """
         needs = {
-            c.name: [*(f"{c.name}_{name}" for name, array in c.arrays.items() if array.required), *c.needs]
+            c.name: [
+                *(f"{c.name}_{name}" for name, array in c.arrays.items() if array.required),
+                *c.needs,
+            ]
             for c in self.known
         }
         return {
             "size": self.size,
-            "fields": {name: [self.offsets[name], *shape] for name, shape in self.shapes.items() if name != "asked"},
+            "fields": {
+                name: [self.offsets[name], *shape]
+                for name, shape in self.shapes.items()
+                if name != "asked"
+            },
             "constraints": needs,
             "states": STATES_LIMIT,
             "settle": self.task.sensing.settle,
@@ -134,7 +165,10 @@ class Layout:
 
     def unpack(self, vectors: Any) -> dict[str, Any]:
         """Returns the fields (B, ...) of flat vectors (B, S), for NumPy and traced arrays."""
-        return {name: self._field(vectors, name).reshape(-1, *shape) for name, shape in self.shapes.items()}
+        return {
+            name: self._field(vectors, name).reshape(-1, *shape)
+            for name, shape in self.shapes.items()
+        }
 
     def _field(self, vectors: Any, name: str) -> Any:
         """Numbers (..., n) of a field in flat vectors (..., S)."""
@@ -152,25 +186,36 @@ class Layout:
           CongraspError: it names no valid constraints, or has too many states.
         """
         vectors = message.arrays.get(PACKED)
-        fits = vectors is not None and vectors.ndim == 2 and vectors.shape[1] == self.size and len(message.arrays) == 1
+        fits = (
+            vectors is not None
+            and vectors.ndim == 2
+            and vectors.shape[1] == self.size
+            and len(message.arrays) == 1
+        )
         if vectors is None or not fits or message.meta.get("layout") != self.digest:
-            raise LayoutError("The query does not match the policy's layout.", "Take it from the policy's metadata.")
+            raise LayoutError(
+                "The query does not match the policy's layout.",
+                "Take it from the policy's metadata.",
+            )
         if not 1 <= len(vectors) <= STATES_LIMIT:
-            raise CongraspError(f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time.")
+            raise CongraspError(
+                f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time."
+            )
         asked = self._asked(message.meta.get("constraints", ["heading"]))
         vectors = np.array(vectors, np.float32)
         vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
         return Query(vectors, asked)
 
     def complete(self, vectors: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        """Normalises quaternions and directions of queries, and fills in omitted fields; traced with the policy.
+        """Normalises quaternions and directions of queries, and fills in omitted fields; traced
+        with the policy.
 
         Args:
           vectors: (B, S) flat vectors.
 
         Returns:
-          Fields (B, ...) by name, zero where a query is not finite, and checks (B, C) for `find_error`: finite and each
-          constraint valid, as 1 or 0, and norms that must be 1.
+          Fields (B, ...) by name, zero where a query is not finite, and checks (B, C) for
+          `find_error`: finite and each constraint valid, as 1 or 0, and norms that must be 1.
         """
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
@@ -180,20 +225,30 @@ class Layout:
         lengths = []
         for name in self._directions:
             constraint = self._arrays[name][0] if name in self._arrays else None
-            wanted = jnp.ones_like(finite) if constraint is None else asked[:, self.known.index(constraint)]
+            wanted = (
+                jnp.ones_like(finite)
+                if constraint is None
+                else asked[:, self.known.index(constraint)]
+            )
             default = self._neutral.get(name, np.array((1, 0, 0, 0), np.float32))
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
         frame, still = world(len(vectors)), jnp.zeros((len(vectors), 3))
-        for name in (name for name in SceneState._fields if name not in self._state):  # the object frame is the world's
+        for name in (
+            name for name in SceneState._fields if name not in self._state
+        ):  # the object frame is the world's
             fields[name] = frame[:, 3:] if "quaternion" in name else still
             if name in Readings._fields:
                 fields[f"past_{name}"] = jnp.repeat(fields[name][:, None], self.task.history - 1, 1)
         start = rotations.conjugate(fields["object_quaternion_initial"]), fields["base_quaternion"]
         held = rotations.rotate(rotations.multiply(*start), jnp.array(grasp_frame(self.hand).cross))
-        fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"], held)
+        fields["heading_cross"] = _orthogonal(
+            fields["heading_cross"], fields["heading_direction"], held
+        )
         if NORMALS in fields:
-            fields[NORMALS], length = _unit(fields[NORMALS], jnp.ones_like(finite), np.array((0, 0, 1), np.float32))
+            fields[NORMALS], length = _unit(
+                fields[NORMALS], jnp.ones_like(finite), np.array((0, 0, 1), np.float32)
+            )
             lengths.append(length)
         surface, goal = self.surface(fields), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
@@ -204,7 +259,8 @@ class Layout:
         return Surface(fields[self.points], fields["surface_avoid"], fields.get(NORMALS))
 
     def estimate_normals(self, vectors: np.ndarray) -> None:
-        """Writes normals into queries (B, S) that have none, if the policy observes them; those of a surface are kept.
+        """Writes normals into queries (B, S) that have none, if the policy observes them; those of
+        a surface are kept.
 
         An estimate costs ten times an action, and an episode's points stay the same.
         """
@@ -214,22 +270,35 @@ class Layout:
         for index in np.flatnonzero(~vectors[:, own].any(1)):
             row = vectors[index]
             eye = self._field(row, CAMERA) if CAMERA in self.shapes else np.zeros(0, np.float32)
-            row[own] = _estimated(self._field(row, self.points).tobytes(), eye.tobytes() if eye.any() else b"")
+            row[own] = _estimated(
+                self._field(row, self.points).tobytes(), eye.tobytes() if eye.any() else b""
+            )
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """Returns the goal arrays of completed fields, before the priority rules."""
-        return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
+        return Goal(
+            {
+                c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays})
+                for c in self.known
+            },
+            {},
+        )
 
     def readings(self, fields: Mapping[str, Any]) -> Readings | None:
         """Returns the earlier control steps of completed fields, if the policy observes them."""
         if not self._past:
             return None
         return Readings(
-            *(jnp.concatenate([fields[name][:, None], fields[f"past_{name}"]], 1) for name in Readings._fields)
+            *(
+                jnp.concatenate([fields[name][:, None], fields[f"past_{name}"]], 1)
+                for name in Readings._fields
+            )
         )
 
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
-        """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`; None without one."""
+        """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`;
+        None without one.
+        """
         wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
         if not wrong.any():
             return None
@@ -249,13 +318,16 @@ class Layout:
 
     def _asked(self, names: Any) -> tuple[str, ...]:
         """Names of the requested constraints of a query, weakest first."""
-        if not isinstance(names, list) or not all(isinstance(n, str) and len(n) <= LONGEST_NAME for n in names):
+        if not isinstance(names, list) or not all(
+            isinstance(n, str) and len(n) <= LONGEST_NAME for n in names
+        ):
             raise CongraspError("The query's 'constraints' must be a list of names.")
         require_known(names, self.task)
         leading = [constraint.name for constraint in self.known if constraint.guides]
         if not set(leading) & set(names):
             raise CongraspError(
-                "The query has no constraint that guides the wrist.", f"Add one of: {', '.join(leading)}."
+                "The query has no constraint that guides the wrist.",
+                f"Add one of: {', '.join(leading)}.",
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
@@ -263,11 +335,17 @@ class Layout:
 @functools.lru_cache(maxsize=1024)
 def _estimated(points: bytes, eye: bytes) -> np.ndarray:
     """Normals (3 N) at points (N, 3), float32, toward an eye if there is one."""
-    cloud, *camera = (np.frombuffer(data, np.float32).reshape(1, -1, 3) for data in (points, eye) if data)
-    return np.asarray(estimated_normals(cloud, *(position[:, 0] for position in camera))).reshape(-1)
+    cloud, *camera = (
+        np.frombuffer(data, np.float32).reshape(1, -1, 3) for data in (points, eye) if data
+    )
+    return np.asarray(estimated_normals(cloud, *(position[:, 0] for position in camera))).reshape(
+        -1
+    )
 
 
-def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:
+def _unit(
+    vectors: jax.Array, wanted: jax.Array, default: np.ndarray
+) -> tuple[jax.Array, jax.Array]:
     """Normalises vectors (B, ..., n) where wanted (B,) and replaces others by the default.
 
     Returns:
@@ -277,14 +355,16 @@ def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[j
     usable = wanted.reshape(-1, *[1] * (vectors.ndim - 1)) & (lengths > 0.5)
     every = lengths.reshape(len(vectors), -1)
     worst = jnp.where(every.max(1) - 1.0 > 1.0 - every.min(1), every.max(1), every.min(1))
-    return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(wanted, worst, 1.0)
+    return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(
+        wanted, worst, 1.0
+    )
 
 
 def _orthogonal(cross: jax.Array, direction: jax.Array, held: jax.Array) -> jax.Array:
     """Unit cross-finger directions (B, 3) orthogonal to the heading.
 
-    If absent or parallel to it, that of the hand at the start, `held`, so that the hand does not roll; if that is
-    parallel as well, an arbitrary one.
+    If absent or parallel to it, that of the hand at the start, `held`, so that the hand does not
+    roll; if that is parallel as well, an arbitrary one.
     """
 
     def across(vector: jax.Array) -> jax.Array:
@@ -298,4 +378,5 @@ def _orthogonal(cross: jax.Array, direction: jax.Array, held: jax.Array) -> jax.
     for wanted, least in ((held, 0.3), (cross, 1e-3)):
         wanted = across(wanted)
         rest = jnp.where(jnp.linalg.norm(wanted, axis=-1, keepdims=True) < least, rest, wanted)
-    return unit(across(unit(rest)))  # repeated, because a nearly parallel one leaves mostly rounding error
+    # Repeated, because a nearly parallel one leaves mostly rounding error
+    return unit(across(unit(rest)))

@@ -1,4 +1,6 @@
-"""The live policy server: follows a run or a policy file, and answers queries on `policy/act` and `policy/health`."""
+"""The live policy server: follows a run or a policy file, and answers queries on `policy/act` and
+`policy/health`.
+"""
 
 import functools
 import pathlib
@@ -31,7 +33,9 @@ DEPTH = 64
 SHARE = 16
 """Limit of queued queries of one peer."""
 SHARED = BATCH_SIZES[1]
-"""Limit of a batch's states while several peers share it: takes hardly longer than a single state."""
+"""Limit of a batch's states while several peers share it: takes hardly longer than a single
+state.
+"""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 
@@ -66,8 +70,8 @@ class PolicyServer:
           transport: endpoint of the server.
           run: name of the served run.
           source: source of policies.
-          on_answer: called with the outcome of every query (answered, refused, overloaded, late), and its duration.
-          on_batch: called with the number of states of every batch.
+          on_answer: called with the outcome of every query (answered, refused, overloaded, late),
+          and its duration. on_batch: called with the number of states of every batch.
 
         Raises:
           CongraspError: there is no policy yet, or the name is not valid.
@@ -75,7 +79,10 @@ class PolicyServer:
         keys = Keys(run)
         first = source(-1)
         if first is None:
-            raise CongraspError("There is no policy to serve yet.", "Start the server after the run has published one.")
+            raise CongraspError(
+                "There is no policy to serve yet.",
+                "Start the server after the run has published one.",
+            )
         self._source = source
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
@@ -94,17 +101,17 @@ class PolicyServer:
             parts=Parts(SHARED, _cut, self._join),
         )
         transport.serve(keys.health, self._describe)
-        transport.serve(
-            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject
-        )  # one may infer while the other receives
+        # One may infer while the other receives
+        transport.serve(below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject)
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
     def health(self) -> dict[str, Any]:
-        """Readiness, version, hand, queue, and the reason why a newer policy was rejected (`trouble`), as JSON.
+        """Readiness, version, hand, queue, and the reason why a newer policy was rejected
+        (`trouble`), as JSON.
 
-        `queue_limit` and `peer_limit` bound the queued queries of all peers and of one. `states_per_second` is the
-        highest throughput, measured at the start.
+        `queue_limit` and `peer_limit` bound the queued queries of all peers and of one.
+        `states_per_second` is the highest throughput, measured at the start.
         """
         held = self._held
         return {
@@ -117,14 +124,18 @@ class PolicyServer:
             "queue": len(self._batcher),
             "queue_limit": DEPTH,
             "peer_limit": SHARE,
-            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items())),
+            "states_per_second": round(
+                max(size / seconds for size, seconds in self._seconds.items())
+            ),
             "answered": self._answered,
             "trouble": self._trouble,
         }
 
     def _describe(self, key: str, request: Message) -> Message:
         """The health, or the policy's metadata if the query requests them."""
-        return Message({}, self._function.metadata() if request.meta.get("metadata") else self.health())
+        return Message(
+            {}, self._function.metadata() if request.meta.get("metadata") else self.health()
+        )
 
     def close(self) -> None:
         """Refuses queued queries, and stops following."""
@@ -175,11 +186,14 @@ class PolicyServer:
         """Validates the deadline of a query in seconds."""
         if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
             raise CongraspError(
-                f"The query's 'timeout' is {ascii(seconds)[:40]}.", f"It must be seconds, at most {_MAX_TIMEOUT:g}."
+                f"The query's 'timeout' is {ascii(seconds)[:40]}.",
+                f"It must be seconds, at most {_MAX_TIMEOUT:g}.",
             )
         return float(seconds)
 
-    def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
+    def _infer(
+        self, queries: Sequence[Query], queued: Sequence[float]
+    ) -> list[_Answered | Exception]:
         """Answers a batch."""
         held, began = self._held, time.monotonic()
         self._on_batch(sum(len(query.vectors) for query in queries))
@@ -191,7 +205,9 @@ class PolicyServer:
         ]
 
     def _join(self, query: Query, answers: list[_Answered]) -> _Answered | Exception:
-        """Joins the parts of a query; repeats it if the policy was swapped, so that one policy answers all."""
+        """Joins the parts of a query; repeats it if the policy was swapped, so that one policy
+        answers all.
+        """
         inferences, held, queued, inferred = zip(*answers, strict=True)
         if any(one is not held[-1] for one in held):
             return self._infer([query], queued[:1])[0]
@@ -200,7 +216,9 @@ class PolicyServer:
         return Inference(vectors, active), held[-1], queued[0], sum(inferred)
 
     def _follow(self) -> None:
-        """Swaps in newer policies; one that does not match is refused, and the current one stays."""
+        """Swaps in newer policies; one that does not match is refused, and the current one
+        stays.
+        """
         while not self._closed.wait(_FOLLOW_SECONDS):
             try:
                 newer = self._source(self._held.bundle.version)
@@ -218,7 +236,9 @@ class PolicyServer:
         old = self._held.bundle
         old.spec.require(newer.spec, "that the server was to change to")
         if newer.task != old.task:
-            raise CongraspError("The newer policy was trained on another task.", "Restart the server to serve it.")
+            raise CongraspError(
+                "The newer policy was trained on another task.", "Restart the server to serve it."
+            )
         self._held = _hold(newer)
         self._trouble = ""
 
@@ -261,7 +281,9 @@ def follow_file(path: pathlib.Path) -> Source:
 
 
 def follow_run(transport: Transport, run: str, name: str) -> Source:
-    """Returns a source that pulls the newest policy from a learner, under the server's name on the wire."""
+    """Returns a source that pulls the newest policy from a learner, under the server's name on the
+    wire.
+    """
     key = Keys(run).weights_for("server", name)
 
     def pull(version: int) -> PolicyBundle | None:

@@ -14,7 +14,13 @@ from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import objects_at, one_object
-from congrasp.services.assets.objects.options import UNIT_NAMES, ImportOptions, Unit, guessed_unit, sizes_by_unit
+from congrasp.services.assets.objects.options import (
+    UNIT_NAMES,
+    ImportOptions,
+    Unit,
+    guessed_unit,
+    sizes_by_unit,
+)
 from congrasp.services.studio.server import BadRequest, Picture
 from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of
@@ -53,7 +59,9 @@ class Catalogue:
 
     def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
         """Adds an object; returns its name, which has a number if `name` is taken."""
-        free = next(n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers)
+        free = next(
+            n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers
+        )
         self._makers[free] = maker
         return free
 
@@ -82,7 +90,10 @@ def offered(folder: pathlib.Path | None) -> Catalogue:
         guess = ImportOptions(unit="guess")
         makers |= {found.name: functools.partial(found.load, guess) for found in objects_at(folder)}
     families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
-    return Catalogue(makers | {name: functools.partial(procedural.generate, HELD_OUT_SEED, name) for name in families})
+    return Catalogue(
+        makers
+        | {name: functools.partial(procedural.generate, HELD_OUT_SEED, name) for name in families}
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +139,8 @@ class Uploads:
 
         Raises:
           BadRequest: `name` is no file name.
-          CongraspError: the file is empty or cannot be read, or a hand could grasp the mesh in no unit.
+          CongraspError: the file is empty or cannot be read, or a hand could grasp the mesh in no
+          unit.
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
         if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
@@ -181,7 +193,9 @@ class Thumbnails:
         self._drawn: dict[int, Picture] = {}
 
     def picture(self, obj: GraspObject, rest: int) -> Picture:
-        """An object in one of its resting poses, from 0; raises a CongraspError if there is none of this number."""
+        """An object in one of its resting poses, from 0; raises a CongraspError if there is none of
+        this number.
+        """
         if not 0 <= rest < len(obj.rest_poses):
             raise CongraspError(f"The object '{obj.name}' has no resting pose {rest + 1}.")
         with self._lock:

@@ -1,4 +1,6 @@
-"""Drawn parts of a request: the heading as an arrow, and the avoid region as paint; both in the object frame."""
+"""Drawn parts of a request: the heading as an arrow, and the avoid region as paint; both in the
+object frame.
+"""
 
 import itertools
 from typing import Any, NamedTuple
@@ -13,7 +15,9 @@ from congrasp.common.task.sampling.headings import INWARD
 from congrasp.services.record.palette import finer, painted
 
 LARGEST = 1e6
-"""Bound on each number of a position (m) or direction from a page; its square is finite in single precision."""
+"""Bound on each number of a position (m) or direction from a page; its square is finite in single
+precision.
+"""
 _ROUND = 1e-6  # rad
 _LOWEST = 0.012  # m above the table of a target from above
 _MOST = 2000  # points of a stroke
@@ -31,7 +35,8 @@ class Arrow(NamedTuple):
     """(3,) unit, orthogonal to the direction: along the hand's cross-finger axis."""
 
     def roll(self, up: np.ndarray) -> float:
-        """Angle in rad, in (-π, π], by which the cross-finger axis is turned around the direction from level.
+        """Angle in rad, in (-π, π], by which the cross-finger axis is turned around the direction
+        from level.
 
         Args:
           up: (3,) unit, away from the table.
@@ -39,12 +44,15 @@ class Arrow(NamedTuple):
         level = _level(self.direction, up)
         other = np.cross(self.direction, level)
         angle = float(np.arctan2(self.cross @ other, self.cross @ level))
-        return angle if angle > _ROUND - np.pi else np.pi  # -π and π are one angle, whose sign rounding would decide
+        # -π and π are one angle, whose sign rounding would decide
+        return angle if angle > _ROUND - np.pi else np.pi
 
     def with_roll(self, angle: float, up: np.ndarray) -> "Arrow":
         """The arrow with a roll of `angle` rad; see `roll`."""
         level = _level(self.direction, up)
-        return self._replace(cross=np.cos(angle) * level + np.sin(angle) * np.cross(self.direction, level))
+        return self._replace(
+            cross=np.cos(angle) * level + np.sin(angle) * np.cross(self.direction, level)
+        )
 
 
 def arrow_through(surface: Any, direction: Any, cross: np.ndarray) -> Arrow:
@@ -67,7 +75,9 @@ def arrow_through(surface: Any, direction: Any, cross: np.ndarray) -> Arrow:
 
 
 def from_above(obj: GraspObject, rest: int) -> Arrow:
-    """The arrow straight down onto an object in a resting pose, with the cross-finger axis along its narrower side."""
+    """The arrow straight down onto an object in a resting pose, with the cross-finger axis along
+    its narrower side.
+    """
     turn = matrix(obj.rest_poses[rest][3:])
     world = obj.points @ turn.T
     near = np.linalg.norm(world[:, :2] - (world[:, :2].max(0) + world[:, :2].min(0)) / 2, axis=-1)
@@ -80,14 +90,20 @@ def from_above(obj: GraspObject, rest: int) -> Arrow:
 
 
 def _level(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(3,) unit, orthogonal to a direction and parallel to the table; for a vertical one, any such."""
+    """(3,) unit, orthogonal to a direction and parallel to the table; for a vertical one, any
+    such.
+    """
     level = np.cross(up, direction)
     length = np.linalg.norm(level)
-    return level / length if length > 1e-3 else _orthogonal(np.eye(3)[np.abs(up).argmin()], direction)
+    return (
+        level / length if length > 1e-3 else _orthogonal(np.eye(3)[np.abs(up).argmin()], direction)
+    )
 
 
 def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(3,) unit, the part of a vector that is orthogonal to a direction; any orthogonal one if that part vanishes."""
+    """(3,) unit, the part of a vector that is orthogonal to a direction; any orthogonal one if that
+    part vanishes.
+    """
     cross = wanted - wanted @ direction * direction
     if np.linalg.norm(cross) < 1e-3:
         cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
@@ -119,7 +135,9 @@ class Canvas:
         self._obj = obj
         self.colours: np.ndarray | None = None
         if obj.colours:
-            self.vertices, self.faces, self.colours = painted(obj.visual_vertices, obj.visual_faces, obj.colours)
+            self.vertices, self.faces, self.colours = painted(
+                obj.visual_vertices, obj.visual_faces, obj.colours
+            )
         else:
             self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
@@ -130,7 +148,8 @@ class Canvas:
         return self.paint.avoid
 
     def brush(self, points: Any, radius: float, avoid: bool) -> None:
-        """Paints everything within `radius` (m) of points (N, 3), or removes the paint there if `avoid` is False.
+        """Paints everything within `radius` (m) of points (N, 3), or removes the paint there if
+        `avoid` is False.
 
         Raises:
           CongraspError: see `stroke`; or the radius is not 1 mm to 20 cm.
@@ -174,9 +193,16 @@ def vector(what: str, value: Any) -> np.ndarray:
 
 
 def stroke(what: str, points: Any) -> np.ndarray:
-    """(N, 3) points of a stroke of the mouse; raises a CongraspError unless they are at most 2000 within `LARGEST`."""
+    """(N, 3) points of a stroke of the mouse; raises a CongraspError unless they are at most 2000
+    within `LARGEST`.
+    """
     found = np.asarray(points, float)
-    if found.ndim != 2 or found.shape[1:] != (3,) or len(found) > _MOST or not np.isfinite(found).all():
+    if (
+        found.ndim != 2
+        or found.shape[1:] != (3,)
+        or len(found) > _MOST
+        or not np.isfinite(found).all()
+    ):
         raise CongraspError(f"A {what} must be at most {_MOST} points of three numbers.")
     if np.abs(found).max(initial=0.0) > LARGEST:
         raise CongraspError(f"A {what} must be within {LARGEST:g} m of the object.")

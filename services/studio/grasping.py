@@ -1,4 +1,6 @@
-"""Grasps of a policy for the studio: as drawn, or a variation if that fails; and the reason if none holds."""
+"""Grasps of a policy for the studio: as drawn, or a variation if that fails; and the reason if none
+holds.
+"""
 
 import dataclasses
 import functools
@@ -65,7 +67,8 @@ class PolicyGrasping:
         first = source(-1)
         if first is None:
             raise CongraspError(
-                f"There is no policy of {name} yet.", "Start the studio when the run has published one."
+                f"There is no policy of {name} yet.",
+                "Start the studio when the run has published one.",
             )
         self._source, self._name, self._policy = source, name, first
         self._trouble = ""
@@ -75,7 +78,9 @@ class PolicyGrasping:
         self._compiled, self._free = False, threading.Lock()
 
     def newest(self) -> dict[str, Any]:
-        """Source and version; `trouble` is the reason why newer weights were not taken, or empty."""
+        """Source and version; `trouble` is the reason why newer weights were not taken, or
+        empty.
+        """
         return {"source": self._name, "version": self._policy.version, "trouble": self._trouble}
 
     def refresh(self) -> None:
@@ -91,8 +96,11 @@ class PolicyGrasping:
         except CongraspError as error:
             self._trouble = str(error)
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
-        """Returns the episode of the drawn grasp, or of a variation that clearly holds or meets the constraints better.
+    def grasp(
+        self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
+    ) -> Message:
+        """Returns the episode of the drawn grasp, or of a variation that clearly holds or meets the
+        constraints better.
 
         `note` in its metadata names a variation, or explains why none held.
 
@@ -107,21 +115,30 @@ class PolicyGrasping:
         finally:
             self._free.release()
 
-    def _grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
+    def _grasp(
+        self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
+    ) -> Message:
         """Does the work of `grasp`; the caller holds the lock."""
         self._attempts.phases = phases
         first_time = not self._compiled
-        progress(f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights", 0.02)
+        progress(
+            f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights",
+            0.02,
+        )
         self.refresh()
         require_known(request.constraints, self.task)
         outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
         self._compiled = True
-        index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1, phases.lift)
+        index = _best(
+            outcome, tuple(request.constraints), self.task.approach_steps - 1, phases.lift
+        )
         about = {"actor": "studio", "note": _note(outcome, index, aside)}
         episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
         if phases.approach:
             progress("reach", 1.0)
-            episode = with_planned_reach(episode, self.hand, obj, phases.approach, self._attempts.speed)
+            episode = with_planned_reach(
+                episode, self.hand, obj, phases.approach, self._attempts.speed
+            )
         if (outcome.metrics["held"] > 0).any():
             return episode
 
@@ -145,7 +162,9 @@ class PolicyGrasping:
     def _attempt(
         self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
     ) -> tuple[Outcome, np.ndarray]:
-        """Outcome of a request and its variations, and the distance (B,) of each from the request, m."""
+        """Outcome of a request and its variations, and the distance (B,) of each from the request,
+        m.
+        """
         episodes, aside = _episodes(self.hand, self.task, obj, request)
         steps = self._attempts.steps
         return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
@@ -154,7 +173,9 @@ class PolicyGrasping:
 def pretrained() -> Loaders:
     """The pretrained and custom policies, by the names of their hands."""
     return {
-        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
+        name: functools.partial(
+            PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy"
+        )
         for name in hands_with_policy()
     }
 
@@ -166,7 +187,11 @@ def of_file(path: pathlib.Path) -> Loaders:
 
 def of_run(transport: Transport, run: str, name: str) -> Loaders:
     """The newest policy of a run, pulled from its learner under this process's name on the wire."""
-    return {"of the run": functools.partial(PolicyGrasping, follow_run(transport, run, name), f"the run '{run}'")}
+    return {
+        "of the run": functools.partial(
+            PolicyGrasping, follow_run(transport, run, name), f"the run '{run}'"
+        )
+    }
 
 
 def _episodes(
@@ -184,18 +209,27 @@ def _episodes(
     way = rng.uniform(0.0, 2 * np.pi, ATTEMPTS)
     axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
     turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
-    turned = {"direction": turn.apply(direction).astype(np.float32), "cross": turn.apply(cross).astype(np.float32)}
+    turned = {
+        "direction": turn.apply(direction).astype(np.float32),
+        "cross": turn.apply(cross).astype(np.float32),
+    }
     goal = goal.replace("heading", **turned)
     for constraint in known(task):
         if "position" in constraint.arrays:
             place = goal[constraint.name].position
-            goal = goal.replace(constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3))
+            goal = goal.replace(
+                constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3)
+            )
     return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
 def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
-    """Index of the drawn grasp, or of a variation that clearly holds or meets the constraints better."""
-    return int(np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0)))
+    """Index of the drawn grasp, or of a variation that clearly holds or meets the constraints
+    better.
+    """
+    return int(
+        np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0))
+    )
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
@@ -203,12 +237,21 @@ def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
     held = outcome.metrics["held"] > 0
     if held.any() and index:
         why = "is better than the drawn grasp" if held[0] else "holds; the drawn grasp does not"
-        return f"This variation, the best of {ATTEMPTS - 1}, {why}: it is {1000 * aside[index]:.0f} mm away."
+        return (
+            f"This variation, the best of {ATTEMPTS - 1}, {why}: it is {1000 * aside[index]:.0f} "
+            f"mm away."
+        )
     return ""
 
 
 def why_nothing_held(
-    episode: Message, request: GraspRequest, explanation: list[str], held: Held, *, attempts: int, drop_height: float
+    episode: Message,
+    request: GraspRequest,
+    explanation: list[str],
+    held: Held,
+    *,
+    attempts: int,
+    drop_height: float,
 ) -> str:
     """Explains a failed grasp to the user in a few sentences.
 
@@ -227,8 +270,14 @@ def why_nothing_held(
         title = get_constraint(best).title
         return f"{text} The {title} decided: without it {found[best]} of {attempts} hold."
     guides = [name for name in request.constraints if "heading" in get_constraint(name).overrides]
-    advice = f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
-    return f"{text} Leaving out any one constraint does not help. {advice}" if found else f"{text} {advice}"
+    advice = (
+        f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
+    )
+    return (
+        f"{text} Leaving out any one constraint does not help. {advice}"
+        if found
+        else f"{text} {advice}"
+    )
 
 
 def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:

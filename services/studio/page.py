@@ -27,7 +27,12 @@ from congrasp.common.task.constraints.base import ErrorSpec, Ghost, Marker
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import FORMATS, export_motions, motion_of_episode, save_motion
+from congrasp.services.export.motion_file import (
+    FORMATS,
+    export_motions,
+    motion_of_episode,
+    save_motion,
+)
 from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.episode import active_blocks, active_constraints, markers
 from congrasp.services.record.palette import painted
@@ -35,7 +40,12 @@ from congrasp.services.record.scene import save_episode
 from congrasp.services.studio.drawing import vector
 from congrasp.services.studio.server import Download
 from congrasp.services.studio.state import Studio, tool_of
-from congrasp.services.viz.render import Film, grasp_steps, render_episode_frames, save_episode_video
+from congrasp.services.viz.render import (
+    Film,
+    grasp_steps,
+    render_episode_frames,
+    save_episode_video,
+)
 from congrasp.services.viz.shapes import Camera, link_frames, skin_colours
 from congrasp.services.viz.sheets import png_of
 
@@ -70,7 +80,9 @@ _PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 
 def describe(studio: Studio) -> dict[str, Any]:
-    """The page's content for a request, in the object frame; resting pose and start are in the world frame."""
+    """The page's content for a request, in the object frame; resting pose and start are in the
+    world frame.
+    """
     resolution = studio.resolution
     goal = resolution.goal
     obj, hand, rest = studio.obj, studio.hand, studio.obj.rest_poses[studio.rest]
@@ -80,12 +92,18 @@ def describe(studio: Studio) -> dict[str, Any]:
         "hand": hand.name,
         "object": {
             "name": obj.name,
-            "size_cm": [round(100 * float(side), 1) for side in np.ptp(obj.visual_vertices, axis=0)],
+            "size_cm": [
+                round(100 * float(side), 1) for side in np.ptp(obj.visual_vertices, axis=0)
+            ],
             "mass_g": round(1000 * obj.mass),
             "faces": len(studio.canvas.faces),
             "tilts_deg": np.degrees(rest_tilts(obj)).round().tolist(),
         },
-        "rest": {"index": studio.rest, "position": rest[:3].tolist(), "quaternion": rest[3:].tolist()},
+        "rest": {
+            "index": studio.rest,
+            "position": rest[:3].tolist(),
+            "quaternion": rest[3:].tolist(),
+        },
         "asked": sorted(studio.asked),
         "constraints": list(_rows(studio)),
         "arrow": _lists(studio.arrow._asdict()),
@@ -93,7 +111,8 @@ def describe(studio: Studio) -> dict[str, Any]:
         "active": {
             "masks": {block: bool(on) for block, on in goal.active.items()},
             **_lists(goal["heading"]._asdict()),
-            "overruled": bool(resolution.redirected) or any("heading" in constraint.overrides for constraint in asked),
+            "overruled": bool(resolution.redirected)
+            or any("heading" in constraint.overrides for constraint in asked),
         },
         "explanation": studio.explanation,
         "trouble": studio.trouble,
@@ -112,7 +131,12 @@ def _rows(studio: Studio) -> Iterator[dict[str, Any]]:
             field: dict(zip(labels, fields[field].tolist(), strict=True))
             for field, labels in constraint.labels(studio.hand).items()
         }
-        yield {"name": constraint.name, "title": constraint.title, "tool": tool_of(constraint), "flags": flags}
+        yield {
+            "name": constraint.name,
+            "title": constraint.title,
+            "tool": tool_of(constraint),
+            "flags": flags,
+        }
 
 
 def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -123,24 +147,38 @@ def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray]:
     """The goal, the object's surface and its resting pose (7,), with a batch axis."""
     rest = np.asarray(studio.obj.rest_poses[studio.rest], np.float32)
-    return jax.tree.map(lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest))
+    return jax.tree.map(
+        lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array) -> tuple[jax.Array, ...]:
+def _start(
+    hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array
+) -> tuple[jax.Array, ...]:
     """Finger angles (F,) and wrist pose (3,), (4,) at the start of a grasp, world frame."""
     q, position, quaternion = initial_hand(hand, task, goal, surface, rest)
     return q[0], position[0], quaternion[0]
 
 
 def _frames(hand: Hand, q: Any, position: Any, quaternion: Any) -> dict[str, np.ndarray]:
-    """Link frames, positions (L, 3) and quaternions (L, 4), of finger angles and a wrist pose, in that pose's frame."""
+    """Link frames, positions (L, 3) and quaternions (L, 4), of finger angles and a wrist pose, in
+    that pose's frame.
+    """
     wrist = Rotation.from_quat(quaternion, scalar_first=True)
-    return dict(zip(("position", "quaternion"), link_frames(hand, np.asarray(q, float), position, wrist), strict=True))
+    return dict(
+        zip(
+            ("position", "quaternion"),
+            link_frames(hand, np.asarray(q, float), position, wrist),
+            strict=True,
+        )
+    )
 
 
 def _shapes(hand: Hand, shown: Iterator[Marker]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Kind and fields of each marker, object frame; a ghost of a whole hand has its link frames as fields."""
+    """Kind and fields of each marker, object frame; a ghost of a whole hand has its link frames as
+    fields.
+    """
     for marker in shown:
         if not isinstance(marker, Ghost):
             yield type(marker).__name__.lower(), marker._asdict()
@@ -170,7 +208,9 @@ class Lane(NamedTuple):
     met: np.ndarray
     """(T,) bool."""
     counts: np.ndarray
-    """(T,) bool: the constraint applies to this step (a heading to the grasp, a path to the approach)."""
+    """(T,) bool: the constraint applies to this step (a heading to the grasp, a path to the
+    approach).
+    """
     legend: str
     """Measured quantity, and its tolerance."""
     errors: Mapping[str, np.ndarray]
@@ -178,11 +218,17 @@ class Lane(NamedTuple):
 
 
 def lanes(episode: Message) -> dict[str, Lane]:
-    """The lanes of an episode by name: contact, then the active constraints whose errors are recorded."""
+    """The lanes of an episode by name: contact, then the active constraints whose errors are
+    recorded.
+    """
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
     table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
     links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
-    found = {"contact": Lane(links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)})}
+    found = {
+        "contact": Lane(
+            links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)}
+        )
+    }
     active, blocks = active_constraints(arrays), active_blocks(arrays)
     for constraint in CONSTRAINTS:
         errors = [spec for spec in constraint.errors if not spec.block or blocks.get(spec.block)]
@@ -200,28 +246,48 @@ def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: 
     for spec in errors:
         factor, unit = _UNITS[spec.unit]
         parts.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
-    return Lane(met, counts, "; ".join(parts), {spec.unit or "share": value for spec, value in values.items()})
+    return Lane(
+        met,
+        counts,
+        "; ".join(parts),
+        {spec.unit or "share": value for spec, value in values.items()},
+    )
 
 
 def for_page(episode: Message) -> Message:
-    """The episode for the page's player: poses, forces, rewards, object, lanes, and markers `KIND/CONSTRAINT/FIELD`."""
+    """The episode for the page's player: poses, forces, rewards, object, lanes, and markers
+    `KIND/CONSTRAINT/FIELD`.
+    """
     found = lanes(episode)
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in _PLAYED}
     if "colour_values" in episode.arrays:
         own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
         mesh = painted(arrays["visual_vertices"], arrays["visual_faces"], own)
-        arrays |= dict(zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True))
+        arrays |= dict(
+            zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True)
+        )
     rewards = {name: value for name, value in episode.arrays.items() if name.startswith("reward/")}
     arrays |= rewards
     for name, lane in found.items():
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
-        arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
+        arrays |= {
+            f"lane/{name}/{unit}": np.asarray(value, np.float32)
+            for unit, value in lane.errors.items()
+        }
     for name, marker in markers(episode.arrays):
         for kind, fields in _shapes(known_hand(episode.meta["hand"]), iter([marker])):
             fields = {"avoid": episode.arrays["surface_avoid"]} if kind == "paint" else fields
-            arrays |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}
-    terms = {name: MEANINGS.get(name, "") for name in (key.removeprefix("reward/") for key in rewards)}
-    return Message(arrays, {**episode.meta, "lanes": {n: lane.legend for n, lane in found.items()}, "terms": terms})
+            arrays |= {
+                f"{kind}/{name}/{field}": np.asarray(value, np.float32)
+                for field, value in fields.items()
+            }
+    terms = {
+        name: MEANINGS.get(name, "") for name in (key.removeprefix("reward/") for key in rewards)
+    }
+    return Message(
+        arrays,
+        {**episode.meta, "lanes": {n: lane.legend for n, lane in found.items()}, "terms": terms},
+    )
 
 
 class Motions:
@@ -243,7 +309,9 @@ class Motions:
     def get(self, key: str) -> Message:
         """A motion by its number; a CongraspError if there is none."""
         if key not in self._kept:
-            raise CongraspError(f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list.")
+            raise CongraspError(
+                f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list."
+            )
         return self._kept[key]
 
     def delete(self, key: str) -> None:
@@ -256,7 +324,9 @@ class Motions:
 
 
 def _asked(episode: Message) -> str:
-    """Request of a motion in words: its constraints, and the direction of the approach, world frame."""
+    """Request of a motion in words: its constraints, and the direction of the approach, world
+    frame.
+    """
     arrays, names = episode.arrays, active_constraints(episode.arrays)[1:]
     turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
     down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])
@@ -287,7 +357,9 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
       CongraspError: there is no such kind, or a package for it is absent.
     """
     if kind not in DATA:
-        raise CongraspError(f"A motion cannot be saved as '{kind[:20]}'.", f"Choose from: {', '.join(DATA)}.")
+        raise CongraspError(
+            f"A motion cannot be saved as '{kind[:20]}'.", f"Choose from: {', '.join(DATA)}."
+        )
     with tempfile.TemporaryDirectory(prefix="congrasp-export-") as folder:
         path = pathlib.Path(folder) / f"motion{FORMATS.get(kind, f'.{kind}')}"
         try:
@@ -308,7 +380,12 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
 
 
 def drawing(
-    episode: Message, key: str, kind: str, view: Mapping[str, Any], frame: int, progress: Callable[[float], None]
+    episode: Message,
+    key: str,
+    kind: str,
+    view: Mapping[str, Any],
+    frame: int,
+    progress: Callable[[float], None],
 ) -> Download:
     """A motion as MP4, or one of its frames as PNG, from the page's camera.
 
@@ -316,15 +393,17 @@ def drawing(
       episode: the motion.
       key: its key, for the file's name.
       kind: one of `DRAWN`.
-      view: the page's camera: position and target (3,) in the world, m, and its vertical field_of_view in degrees.
-      frame: control step of the PNG.
+      view: the page's camera: position and target (3,) in the world, m, and its vertical
+      field_of_view in degrees. frame: control step of the PNG.
       progress: called with the completed share, from 0 to 1, of an MP4.
 
     Raises:
       CongraspError: the kind, the camera or the frame is invalid.
     """
     if kind not in DRAWN:
-        raise CongraspError(f"A motion cannot be drawn as '{str(kind)[:20]}'.", f"Choose from: {', '.join(DRAWN)}.")
+        raise CongraspError(
+            f"A motion cannot be drawn as '{str(kind)[:20]}'.", f"Choose from: {', '.join(DRAWN)}."
+        )
     camera = _camera(view)
     if kind == "png":
         if not isinstance(frame, int) or not 0 <= frame < len(episode.arrays["table"]):
@@ -341,10 +420,14 @@ def _camera(view: Mapping[str, Any]) -> Camera:
     """The page's camera."""
     if not isinstance(view, Mapping):
         raise CongraspError("The camera must have a position, a target and a field of view.")
-    position, target = (vector(f"camera's {name}", view.get(name)) for name in ("position", "target"))
+    position, target = (
+        vector(f"camera's {name}", view.get(name)) for name in ("position", "target")
+    )
     angle = float(vector("camera's field of view", [view.get("field_of_view"), 0.0, 0.0])[0])
     if np.linalg.norm((target - position)[:2]) < 1e-6 or not 1 <= angle <= 120:
-        raise CongraspError("The camera looks straight down, or its field of view is not 1 to 120 degrees.")
+        raise CongraspError(
+            "The camera looks straight down, or its field of view is not 1 to 120 degrees."
+        )
     return Camera(position, target, angle)
 
 

@@ -1,4 +1,6 @@
-"""Serves a studio over HTTP to browsers on this machine: a session for each, files, JSON, and messages of arrays."""
+"""Serves a studio over HTTP to browsers on this machine: a session for each, files, JSON, and
+messages of arrays.
+"""
 
 import collections
 import contextlib
@@ -23,7 +25,9 @@ STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20
 """Bytes of the largest request body, an uploaded mesh."""
 MOST = 16
-"""Maximum number of browsers; a further one ends the session that was used least recently, if it is idle."""
+"""Maximum number of browsers; a further one ends the session that was used least recently, if it is
+idle.
+"""
 IDLE = 1800.0
 """Seconds without a request after which a session is idle."""
 _TYPES = {
@@ -32,13 +36,20 @@ _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-_POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
+_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "frame-ancestors 'none'"
+)
 _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
-_DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
+# Bytes read of a refused body, so that the answer arrives before the close
+_DRAINED, _DRAIN_SECONDS = (
+    64 << 10,
+    1.0,
+)
 
 
 class BadRequest(CongraspError):
@@ -111,7 +122,8 @@ class Sessions:
                 if now - used < IDLE:
                     raise CongraspError(
                         f"{MOST} browsers use this studio.",
-                        f"Try again when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
+                        f"Try again when one has been idle for {IDLE / 60:.0f} minutes, or start "
+                        f"another studio.",
                     )
                 self._open.popitem(last=False)
                 oldest.close()
@@ -129,13 +141,15 @@ class Sessions:
 class PageServer:
     """Serves the page and the routes of a studio until it is closed."""
 
-    def __init__(self, routes: Callable[[str], Routes], host: str, port: int, names: Sequence[str] = ()):
+    def __init__(
+        self, routes: Callable[[str], Routes], host: str, port: int, names: Sequence[str] = ()
+    ):
         """Listens.
 
         Args:
-          routes: returns the routes of a browser, by the token in its cookie; an empty one without a cookie.
-          host: interface; on loopback, only requests to a loopback name or one of `names` are answered.
-          port: TCP port; 0 takes a free one (see `port`).
+          routes: returns the routes of a browser, by the token in its cookie; an empty one without
+          a cookie. host: interface; on loopback, only requests to a loopback name or one of `names`
+          are answered. port: TCP port; 0 takes a free one (see `port`).
           names: names under which a proxy offers the page.
 
         Raises:
@@ -148,7 +162,9 @@ class PageServer:
         self.host, self.port = host, int(self._server.server_address[1])
         self._named = set(names)
         self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.1,), daemon=True, name="page"
+        )
         self._thread.start()
 
     @property
@@ -166,21 +182,29 @@ class PageServer:
     def fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
         """Reason why a request is refused, with the remedy; empty if it comes from the page itself.
 
-        Other sites in the browser must not reach the page. A site's name may resolve to this machine (DNS rebinding),
-        so the Host header must name this machine, or a proxy set by the user. Ports differ behind a tunnel.
+        Other sites in the browser must not reach the page. A site's name may resolve to this
+        machine (DNS rebinding), so the Host header must name this machine, or a proxy set by the
+        user. Ports differ behind a tunnel.
         """
         host = request.headers.get("Host", "").strip()
         origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
         name = re.sub(r":\d*$", "", host).strip("[]")
         if not host or (self._names is not None and not {host, name} & self._names):
             shown = ascii(name)[:60]
-            return f"The page is not offered as {shown}. Open {self.url} or start it with --allow-host {shown}."
+            return (
+                f"The page is not offered as {shown}. Open {self.url} or start it with "
+                f"--allow-host {shown}."
+            )
         sender = re.sub(r"^https?://|:\d*$", "", origin or "").strip("[]")
         # A proxy may put this server's address as Host, and leave the browser's Origin.
         ours = origin in (None, f"http://{host}", f"https://{host}") or sender in self._named
         if not ours or site not in (None, "none", "same-origin"):
             shown = ascii(sender)[:60]
-            proxy = f" If that is a proxy of yours, start it with --allow-host {shown}." if sender else ""
+            proxy = (
+                f" If that is a proxy of yours, start it with --allow-host {shown}."
+                if sender
+                else ""
+            )
             return f"Another site sent this request. Open the page itself, at {self.url}.{proxy}"
         return ""
 
@@ -224,11 +248,19 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         kind = (self.headers.get("Content-Type") or "").partition(";")[0]
         given = self.headers.get("Content-Length") or ""
         length = int(given) if given.isdecimal() and len(given) < 20 else -1
-        fault = "" if kind in ("application/json", "application/octet-stream") else "The page sends no such content."
+        fault = (
+            ""
+            if kind in ("application/json", "application/octet-stream")
+            else "The page sends no such content."
+        )
         if self._refused(fault):
             self._drain(length)
         elif not 0 <= length <= MOST_BYTES:
-            message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            message = (
+                "The request has no length."
+                if length < 0
+                else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            )
             self._error(413, message)
             self._drain(length)
         elif (routes := self._routes()) is None:
@@ -264,7 +296,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Logs nothing."""
 
     def _route(self) -> tuple[str, dict[str, str]]:
-        """Path, without the prefix of a proxy, and query parameters; an empty path for a malformed URL."""
+        """Path, without the prefix of a proxy, and query parameters; an empty path for a malformed
+        URL.
+        """
         try:
             parts = urllib.parse.urlsplit(self.path)
         except ValueError:
@@ -274,7 +308,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, fault: str = "") -> bool:
-        """Sends a refusal if the request is not allowed, or has another fault; returns True if it did."""
+        """Sends a refusal if the request is not allowed, or has another fault; returns True if it
+        did.
+        """
         if fault := self.server.page.fault(self) or fault:
             self._error(403, fault)
         return bool(fault)
@@ -295,7 +331,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return
         new = {}
         if file.suffix == ".html" and not self._browser():
-            new = {"Set-Cookie": f"{self._cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
+            new = {
+                "Set-Cookie": f"{self._cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"
+            }
         self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
 
     def _answer(self, work: Callable[[], Answer]) -> None:
@@ -308,15 +346,21 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return self._error(200, str(error))
         except Exception as error:  # the server continues after any error of a request
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            return self._error(500, f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}.")
+            return self._error(
+                500, f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
+            )
         self._send(200, *content)
 
     def _error(self, code: int, error: str) -> None:
-        """Sends an error; one with the code 200 is an answer of the studio, such as a wrong value."""
+        """Sends an error; one with the code 200 is an answer of the studio, such as a wrong
+        value.
+        """
         refused = {"X-Refused": "yes"} if code == 200 else {}
         self._send(code, "application/json", json.dumps({"error": error}).encode(), refused)
 
-    def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
+    def _send(
+        self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None
+    ) -> None:
         """Sends a whole answer."""
         self.send_response(code)
         headers = {
@@ -339,7 +383,11 @@ def _content(found: Answer) -> tuple[str, bytes, Mapping[str, str]]:
         return "application/octet-stream", encode(found), {}
     if isinstance(found, Download):
         name = urllib.parse.quote(found.name)
-        return "application/octet-stream", found.data, {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
+        return (
+            "application/octet-stream",
+            found.data,
+            {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"},
+        )
     if isinstance(found, Picture):
         return "image/png", found.png, {}
     return "application/json", json.dumps(found, allow_nan=False).encode(), {}

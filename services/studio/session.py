@@ -1,4 +1,6 @@
-"""The session of a browser: studio, policy, objects, motions, training window, background job, routes; and the page."""
+"""The session of a browser: studio, policy, objects, motions, training window, background job,
+routes; and the page.
+"""
 
 import contextlib
 import functools
@@ -22,8 +24,25 @@ from congrasp.services.assets.objects.options import METRES
 from congrasp.services.ops.logs import log
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
 from congrasp.services.studio.grasping import SECONDS, Loaders, PolicyGrasping, Progress
-from congrasp.services.studio.page import DATA, DRAWN, Motions, data_file, describe, drawing, for_page, hand_message
-from congrasp.services.studio.server import BadRequest, Download, Get, PageServer, Picture, Routes, Sessions
+from congrasp.services.studio.page import (
+    DATA,
+    DRAWN,
+    Motions,
+    data_file,
+    describe,
+    drawing,
+    for_page,
+    hand_message,
+)
+from congrasp.services.studio.server import (
+    BadRequest,
+    Download,
+    Get,
+    PageServer,
+    Picture,
+    Routes,
+    Sessions,
+)
 from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow
 
@@ -41,7 +60,13 @@ _LATEST = 1e10
 class Session:
     """Everything behind the page; its routes are `routes`."""
 
-    def __init__(self, hands: Loaders, objects: Catalogue, importer: Importer, window: TrainingWindow | None = None):
+    def __init__(
+        self,
+        hands: Loaders,
+        objects: Catalogue,
+        importer: Importer,
+        window: TrainingWindow | None = None,
+    ):
         """Loads the first hand's policy and the first object.
 
         Args:
@@ -72,7 +97,9 @@ class Session:
             "/api/export": lambda query: self.export(query.get("id", ""), query.get("kind", "")),
             "/api/drawn": lambda query: self.drawn(),
             "/api/training": lambda query: self.training(query.get("names", "")),
-            "/api/episodes": lambda query: self.episodes_around(query.get("time", ""), query.get("seconds", "")),
+            "/api/episodes": lambda query: self.episodes_around(
+                query.get("time", ""), query.get("seconds", "")
+            ),
         }
         self.routes = Routes(gets, {"/api/do": self._do, "/api/upload": self._upload})
 
@@ -122,10 +149,14 @@ class Session:
         """The object in one of its resting poses, from 0."""
         with self._lock:
             obj = self._studio.obj
-        return self._thumbnails.picture(obj, int(index) if index.isdecimal() and len(index) < 6 else -1)
+        return self._thumbnails.picture(
+            obj, int(index) if index.isdecimal() and len(index) < 6 else -1
+        )
 
     def motion(self, key: str) -> Message:
-        """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for a recorded one."""
+        """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for
+        a recorded one.
+        """
         kind, _, name = key.partition(":")
         if kind == "actor" and self._window is not None:
             return self._window.episode(name)
@@ -147,13 +178,17 @@ class Session:
     def training(self, names: str) -> dict[str, Any]:
         """Content of the training window; `names` are the curves, separated by commas."""
         if self._window is None:
-            raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
+            raise CongraspError(
+                "The studio follows no run.", "Start it with --connect, or with --recordings."
+            )
         return self._window.view([name for name in names.split(",") if name])
 
     def episodes_around(self, time: str, seconds: str) -> dict[str, Any]:
         """Episodes that were recorded around a time."""
         if self._window is None or self._window.recordings is None:
-            raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
+            raise CongraspError(
+                "No recordings were named.", "Start the studio with --recordings FOLDER."
+            )
         try:
             when, around = float(time), float(seconds)
         except ValueError:
@@ -185,7 +220,10 @@ class Session:
                 **{name: functools.partial(self._history.do, name) for name in ACTIONS},
             }
             if not isinstance(action, str) or action not in actions:
-                raise CongraspError(f"There is no action '{str(action)[:40]}'.", f"Choose from: {', '.join(actions)}.")
+                raise CongraspError(
+                    f"There is no action '{str(action)[:40]}'.",
+                    f"Choose from: {', '.join(actions)}.",
+                )
             try:
                 actions[action](**request)
             except (TypeError, ValueError, OverflowError) as error:
@@ -193,26 +231,38 @@ class Session:
         return self.state()
 
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
-        """Imports a mesh and then shows its object; waits for the user's choice if several units fit."""
+        """Imports a mesh and then shows its object; waits for the user's choice if several units
+        fit.
+        """
         upload = self._uploads.take(query.get("name", ""), body)
         with self._lock:
             if upload.unit:
-                return self._import(upload.path.name, lambda: self._uploads.load(upload, upload.unit))
+                return self._import(
+                    upload.path.name, lambda: self._uploads.load(upload, upload.unit)
+                )
             self._jobs.require_idle()
             self._uploads.pending = upload
             return self._jobs.state()
 
     def _choose_unit(self, unit: str) -> None:
         """Imports the uploaded mesh again in another unit."""
-        upload, replaces = self._uploads.of(self._object), "" if self._uploads.pending else self._object
+        upload, replaces = (
+            self._uploads.of(self._object),
+            "" if self._uploads.pending else self._object,
+        )
         if upload is None or unit not in METRES:
-            raise CongraspError(f"The unit cannot be '{str(unit)[:20]}'.", "Open a mesh, then choose m, cm, mm or in.")
+            raise CongraspError(
+                f"The unit cannot be '{str(unit)[:20]}'.",
+                "Open a mesh, then choose m, cm, mm or in.",
+            )
         self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
 
     def _weigh(self, mass_g: float = 0, material: str = "") -> None:
         """Sets the object's mass: `mass_g`, else by a material, else its original mass."""
         if mass_g and not LIGHTEST_G <= mass_g <= HEAVIEST_G:
-            raise CongraspError(f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing.")
+            raise CongraspError(
+                f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing."
+            )
         obj = self._objects.get(self._object)
         self._studio.obj = with_mass(obj, mass_g / 1000 if mass_g else None, material)
         self._weight = {"mass_g": mass_g, "material": material}
@@ -222,18 +272,30 @@ class Session:
         for name, value in phases.items():
             most = getattr(LONGEST, name, None)
             if most is None or not 0 <= float(value) <= most:
-                limits = ", ".join(f"{phase} 0 to {value:g}" for phase, value in LONGEST._asdict().items())
-                raise CongraspError(f"The {name[:20]} cannot be {str(value)[:20]}.", f"Write (s, m, s): {limits}.")
-        self._phases = self._phases._replace(**{name: float(value) for name, value in phases.items()})
+                limits = ", ".join(
+                    f"{phase} 0 to {value:g}" for phase, value in LONGEST._asdict().items()
+                )
+                raise CongraspError(
+                    f"The {name[:20]} cannot be {str(value)[:20]}.", f"Write (s, m, s): {limits}."
+                )
+        self._phases = self._phases._replace(
+            **{name: float(value) for name, value in phases.items()}
+        )
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
-        """Begins an import by `load`, which returns the object's name, and then shows the object."""
-        return self._load(f"importing {file}: repair and convex pieces, up to a minute", load, self._show)
+        """Begins an import by `load`, which returns the object's name, and then shows the
+        object.
+        """
+        return self._load(
+            f"importing {file}: repair and convex pieces, up to a minute", load, self._show
+        )
 
     def _choose_hand(self, name: str) -> None:
         """Loads the policy of another hand."""
         if name not in self._hands:
-            raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
+            raise CongraspError(
+                f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}."
+            )
 
         def show(grasping: PolicyGrasping) -> None:
             """Begins a request for it."""
@@ -242,8 +304,12 @@ class Session:
 
         self._load(f"loading the policy of the hand {name}", self._hands[name], show)
 
-    def _load(self, text: str, load: Callable[[], _T], show: Callable[[_T], None]) -> dict[str, Any]:
-        """Begins a job that loads something, and shows it afterwards; returns the state of the job."""
+    def _load(
+        self, text: str, load: Callable[[], _T], show: Callable[[_T], None]
+    ) -> dict[str, Any]:
+        """Begins a job that loads something, and shows it afterwards; returns the state of the
+        job.
+        """
 
         def work(progress: Progress) -> None:
             """Loads it."""
@@ -295,7 +361,12 @@ class Session:
         def work(progress: Progress) -> str:
             """Draws it."""
             self._drawn = drawing(
-                episode, key, kind, camera, frame, lambda share: progress(f"drawing the {kind}", share)
+                episode,
+                key,
+                kind,
+                camera,
+                frame,
+                lambda share: progress(f"drawing the {kind}", share),
             )
             return _DRAWING
 
@@ -332,7 +403,9 @@ def open_page(
     """
     shared = {name: functools.cache(load) for name, load in hands.items()}
     opened: list[Sessions] = []  # the port is taken before the programs compile
-    with contextlib.closing(PageServer(lambda browser: opened[0].routes(browser), host, port, names)) as server:
+    with contextlib.closing(
+        PageServer(lambda browser: opened[0].routes(browser), host, port, names)
+    ) as server:
         opened.append(Sessions(lambda: Session(shared, offered(objects), Importer(), window)))
         with contextlib.closing(opened[0]):
             yield server.url
@@ -370,7 +443,9 @@ class Jobs:
                 raise CongraspError(f"Please wait: {self.state()['text']}.")
 
     def state(self) -> dict[str, Any]:
-        """The current job, or the last one: number, running, text, share, error, and the key of its result (made)."""
+        """The current job, or the last one: number, running, text, share, error, and the key of its
+        result (made).
+        """
         with self._lock:
             seconds = f"{time.monotonic() - self._since:.0f}"
             return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
@@ -400,4 +475,11 @@ class Jobs:
 
 def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
     """A job's state at its start."""
-    return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}
+    return {
+        "number": number,
+        "running": running,
+        "text": text,
+        "share": 0.0,
+        "error": "",
+        "made": None,
+    }

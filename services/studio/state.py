@@ -1,4 +1,6 @@
-"""The request of the studio's user: object, constraints, and the effects of the priority rules; with undo and redo."""
+"""The request of the studio's user: object, constraints, and the effects of the priority rules;
+with undo and redo.
+"""
 
 import collections
 import dataclasses
@@ -15,7 +17,14 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import Constraint, get_constraint, goal_of, known, optional, require_known
+from congrasp.common.task.constraints import (
+    Constraint,
+    get_constraint,
+    goal_of,
+    known,
+    optional,
+    require_known,
+)
 from congrasp.common.task.constraints.priority import Resolution, explain, resolve
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import BACK_OFF
@@ -23,7 +32,15 @@ from congrasp.common.task.sampling.sets import make_sets
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.approaches import with_avoid
-from congrasp.services.studio.drawing import Arrow, Canvas, Paint, arrow_through, from_above, stroke, vector
+from congrasp.services.studio.drawing import (
+    Arrow,
+    Canvas,
+    Paint,
+    arrow_through,
+    from_above,
+    stroke,
+    vector,
+)
 
 Fields = Mapping[str, np.ndarray]
 """Goal arrays of a constraint by field, without batch axis."""
@@ -52,19 +69,24 @@ class Edit(NamedTuple):
 
 
 class Studio:
-    """One user's request. Its methods are the user's actions, and raise a CongraspError if they are impossible.
+    """One user's request. Its methods are the user's actions, and raise a CongraspError if they are
+    impossible.
 
     Attributes:
       obj: the object, without paint.
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
-      fields: goal arrays of the constraints that have been set, on or off; those with flags have some from the start.
-      canvas: the object's surface, with the painted avoid region.
+      fields: goal arrays of the constraints that have been set, on or off; those with flags have
+      some from the start. canvas: the object's surface, with the painted avoid region.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
         """Begins with an object, and a heading from above."""
-        self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects keep their size
+        # Objects keep their size
+        self.hand, self.task = (
+            hand,
+            dataclasses.replace(task, object_scale=1.0),
+        )
         self.take(obj)
 
     def take(self, obj: GraspObject) -> None:
@@ -122,19 +144,28 @@ class Studio:
     def choose(self, constraint: str, field: str, values: Any) -> None:
         """Sets the flags of a constraint without a drawing tool, and switches it on."""
         require_known([constraint], self.task)
-        if tool_of(get_constraint(constraint)) or field not in get_constraint(constraint).labels(self.hand):
+        if tool_of(get_constraint(constraint)) or field not in get_constraint(constraint).labels(
+            self.hand
+        ):
             others = [c.name for c in optional(self.task) if not tool_of(c)]
-            raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {others}.")
+            raise CongraspError(
+                f"There is nothing to choose for '{constraint}'.", f"Choose for: {others}."
+            )
         flags = self.fields[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):
             raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
-        self._set(constraint, {**self.fields[constraint], field: np.array([bool(value) for value in values])})
+        self._set(
+            constraint,
+            {**self.fields[constraint], field: np.array([bool(value) for value in values])},
+        )
         self._switch(constraint, True)
 
     def set_heading(self, surface: Any, direction: Any) -> None:
-        """Sets the heading through a point (3,) of the surface in a direction (3,) of any length above zero.
+        """Sets the heading through a point (3,) of the surface in a direction (3,) of any length
+        above zero.
 
-        Its target is `INWARD` beyond the point, as in training, and its roll changes as little as possible.
+        Its target is `INWARD` beyond the point, as in training, and its roll changes as little as
+        possible.
         """
         self.arrow = arrow_through(surface, direction, self.arrow.cross)
 
@@ -144,7 +175,8 @@ class Studio:
         self.arrow = self.arrow.with_roll(angle, self.up)
 
     def paint(self, points: Any, radius: float, avoid: bool) -> None:
-        """Adds the surface near points (N, 3) to the avoid region, or removes it; see `Canvas.brush`.
+        """Adds the surface near points (N, 3) to the avoid region, or removes it; see
+        `Canvas.brush`.
 
         The constraint on the region is requested while there is paint.
         """
@@ -165,25 +197,33 @@ class Studio:
     def draw(self, points: Any) -> None:
         """Requests a wrist path through points (N, 3) of the object frame, from far to near.
 
-        A displacement that grows along the path makes it end at the wrist of the reference pose, or of the hand closed
-        at the arrow. The orientation of the wrist is that of the end throughout.
+        A displacement that grows along the path makes it end at the wrist of the reference pose, or
+        of the hand closed at the arrow. The orientation of the wrist is that of the end throughout.
         """
         name, drawn = self._drawn_by("path"), stroke("path", points)
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=-1))])
         if along[-1] < _LEAST_PATH:
             raise CongraspError(
-                f"The path is {100 * along[-1]:.1f} cm long.", f"Draw {100 * _LEAST_PATH:.0f} cm or more."
+                f"The path is {100 * along[-1]:.1f} cm long.",
+                f"Draw {100 * _LEAST_PATH:.0f} cm or more.",
             )
-        poses = [self.fields[c.name] for c in known(self.task) if tool_of(c) == "hand" and c.name in self.fields]
+        poses = [
+            self.fields[c.name]
+            for c in known(self.task)
+            if tool_of(c) == "hand" and c.name in self.fields
+        ]
         end = poses[0] if poses else self._closed()
         share = np.linspace(0.0, 1.0, self.task.trajectory_points)
         even = np.stack([np.interp(share * along[-1], along, drawn[:, i]) for i in range(3)], -1)
         position = even + share[:, None] * (end["position"] - even[-1])
-        self._set(name, {"position": position, "quaternion": np.tile(end["quaternion"], (len(share), 1))})
+        self._set(
+            name, {"position": position, "quaternion": np.tile(end["quaternion"], (len(share), 1))}
+        )
         self._switch(name, True)
 
     def suggest(self, constraint: str) -> None:
-        """Requests the next heading, reference pose or wrist path that training would draw for this object.
+        """Requests the next heading, reference pose or wrist path that training would draw for this
+        object.
 
         Raises:
           CongraspError: there are none in this resting pose.
@@ -191,17 +231,27 @@ class Studio:
         require_known([constraint], self.task)
         if tool_of(get_constraint(constraint)) in ("", "paint"):
             placed = [c.name for c in known(self.task) if tool_of(c) not in ("", "paint")]
-            raise CongraspError(f"Nothing can be suggested for '{constraint}'.", f"Choose from: {', '.join(placed)}.")
+            raise CongraspError(
+                f"Nothing can be suggested for '{constraint}'.",
+                f"Choose from: {', '.join(placed)}.",
+            )
         self._suggest(constraint)
         if get_constraint(constraint).optional:
             self._switch(constraint, True)
 
     def _suggest(self, name: str) -> None:
-        """Sets the goal arrays of `suggest`; those of a reference also for weaker constraints from references."""
+        """Sets the goal arrays of `suggest`; those of a reference also for weaker constraints from
+        references.
+        """
         sets, reference = self._constraint_sets().arrays, get_constraint(name).from_reference
         same = [c.name for c in known(self.task) if c.from_reference == reference]
-        region = max((get_constraint(asked).region for asked in self.asked), default=0) * self.canvas.avoid.any()
-        allowed = next(sets[f"{other}/allowed"] for other in same if f"{other}/allowed" in sets)[region, self.rest]
+        region = (
+            max((get_constraint(asked).region for asked in self.asked), default=0)
+            * self.canvas.avoid.any()
+        )
+        allowed = next(sets[f"{other}/allowed"] for other in same if f"{other}/allowed" in sets)[
+            region, self.rest
+        ]
         slots = np.flatnonzero(allowed)
         if not len(slots):
             raise CongraspError(
@@ -211,10 +261,14 @@ class Studio:
         slot = slots[(self._suggested[name] * 7919) % len(slots)]
         self._suggested[name] += 1
         for other in same[: same.index(name) + 1]:
-            fields = {field: sets[f"{other}/{field}"][region, slot] for field in get_constraint(other).arrays}
+            fields = {
+                field: sets[f"{other}/{field}"][region, slot]
+                for field in get_constraint(other).arrays
+            }
             if f"{other}/back" in sets:
                 fields["position"] = (
-                    fields["position"] - sets[f"{other}/back"][region, self.rest, slot] * fields["direction"]
+                    fields["position"]
+                    - sets[f"{other}/back"][region, self.rest, slot] * fields["direction"]
                 )
             self._set(other, fields)
 
@@ -238,7 +292,9 @@ class Studio:
         """The request, possible or not."""
         active = [c for c in known(self.task) if not c.optional or c.name in self.asked]
         avoid = self.canvas.avoid if any(tool_of(c) == "paint" for c in active) else None
-        return GraspRequest({c.name: self.fields.get(c.name, {}) for c in active}, avoid, rest=self.rest)
+        return GraspRequest(
+            {c.name: self.fields.get(c.name, {}) for c in active}, avoid, rest=self.rest
+        )
 
     @property
     def goal(self) -> Goal:
@@ -251,7 +307,9 @@ class Studio:
         asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
         goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
         found = _resolve(self.hand, self._surface, goal, asked)
-        return Resolution(found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
+        return Resolution(
+            found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0]
+        )
 
     @property
     def explanation(self) -> list[str]:
@@ -264,20 +322,29 @@ class Studio:
         goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
         asked = [c for c in optional(self.task) if c.name in self.asked]
         for constraint in asked:
-            if tool_of(constraint) == "paint" and (self.canvas.avoid.all() or not self.canvas.avoid.any()):
+            if tool_of(constraint) == "paint" and (
+                self.canvas.avoid.all() or not self.canvas.avoid.any()
+            ):
                 what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
                 return f"{what} painted as avoid region. Paint a part of the object with the brush."
             if not constraint.valid(self._surface, goal[constraint.name])[0]:
                 return " ".join(constraint.invalid)
         found = self.resolution
         if not found.aligned:
-            return "The wrist path ends nearer to the avoid region. Draw another path, or paint elsewhere."
+            return (
+                "The wrist path ends nearer to the avoid region. Draw another path, or paint "
+                "elsewhere."
+            )
         paths = [found.goal[c.name].position for c in asked if tool_of(c) == "path"]
         if any(self._world(point)[2] < 0 for path in paths for point in path):
-            return "The wrist path goes through the table. Draw it higher, or take another suggestion."
+            return (
+                "The wrist path goes through the table. Draw it higher, or take another suggestion."
+            )
         heading = found.goal["heading"]
         if not paths and self._world(heading.position - BACK_OFF * heading.direction)[2] < 0:
-            return "The approach begins under the table. Turn the arrow so that it comes from above."
+            return (
+                "The approach begins under the table. Turn the arrow so that it comes from above."
+            )
         return ""
 
     @property
@@ -291,17 +358,23 @@ class Studio:
         return Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.avoid[None])
 
     def _drawn_by(self, tool: Tool) -> str:
-        """Name of the constraint of a drawing tool; raises a CongraspError if the policy supports none."""
+        """Name of the constraint of a drawing tool; raises a CongraspError if the policy supports
+        none.
+        """
         for constraint in known(self.task):
             if tool_of(constraint) == tool:
                 return constraint.name
         names = ", ".join(self.task.constraints)
-        raise CongraspError(f"The policy supports no constraint of the tool '{tool}'.", f"It supports {names}.")
+        raise CongraspError(
+            f"The policy supports no constraint of the tool '{tool}'.", f"It supports {names}."
+        )
 
     def _closed(self) -> Fields:
         """Reference pose of the hand at the arrow, closed around the object."""
         arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
-        pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
+        pose = closed_poses(
+            self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow
+        )
         return {name: np.asarray(field)[0] for name, field in pose._asdict().items()}
 
     def _set(self, constraint: str, fields: Fields) -> None:
@@ -343,7 +416,9 @@ ACTIONS = {
     "draw": "wrist path",
     "suggest": "suggestion",
 }
-"""Methods of `Studio` that a page may call, with their arguments by name, and their labels on the page."""
+"""Methods of `Studio` that a page may call, with their arguments by name, and their labels on the
+page.
+"""
 
 
 class History:
@@ -357,7 +432,8 @@ class History:
         self._gesture: Any = None
 
     def do(self, action: str, *, gesture: Any = None, **values: Any) -> None:
-        """Calls one of `ACTIONS`. Successive calls of one gesture, such as dragging a slider, are one edit.
+        """Calls one of `ACTIONS`. Successive calls of one gesture, such as dragging a slider, are
+        one edit.
 
         Raises:
           CongraspError: the action fails.

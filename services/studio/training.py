@@ -1,6 +1,8 @@
-"""State of a run while it trains, and its recorded episodes: curves, events, counters, and newest episodes of actors.
+"""State of a run while it trains, and its recorded episodes: curves, events, counters, and newest
+episodes of actors.
 
-It accepts log messages and the learner's status from any receiver, and is independent of network and browser.
+It accepts log messages and the learner's status from any receiver, and is independent of network
+and browser.
 """
 
 import bisect
@@ -54,7 +56,9 @@ _STALE = 15.0  # seconds after which an actor that the learner no longer lists i
 
 @dataclasses.dataclass
 class Curve:
-    """A metric over the updates of a run; after a return to a checkpoint, later values replace earlier ones."""
+    """A metric over the updates of a run; after a return to a checkpoint, later values replace
+    earlier ones.
+    """
 
     steps: list[float] = dataclasses.field(default_factory=list)
     values: list[float] = dataclasses.field(default_factory=list)
@@ -71,14 +75,23 @@ class Curve:
         self.times.append(time)
 
     def thinned(self, most: int) -> dict[str, list[float]]:
-        """At most `most` points for a page: of each section the lowest, the highest and the sharpest one."""
+        """At most `most` points for a page: of each section the lowest, the highest and the
+        sharpest one.
+        """
         index = np.arange(len(self.steps))
         if len(index) > most:
             values = np.array(self.values)
             sudden = np.abs(np.diff(np.pad(values, 1, "edge"), 2))
             parts = np.array_split(index, most // 3)
-            index = np.unique([[p[values[p].argmin()], p[values[p].argmax()], p[sudden[p].argmax()]] for p in parts])
-        return {name: [getattr(self, name)[i] for i in index] for name in ("steps", "values", "times")}
+            index = np.unique(
+                [
+                    [p[values[p].argmin()], p[values[p].argmax()], p[sudden[p].argmax()]]
+                    for p in parts
+                ]
+            )
+        return {
+            name: [getattr(self, name)[i] for i in index] for name in ("steps", "values", "times")
+        }
 
 
 @dataclasses.dataclass
@@ -89,7 +102,9 @@ class Actor:
     episode: Message | None = None
     """Its newest episode."""
     episodes: int = 0
-    recent: collections.deque[bool] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=_TREND))
+    recent: collections.deque[bool] = dataclasses.field(
+        default_factory=lambda: collections.deque(maxlen=_TREND)
+    )
     """Success of its last episodes."""
     last: dict[str, float] = dataclasses.field(default_factory=dict)
     """Version, rollouts and steps per second of its last report."""
@@ -145,7 +160,8 @@ class TrainingWindow:
                     del self._actors[name]
 
     def load(self) -> None:
-        """Reads curves and events from the recordings, and the last report and newest episode of every actor.
+        """Reads curves and events from the recordings, and the last report and newest episode of
+        every actor.
 
         Logs a warning if they cannot be read.
         """
@@ -163,19 +179,25 @@ class TrainingWindow:
         """Does the work of `load`."""
         newest: dict[str, Record] = {}
         for file in log_files(path):
-            for record in read_records(file, lambda topic: topic.startswith(_READ) or is_episode(topic)):
+            for record in read_records(
+                file, lambda topic: topic.startswith(_READ) or is_episode(topic)
+            ):
                 _, kind, role, name = record.topic.split("/", 3)
                 if kind == "events":
                     event = Log.FromString(record.data)
                     with self._lock:
-                        self._event(record.time / 1e9, Log.Level.Name(event.level).lower(), event.message)
+                        self._event(
+                            record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
+                        )
                     continue
                 if kind == "episode":
                     newest[role] = record
                     continue
                 meta = metrics_of(record)
                 with self._lock:
-                    self._metrics(role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9)
+                    self._metrics(
+                        role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9
+                    )
         for name, record in newest.items():
             with self._lock:
                 if name not in self._actors or self._actors[name].episode is None:
@@ -191,7 +213,8 @@ class TrainingWindow:
             known = self._actors.get(actor)
             if known is None or known.episode is None:
                 raise CongraspError(
-                    f"There is no episode of the actor '{actor}' yet.", "Wait: actors send one from time to time."
+                    f"There is no episode of the actor '{actor}' yet.",
+                    "Wait: actors send one from time to time.",
                 )
             return known.episode
 
@@ -202,7 +225,9 @@ class TrainingWindow:
             if found is not None:
                 roles = {role["id"]: role for role in found["roles"] if role["role"] == "actor"}
             phase = self._phase()
-            first = FIRST if phase in ("training", "disconnected") else (*FIRST, *self._labels_of_all())
+            first = (
+                FIRST if phase in ("training", "disconnected") else (*FIRST, *self._labels_of_all())
+            )
             wanted = [name for name in names or dict.fromkeys(first) if name in self._curves]
             return {
                 "run": self.run,
@@ -226,7 +251,9 @@ class TrainingWindow:
             }
 
     def _phase(self) -> str:
-        """Phase of the run: training, finished, disconnected, or recorded (read from its recordings alone)."""
+        """Phase of the run: training, finished, disconnected, or recorded (read from its recordings
+        alone).
+        """
         if self._status is not None and self._status["finished"]:
             return "finished"
         if not self.live and self._status is None:
@@ -234,8 +261,14 @@ class TrainingWindow:
         return "disconnected" if self._disconnected else "training"
 
     def _last(self) -> dict[str, float]:
-        """Update and time (seconds since 1970) of the newest point, and the newest success and throughput."""
-        found = {name: self._curves[curve].values[-1] for name, curve in _LAST.items() if curve in self._curves}
+        """Update and time (seconds since 1970) of the newest point, and the newest success and
+        throughput.
+        """
+        found = {
+            name: self._curves[curve].values[-1]
+            for name, curve in _LAST.items()
+            if curve in self._curves
+        }
         ends = [(curve.steps[-1], curve.times[-1]) for curve in self._curves.values()]
         return found | (dict(zip(("update", "time"), max(ends), strict=True)) if ends else {})
 
@@ -292,16 +325,25 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     """Title, unit and group of each metric, in the order of the figures of `congrasp plot`."""
     any_values = np.arange(2.0), np.arange(2.0)
     found = {}
-    for group, panels in figures({"": {f"learner/0/{name}": any_values for name in metrics}}).values():
+    for group, panels in figures(
+        {"": {f"learner/0/{name}": any_values for name in metrics}}
+    ).values():
         for panel in panels:
             for name in panel.metrics:
-                title = panel.title if len(panel.metrics) == 1 else f"{panel.title}: {name.rpartition('_')[2]}"
+                title = (
+                    panel.title
+                    if len(panel.metrics) == 1
+                    else f"{panel.title}: {name.rpartition('_')[2]}"
+                )
                 found[name] = {"title": title, "unit": panel.unit, "group": group}
-    return found | {n: {"title": n, "unit": "", "group": "Details"} for n in sorted(metrics) if n not in found}
+    return found | {
+        n: {"title": n, "unit": "", "group": "Details"} for n in sorted(metrics) if n not in found
+    }
 
 
 def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
-    """Returns the window on a run, which reads its recordings in the background: that takes seconds for a long run.
+    """Returns the window on a run, which reads its recordings in the background: that takes seconds
+    for a long run.
 
     Args:
       run: name of the run; empty for that of the recordings' folder.
@@ -325,7 +367,9 @@ class Follower:
         window.live = True
         self._stop = threading.Event()
         self._subscription = transport.subscribe(Keys(window.run).logs, depth=1024)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._ask)]
+        self._threads = [
+            threading.Thread(target=work, daemon=True) for work in (self._receive, self._ask)
+        ]
         for thread in self._threads:
             thread.start()
 
@@ -396,7 +440,10 @@ class Recordings:
             if found:
                 break
         found = sorted(found, key=lambda item: abs(item[0] - 1e9 * time))[:MOST]
-        kept = {f"{when}{topic}": decode(data) for when, topic, data in sorted(found, key=lambda item: item[0])}
+        kept = {
+            f"{when}{topic}": decode(data)
+            for when, topic, data in sorted(found, key=lambda item: item[0])
+        }
         with self._lock:
             self._found = kept
         return farther * seconds, [_recorded(key, message) for key, message in kept.items()]
@@ -409,7 +456,9 @@ class Recordings:
         """
         with self._lock:
             if key not in self._found:
-                raise CongraspError("This episode is not among those found last.", "Click the curve again.")
+                raise CongraspError(
+                    "This episode is not among those found last.", "Click the curve again."
+                )
             return self._found[key]
 
 
@@ -438,15 +487,27 @@ def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, by
 
 
 def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
-    """Does the work of `_within` by the index of a finished file; None if it is unfinished, or damaged where read."""
-    with os_errors_as(f"{file} cannot be read"), contextlib.suppress(*DAMAGE), file.open("rb") as stream:
-        if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:
+    """Does the work of `_within` by the index of a finished file; None if it is unfinished, or
+    damaged where read.
+    """
+    with (
+        os_errors_as(f"{file} cannot be read"),
+        contextlib.suppress(*DAMAGE),
+        file.open("rb") as stream,
+    ):
+        if (summary := intact_summary(stream)) is None or (
+            statistics := summary.statistics
+        ) is None:
             return None
         if statistics.message_start_time > end or statistics.message_end_time < begin:
             return []
-        topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
+        topics = [
+            channel.topic for channel in summary.channels.values() if is_episode(channel.topic)
+        ]
         messages = (
-            make_reader(stream, validate_crcs=True).iter_messages(topics, starting_at=begin, ending_before=end)
+            make_reader(stream, validate_crcs=True).iter_messages(
+                topics, starting_at=begin, ending_before=end
+            )
             if topics
             else ()
         )

@@ -63,7 +63,8 @@ def run_training(
       The exit code.
 
     Raises:
-      CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed permanently.
+      CongraspError: the arguments contradict each other, the configuration cannot run, or a process
+      failed permanently.
     """
     imported()
     plan = launch.planned(config)
@@ -102,23 +103,35 @@ def _warn(text: str) -> None:
     console.print(f"  {text}", style="yellow", markup=False)
 
 
-def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:
+def _prepare(
+    run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool
+) -> None:
     """Creates the run's directory, or opens the existing one."""
     if resume:
         continue_run(run_dir, config)
         if not has_checkpoints(run_dir):
-            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir.")
-        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False))
+            raise CongraspError(
+                f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir."
+            )
+        Checkpoints(run_dir / CHECKPOINTS).find(
+            lambda level, text: console.print(text, markup=False)
+        )
         return
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
-        raise CongraspError(f"{run_dir} is not empty and is not a run.", "Choose another --run-dir.")
+        raise CongraspError(
+            f"{run_dir} is not empty and is not a run.", "Choose another --run-dir."
+        )
     _check(config)
     policy = None if initial is None else bundles.load(initial)
     create_run(run_dir, config, policy)
     spec = policy_spec(config.task, config.network)
-    if policy is not None and (policy.spec.layout, policy.spec.privileged) != (spec.layout, spec.privileged):
+    if policy is not None and (policy.spec.layout, policy.spec.privileged) != (
+        spec.layout,
+        spec.privileged,
+    ):
         console.print(
-            f"{initial} has other inputs than this run's policy or critic; the new ones start at zero weight.",
+            f"{initial} has other inputs than this run's policy or critic; the new ones start at "
+            f"zero weight.",
             markup=False,
         )
 
@@ -129,13 +142,15 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     steps = ranks * config.rollout_steps * config.environments * config.rollouts_per_update
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {steps} steps, "
-        f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
+        f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on "
+        f"'{plan.physics}' in "
         f"{run_dir}"
     )
     simplifications = easier(config)
     if simplifications:
         console.print(
-            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU."
+            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset "
+            f"{FULL}, for a GPU."
         )
 
 
@@ -144,12 +159,16 @@ def _check(config: RunConfig) -> None:
     make_algorithm(policy_spec(config.task, config.network), config)
     load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
     if config.environments < 1 or config.rollout_steps < 1:
-        raise CongraspError(f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty.")
+        raise CongraspError(
+            f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty."
+        )
 
 
 @contextlib.contextmanager
 def _full_disk_named(run_dir: pathlib.Path) -> Iterator[None]:
-    """Context that reports a full disk, since a process that dies of it cannot write its error to its log."""
+    """Context that reports a full disk, since a process that dies of it cannot write its error to
+    its log.
+    """
     try:
         yield
     except CongraspError:
@@ -166,7 +185,14 @@ def untrained(config: RunConfig) -> PolicyBundle:
     spec = policy_spec(config.task, config.network)
     algorithm = make_algorithm(spec, config)
     policy = algorithm.policy(algorithm.init(config.seed))
-    return PolicyBundle(spec=spec, task=config.task, version=0, run_id="untrained", transitions=0, **policy._asdict())
+    return PolicyBundle(
+        spec=spec,
+        task=config.task,
+        version=0,
+        run_id="untrained",
+        transitions=0,
+        **policy._asdict(),
+    )
 
 
 class _Progress:
@@ -190,10 +216,19 @@ class _Progress:
 
     def update(self, values: dict[str, float]) -> None:
         """Shows the metrics of an update of this process's learner."""
-        self.show({"values": values, "actors": 1, "update": values["update"], "version": int(values["version"])})
+        self.show(
+            {
+                "values": values,
+                "actors": 1,
+                "update": values["update"],
+                "version": int(values["version"]),
+            }
+        )
 
     def show(self, status: dict[str, Any]) -> None:
-        """Shows the learner's newest metrics, if any, the number of actors and, after the first update, the start."""
+        """Shows the learner's newest metrics, if any, the number of actors and, after the first
+        update, the start.
+        """
         now = time.monotonic()
         if "transitions" in status.get("values", {}):
             if self._first is None:
@@ -201,9 +236,11 @@ class _Progress:
             self._line = self._progress(status, now)
         elif self._first is None:
             self._line = (
-                f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
+                f"compiling, and filling the first batch: {now - self._began:.0f} s, "
+                f"{status['actors']} actor(s)"
             )
-        self._live.update(Padding(self._line, 0))  # a text would be cropped, since the console does not wrap
+        # A text would be cropped, since the console does not wrap
+        self._live.update(Padding(self._line, 0))
         if not console.is_terminal and now - self._last >= _LINE_SECONDS:
             self._last = now
             self._print()
@@ -215,7 +252,9 @@ class _Progress:
             self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
-        """Formats the metrics as one line; the time left is estimated from the first update on, without compilation."""
+        """Formats the metrics as one line; the time left is estimated from the first update on,
+        without compilation.
+        """
         values, updates = status["values"], self._config.updates
         update = status["update"]
         self._first = self._first or (now, update)
@@ -232,26 +271,44 @@ class _Progress:
 
 
 def first_update() -> str:
-    """Stages of this process until the first update, one on each line; other processes log theirs."""
+    """Stages of this process until the first update, one on each line; other processes log
+    theirs.
+    """
     lines = [f"    {one.began:6.1f} to {one.ended:6.1f} s: {one.name}" for one in stages()]
-    return "\n".join([f"  First update {since_start():.1f} s after the start; its stages, partly in parallel:", *lines])
+    return "\n".join(
+        [
+            f"  First update {since_start():.1f} s after the start; its stages, partly in "
+            f"parallel:",
+            *lines,
+        ]
+    )
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
-    """Evaluates headings on held-out objects, draws an episode, a success if there is one, and queries a server."""
+    """Evaluates headings on held-out objects, draws an episode, a success if there is one, and
+    queries a server.
+    """
     objects = config.objects
     if not objects.folder:
-        objects = ObjectsConfig(families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
+        objects = ObjectsConfig(
+            families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED
+        )
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
     policy = dataclasses.replace(bundles.load(run_dir / POLICY_FILE), task=config.task)
-    heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False)
-    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):  # starts meanwhile
+    heading = Experiment(
+        policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False
+    )
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (
+        endpoint,
+        _,
+    ):  # starts meanwhile
         (result,) = heading.run([Variation()], keep=True)
         save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
         row = result.row
         console.print(
-            f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
+            f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval "
+            f"{100 * row.success_low:.1f} to "
             f"{100 * row.success_high:.1f}): "
             f"{row.links_at_removal:.1f} links touch the object when the table is removed."
         )
@@ -265,9 +322,16 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
 def _next_steps(run_dir: pathlib.Path) -> None:
     """Prints the location of the results and commands to inspect them."""
     congrasp = _command()
-    rows = [(str(run_dir / EPISODE), "an episode of the trained policy")] if (run_dir / EPISODE).exists() else []
+    rows = (
+        [(str(run_dir / EPISODE), "an episode of the trained policy")]
+        if (run_dir / EPISODE).exists()
+        else []
+    )
     rows += [
-        (f"{congrasp} grasp mug:0 --video", "a grasp by the pretrained policy of the full task; or your own mesh"),
+        (
+            f"{congrasp} grasp mug:0 --video",
+            "a grasp by the pretrained policy of the full task; or your own mesh",
+        ),
         (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
         (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
         (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),
@@ -281,4 +345,6 @@ def _next_steps(run_dir: pathlib.Path) -> None:
 def _command() -> str:
     """Command line of this installation."""
     script = pathlib.Path(sys.executable).with_name("congrasp")
-    return "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)
+    return (
+        "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)
+    )

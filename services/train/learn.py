@@ -1,4 +1,6 @@
-"""Runs a learner with its metrics and recordings and, if rollouts stay on the device, an actor in the same process."""
+"""Runs a learner with its metrics and recordings and, if rollouts stay on the device, an actor in
+the same process.
+"""
 
 import contextlib
 import dataclasses
@@ -35,7 +37,7 @@ _START_SECONDS = 0.5
 """Head start of the learner, which must listen first, over the actor, s."""
 
 
-def learn(
+def learn(  # noqa: PLR0913
     run_dir: pathlib.Path,
     config: RunConfig,
     *,
@@ -51,14 +53,14 @@ def learn(
 ) -> None:
     """Runs a learner from the newest checkpoint, if there is one, until it is finished or stopped.
 
-    An actor in the same process shares the processors: acting with old weights during an update would gain nothing.
-    Updates are then on-policy, regardless of `max_staleness`.
+    An actor in the same process shares the processors: acting with old weights during an update
+    would gain nothing. Updates are then on-policy, regardless of `max_staleness`.
 
     Args:
       run_dir: see `run_learner`, also for `config`, `ranks`, `on_update` and `on_event`.
-      wire: a listening transport for rollouts and status queries of others; None only with an actor inside.
-      inside: engine of an actor in this process, over the in-memory transport; None for no actor.
-      stop: ends training.
+      wire: a listening transport for rollouts and status queries of others; None only with an actor
+      inside. inside: engine of an actor in this process, over the in-memory transport; None for no
+      actor. stop: ends training.
       writers: metric writers of rank 0.
       watch: endpoint of the metrics.
       grace: deadline for the end of the actor inside, s.
@@ -80,7 +82,9 @@ def learn(
 
         stack.enter_context(watch.exposed(metrics))
         if inside is not None:
-            stack.enter_context(_actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace))
+            stack.enter_context(
+                _actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace)
+            )
         run_learner(
             run_dir,
             config,
@@ -89,7 +93,9 @@ def learn(
             resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
             audit=inside is None,
-            recorder=recorded(transport, config, run_dir, run_dir / LOGS, writers) if rank == 0 else None,
+            recorder=recorded(transport, config, run_dir, run_dir / LOGS, writers)
+            if rank == 0
+            else None,
             on_update=updated,
             on_event=on_event,
         )
@@ -112,7 +118,9 @@ def _actor_thread(
     stop: threading.Event,
     grace: float,
 ) -> Iterator[None]:
-    """Context with an actor in a separate thread; a failure sets `stop`, and its error is raised."""
+    """Context with an actor in a separate thread; a failure sets `stop`, and its error is
+    raised.
+    """
     failures: list[BaseException] = []
     ended = threading.Event()
 
@@ -172,4 +180,12 @@ def until_first_update(
         run_dir = pathlib.Path(folder, "run")
         config = dataclasses.replace(config, updates=1)
         create_run(run_dir, config, None)
-        learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, on_update=updated, grace=_GRACE)
+        learn(
+            run_dir,
+            config,
+            wire=None,
+            inside=engine_of(physics, False),
+            stop=stop,
+            on_update=updated,
+            grace=_GRACE,
+        )

@@ -1,7 +1,8 @@
-"""The flow of `congrasp hands train`: self-check, training, evaluation, and one report about a hand.
+"""The flow of `congrasp hands train`: self-check, training, evaluation, and one report about a
+hand.
 
-Each stage is a separate command in a separate process, so that it has the whole GPU memory. Results are in one folder,
-and repeating the command runs only the missing stages.
+Each stage is a separate command in a separate process, so that it has the whole GPU memory. Results
+are in one folder, and repeating the command runs only the missing stages.
 """
 
 import dataclasses
@@ -71,7 +72,8 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
       File of the trained policy in the run's folder.
 
     Raises:
-      CongraspError: the self-check failed, a stage failed, or the folder holds the training of another hand.
+      CongraspError: the self-check failed, a stage failed, or the folder holds the training of
+      another hand.
     """
     need_package("The report", "jinja2")
     _begin(request)
@@ -87,13 +89,16 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
 
 
 def _begin(request: Request) -> None:
-    """Creates the folder for this hand; raises a CongraspError if it holds the training of another."""
+    """Creates the folder for this hand; raises a CongraspError if it holds the training of
+    another.
+    """
     file, text = request.out / HAND, hand_text(request.hand).encode()
     if file.exists() and file.read_bytes() == text:
         return
     if any(request.out.glob(f"*/{CONFIG_FILE}")):
         raise CongraspError(
-            f"{request.out} holds the training of another hand, or of an earlier version of this one.",
+            f"{request.out} holds the training of another hand, or of an earlier version of this "
+            f"one.",
             "Pass another --out, or remove the folder.",
         )
     (request.out / CHECK).unlink(missing_ok=True)
@@ -104,7 +109,9 @@ def _check(request: Request, note: Callable[[str], None]) -> None:
     """Runs the self-check, unless it exists."""
     file = request.out / CHECK
     if not file.exists():
-        arguments = command("hands", "check", request.reference, json=file, png=file.with_suffix(".png"))
+        arguments = command(
+            "hands", "check", request.reference, json=file, png=file.with_suffix(".png")
+        )
         _run(request, "check", arguments, (0, 1), {"JAX_PLATFORMS": "cpu"})
     findings: list[Finding] = read_findings(file)
     for finding in findings:
@@ -130,8 +137,13 @@ def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
             said, told = time.monotonic(), line
             note(f"  {line}")
 
-    options = [*(command(physics=request.physics, updates=_UPDATES) if request.full else []), *request.options]
-    train_in_background(request.run_dir, chosen, options, patience=request.patience, progress=progress)
+    options = [
+        *(command(physics=request.physics, updates=_UPDATES) if request.full else []),
+        *request.options,
+    ]
+    train_in_background(
+        request.run_dir, chosen, options, patience=request.patience, progress=progress
+    )
     return request.run_dir / POLICY_FILE
 
 
@@ -144,7 +156,10 @@ def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]
     if own.exists():
         there, fresh = bundles.load(own), bundles.load(policy)
         if there.spec.hand == hand.reference and there.transitions > fresh.transitions:
-            note(f"{own} has more training ({there.transitions:,} steps) and remains; this one is --policy {policy}.")
+            note(
+                f"{own} has more training ({there.transitions:,} steps) and remains; this one is "
+                f"--policy {policy}."
+            )
             return
     write_atomically(own, policy.read_bytes())
     note(f"The policy of --hand {hand.name} is {own}.")
@@ -153,7 +168,11 @@ def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]
 def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
     """Runs evaluation and report, unless they exist for this policy."""
     rows, page = request.out / _ROWS, request.out / REPORT
-    about = {"content": bundles.content_hash(policy.read_bytes()), "episodes": request.episodes, "pool": request.pool}
+    about = {
+        "content": bundles.content_hash(policy.read_bytes()),
+        "episodes": request.episodes,
+        "pool": request.pool,
+    }
     if not (page.exists() and rows.exists() and about.items() <= read_json(rows, _LARGEST).items()):
         note(f"Evaluating {request.episodes} episodes of each constraint …")
         measured = {"physics": request.physics, "episodes": request.episodes, "pool": request.pool}
@@ -166,13 +185,25 @@ def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None])
     note(f"The report is {page}" + (f"; the training took {took / 60:.1f} min." if took else "."))
 
 
-def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...], environment: dict[str, str]) -> None:
+def _run(
+    request: Request,
+    name: str,
+    arguments: list[str],
+    fine: tuple[int, ...],
+    environment: dict[str, str],
+) -> None:
     """Runs a stage; raises a CongraspError unless it ends with one of the exit codes."""
     child = Child(name, arguments, request.out / f"{name}.log", environment)
     code = run_child(child, _PATIENCE)
     if code not in fine:
-        why = f"was ended after {_PATIENCE / 60:.0f} min" if code is None else f"failed: {child.last_line()}"
-        raise CongraspError(f"The {name} of '{request.hand.name}' {why}", f"Its log is {child.log}.")
+        why = (
+            f"was ended after {_PATIENCE / 60:.0f} min"
+            if code is None
+            else f"failed: {child.last_line()}"
+        )
+        raise CongraspError(
+            f"The {name} of '{request.hand.name}' {why}", f"Its log is {child.log}."
+        )
 
 
 def _what_a_gpu_would_take(request: Request) -> str:
@@ -180,7 +211,9 @@ def _what_a_gpu_would_take(request: Request) -> str:
     full = get_preset(FULL, request.reference)
     steps = _UPDATES * full.environments * full.rollout_steps * full.rollouts_per_update
     return (
-        "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at "
-        f"best. On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, about "
+        "This machine has no GPU: a short training of an easier task follows, whose policy grasps "
+        "from above at "
+        f"best. On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, "
+        f"about "
         f"{steps / _RATE / 60:.0f} minutes of one H200 and five minutes for start and report."
     )

@@ -1,21 +1,25 @@
-"""Named configurations: the full task for any hand, students with the sensors of a robot, and short runs.
+"""Named configurations: the full task for any hand, students with the sensors of a robot, and short
+runs.
 
 Differences between hands in the recipe of the full task are computed from the hand.
 
-The size of a hand determines the factor s on its objects (`Hand.object_scale`; the paper's for its hands,
-`common.hands.motors.fitting_scale` for others), its strength is the force F with which its fingertips can press (the
-mean of `common.hands.motors.tip_forces`: torque limits over lengths); G is the number of its fingers. Its mass has no
-effect, because the virtual wrist is scaled to it (`common.hands.spec.wrist_gains`).
+The size of a hand determines the factor s on its objects (`Hand.object_scale`; the paper's for its
+hands, `common.hands.motors.fitting_scale` for others), its strength is the force F with which its
+fingertips can press (the mean of `common.hands.motors.tip_forces`: torque limits over lengths); G
+is the number of its fingers. Its mass has no effect, because the virtual wrist is scaled to it
+(`common.hands.spec.wrist_gains`).
 
-* **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is that of the human
-  hand's five: their force grows with the object's surface, s^2, and fewer fingers press more each.
+* **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is
+  that of the human hand's five: their force grows with the object's surface, s^2, and fewer fingers
+  press more each.
 * `force_max` = 5 N k, to half a newton: 5 N, 12 N (Allegro), 6 N (Sharpa).
-* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its position needs more
-  weight in larger hands of fewer fingers is empirical.
-* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: 0 for fingertips that can press three times what is
-  required, as human ones can; 1 for those that cannot press that much (Allegro). Weak hands lose what they may hold
-  at a part only, so that they train it more: `p_affordance` = 0.6 + 0.2 h, and against what they then touch
-  `affordance_distance` = 0.15 + 0.05 h, `affordance_force` = 0.30 + 0.10 h.
+* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its
+  position needs more weight in larger hands of fewer fingers is empirical.
+* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: 0 for fingertips that can press
+  three times what is required, as human ones can; 1 for those that cannot press that much
+  (Allegro). Weak hands lose what they may hold at a part only, so that they train it more:
+  `p_affordance` = 0.6 + 0.2 h, and against what they then touch `affordance_distance` = 0.15 + 0.05
+  h, `affordance_force` = 0.30 + 0.10 h.
 
 Everything else is the same for all hands.
 """
@@ -24,7 +28,13 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
+from congrasp.common.config import (
+    CurriculumConfig,
+    NetworkConfig,
+    ObjectsConfig,
+    PPOConfig,
+    RunConfig,
+)
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import tip_forces
@@ -37,7 +47,12 @@ from congrasp.common.task.methods import CAMERA, STUDENT, with_method
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part, included twice in training."""
-_FORCE, _HEADING, _AFFORDANCE = 5.0, 12.0, 0.6  # of the human hand: N, weight, share of the episodes
+# Of the human hand: N, weight, share of the episodes
+_FORCE, _HEADING, _AFFORDANCE = (
+    5.0,
+    12.0,
+    0.6,
+)
 _STRONG = 0.3  # share of its fingertips' strength required of a strong hand
 
 
@@ -59,7 +74,9 @@ def rules(hand: Hand) -> Rules:
     """Computes the recipe's rules (see the module) for a hand."""
     squeeze = hand.object_scale**2 * 5 / len(hand.tip_links)
     force_max = max(round(2 * _FORCE * squeeze), 1) / 2
-    weakness = min(max((force_max / float(tip_forces(hand).mean()) - _STRONG) / (1 - _STRONG), 0.0), 1.0)
+    weakness = min(
+        max((force_max / float(tip_forces(hand).mean()) - _STRONG) / (1 - _STRONG), 0.0), 1.0
+    )
     return Rules(
         force_max=force_max,
         heading_position=float(max(round(_HEADING * squeeze), 1)),
@@ -84,7 +101,9 @@ def recipe(hand: Hand) -> RunConfig:
             p_trajectory=0.35,
             p_fingers=0.2,
             p_force=0.25,
-            p_together=0.45,  # trajectory and affordance in 15 % of the episodes (Allegro: 17), without it in 8 (9)
+            # Trajectory and affordance in 15 % of the episodes (Allegro: 17), without
+            # it in 8 (9)
+            p_together=0.45,
             hold_steps_max=200,
             surface_normals=True,
             disturbed_references=0.5,
@@ -92,8 +111,8 @@ def recipe(hand: Hand) -> RunConfig:
             friction_range=(0.6, 1.2),
             reward=RewardWeights(force_max=own.force_max),
         ),
-        # Grasps first, then the precision of constraints: with the second weights from the beginning, trajectories are
-        # not learnt.
+        # Grasps first, then the precision of constraints: with the second weights from the
+        # beginning, trajectories are not learnt.
         curriculum=CurriculumConfig(
             ramp=(80, 160),
             reward=RewardWeights(
@@ -115,7 +134,9 @@ def recipe(hand: Hand) -> RunConfig:
                 affordance_force=own.affordance_force,
             ),
         ),
-        objects=ObjectsConfig(families=("all", "scans", *HARD_FAMILIES), count=1600, by_failure=True),
+        objects=ObjectsConfig(
+            families=("all", "scans", *HARD_FAMILIES), count=1600, by_failure=True
+        ),
         rollouts_per_update=1,
         ppo=PPOConfig(gamma=0.99, settling=0.25, least_std=0.35),
     )
@@ -155,14 +176,18 @@ CHECK = dataclasses.replace(
     objects=ObjectsConfig(count=2),
     network=NetworkConfig(hidden=(16,)),
 )
-"""Learns nothing: it shows that physics, messages, log, server and pictures of an installation work."""
+"""Learns nothing: it shows that physics, messages, log, server and pictures of an installation
+work.
+"""
 _SHORT = {run.name: run for run in (QUICKSTART, CHECK)}
 PRESETS = (*_SHORT, FULL, *FULL_FOR)
 """Names of the presets."""
 
 
 def easier(config: RunConfig) -> list[str]:
-    """Phrases for the simplifications of a run relative to the full task; empty if there are none."""
+    """Phrases for the simplifications of a run relative to the full task; empty if there are
+    none.
+    """
     task, full = config.task, get_preset(FULL)
     words = []
     if task.headings == "above" and full.task.headings != "above":
@@ -179,11 +204,16 @@ def easier(config: RunConfig) -> list[str]:
     if task.impratio < full.task.impratio:
         words.append("friction is soft")
     if task.approach_steps < full.task.approach_steps:
-        words.append(f"the table is removed after {task.approach_steps} control steps, not {full.task.approach_steps}")
+        words.append(
+            f"the table is removed after {task.approach_steps} control steps, not "
+            f"{full.task.approach_steps}"
+        )
     if not config.objects.folder and config.objects.count < full.objects.count:
         words.append(f"an actor has {config.objects.count} objects, not {full.objects.count}")
     if sum(config.network.hidden) < sum(full.network.hidden):
-        layers = [" and ".join(map(str, network.hidden)) for network in (config.network, full.network)]
+        layers = [
+            " and ".join(map(str, network.hidden)) for network in (config.network, full.network)
+        ]
         words.append(f"networks have layers of {layers[0]} units, not {layers[1]}")
     return words
 
@@ -193,7 +223,8 @@ def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
 
     Args:
       name: one of `PRESETS`.
-      hand: the name, file or text of a hand. A full task depends on the hand (`services.train.presets`); in the others
+      hand: the name, file or text of a hand. A full task depends on the hand
+      (`services.train.presets`); in the others
         only the hand changes.
       **sizes: other numbers of `environments` and `rollout_steps`; 0 keeps that of the preset.
 
@@ -201,7 +232,9 @@ def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
       CongraspError: there is no such preset or hand; the message lists the available ones.
     """
     if name not in PRESETS:
-        raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
+        raise CongraspError(
+            f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}."
+        )
     if name in _SHORT:
         config = with_hand(_SHORT[name], hand)
     else:
@@ -211,7 +244,9 @@ def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
 
 
 def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
-    """Returns the configuration with another hand, or unchanged; a hand's file is included, for remote actors."""
+    """Returns the configuration with another hand, or unchanged; a hand's file is included, for
+    remote actors.
+    """
     found = get_hand(hand or config.task.hand)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))
 
@@ -227,10 +262,11 @@ TRACKERS = SensingConfig(
     rotation_bias=(0.0, 0.035),
     settle=0.04,
 )
-"""From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost samples.
+"""From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost
+samples.
 
-All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the others). Servos
-follow targets up to 40 ms late."""
+All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the
+others). Servos follow targets up to 40 ms late."""
 
 
 CAMERAS = SensingConfig(
@@ -245,14 +281,15 @@ CAMERAS = SensingConfig(
 )
 """A depth camera on one side: an image before the reach, in half of the episodes another at 10 Hz.
 
-The points' depth has errors of up to 4 mm, half of them may be missing, and the hand-eye calibration is off by up to
-5 mm and 2° (standard deviations), constant in an episode."""
+The points' depth has errors of up to 4 mm, half of them may be missing, and the hand-eye
+calibration is off by up to 5 mm and 2° (standard deviations), constant in an episode."""
 _SENSING = {STUDENT: TRACKERS, CAMERA: CAMERAS}
 _STUDENT_STD = 0.15  # the action's least standard deviation: a teacher's is 0.1 once it has settled
 
 
 def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunConfig:
-    """Returns the run that distils a teacher, with twice its time and random sensors, mass, friction and gains.
+    """Returns the run that distils a teacher, with twice its time and random sensors, mass,
+    friction and gains.
 
     Args:
       config: numbers, objects and networks.
@@ -266,7 +303,8 @@ def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunCon
     task = bundles.load(file).task
     task = dataclasses.replace(
         task,
-        # Servos that follow up to 40 ms late reach half as fast; a policy observes the time as a share of the episode.
+        # Servos that follow up to 40 ms late reach half as fast; a policy observes the time as a
+        # share of the episode.
         approach_steps=2 * task.approach_steps,
         sensing=_SENSING[method],
         mass_range=(0.7, 1.4),
@@ -278,12 +316,16 @@ def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunCon
             config,
             name=f"{config.name}-{method}",
             task=task,
-            # PPO after the distillation begins with a policy that obeys all constraints, and with its teacher's noise.
-            curriculum=dataclasses.replace(config.curriculum, ramp=(0, int(config.curriculum.ramped))),
+            # PPO after the distillation begins with a policy that obeys all constraints, and with
+            # its teacher's noise.
+            curriculum=dataclasses.replace(
+                config.curriculum, ramp=(0, int(config.curriculum.ramped))
+            ),
             ppo=dataclasses.replace(config.ppo, least_std=_STUDENT_STD),
             algorithm="distill",
             distill=dataclasses.replace(
-                config.distill, teacher=str(file.resolve()) if pathlib.Path(teacher) == file else teacher
+                config.distill,
+                teacher=str(file.resolve()) if pathlib.Path(teacher) == file else teacher,
             ),
         ),
         method,

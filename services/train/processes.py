@@ -1,4 +1,5 @@
-"""Trainings as processes of this machine: a learner and its actors, and a whole training in the background.
+"""Trainings as processes of this machine: a learner and its actors, and a whole training in the
+background.
 
 `Launch` has their number, their engine, and the peers that may connect.
 """
@@ -39,7 +40,9 @@ MAX_RESTARTS = 5
 _BAD_INPUT = 2
 _START_SECONDS, _POLL = 120.0, 0.25
 Report = Callable[[dict[str, Any]], None]
-"""Called several times a second with the learner's newest metrics, if any, and the number of live actors."""
+"""Called several times a second with the learner's newest metrics, if any, and the number of live
+actors.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,28 +50,32 @@ class Launch:
     """Options of a run's processes."""
 
     actors: int | None = None
-    """Actor processes. By default two, or one on fewer than four cores; on a GPU none: a single actor then runs in the
-    learner's process, and rollouts never leave the device."""
+    """Actor processes. By default two, or one on fewer than four cores; on a GPU none: a single
+    actor then runs in the learner's process, and rollouts never leave the device."""
     ranks: int = 1
-    """Learners that train together, data parallel; each has --actors actors, and a separate GPU if there are GPUs. The
-    batch grows with them."""
+    """Learners that train together, data parallel; each has --actors actors, and a separate GPU if
+    there are GPUs. The batch grows with them."""
     listen: str | None = None
-    """Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine can join."""
+    """Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine
+    can join.
+    """
     certs: pathlib.Path | None = None
     """The authority's folder (congrasp certs), for mutual TLS."""
     insecure: bool = False
     """Listen beyond loopback without certificates."""
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",)
-    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there, for `wandb
-    sync`), wandb (needs an account); without a name, none."""
+    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files
+    there, for `wandb sync`), wandb (needs an account); without a name, none."""
     metrics_port: int = 0
     """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none."""
 
     def planned(self, config: RunConfig) -> "Plan":
-        """Chooses engine and number of actors; on a GPU one process does everything unless others may connect.
+        """Chooses engine and number of actors; on a GPU one process does everything unless others
+        may connect.
 
         Raises:
-          CongraspError: the options contradict each other or this machine, or the learner may not listen as requested.
+          CongraspError: the options contradict each other or this machine, or the learner may not
+          listen as requested.
         """
         if self.actors is not None and self.actors < 0:
             raise CongraspError(
@@ -87,17 +94,22 @@ class Launch:
         return Plan(self, default if self.actors is None else self.actors, physics, gpus)
 
     def _check_connections(self, run: str) -> None:
-        """Raises a `CongraspError` if the learner may not listen as requested, or only some roles have certificates."""
+        """Raises a `CongraspError` if the learner may not listen as requested, or only some roles
+        have certificates.
+        """
         if self.certs is not None and (self.certs / CERTIFICATE_FILE).exists():
             raise CongraspError(
-                f"{self.certs} belongs to one role.", "Pass the authority's folder, which holds those of all roles."
+                f"{self.certs} belongs to one role.",
+                "Pass the authority's folder, which holds those of all roles.",
             )
         credentials = urls.find_credentials(self.certs, "learner", run)
         check_exposure(self.listen or LEARNER_URL, credentials, insecure=self.insecure)
         for role in ("actor", "observer"):
             urls.find_credentials(self.certs, role, run)
         if self.actors == 0:
-            raise CongraspError("With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors.")
+            raise CongraspError(
+                "With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors."
+            )
 
 
 class Plan(NamedTuple):
@@ -118,7 +130,8 @@ class Plan(NamedTuple):
 
 
 def leave_gpus_to(ranks: int) -> bool:
-    """Returns True if each rank has a GPU; this process then uses none, so that the ranks have all memory.
+    """Returns True if each rank has a GPU; this process then uses none, so that the ranks have all
+    memory.
 
     Raises:
       CongraspError: there are fewer GPUs than ranks, but not none.
@@ -128,7 +141,9 @@ def leave_gpus_to(ranks: int) -> bool:
     if backend == "cpu":
         return False
     if count < ranks:
-        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, but JAX finds {count}.", "Pass a smaller --ranks.")
+        raise CongraspError(
+            f"{ranks} ranks need {ranks} GPUs, but JAX finds {count}.", "Pass a smaller --ranks."
+        )
     jax.config.update("jax_platforms", "cpu")
     return True
 
@@ -145,7 +160,11 @@ def accelerators() -> tuple[str, int]:
     environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     try:
         seen = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120.0
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120.0,
         )
         backend, count = seen.stdout.split()
     except (subprocess.TimeoutExpired, ValueError):
@@ -167,28 +186,35 @@ def train(
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
 ) -> None:
-    """Runs a prepared run directory to its end with one learner and its actor processes, or several of both.
+    """Runs a prepared run directory to its end with one learner and its actor processes, or several
+    of both.
 
-    A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. If one of
-    several ranks dies, the others end as well, and all are restarted.
+    A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS`
+    times each. If one of several ranks dies, the others end as well, and all are restarted.
 
     Args:
-      run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
-      config: the run's configuration.
-      plan: its processes. Rank r listens on the ports after those of rank r - 1; without an endpoint, on free ones of
+      run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from
+      the latest. config: the run's configuration.
+      plan: its processes. Rank r listens on the ports after those of rank r - 1; without an
+      endpoint, on free ones of
         the loopback interface.
       stop: drains everything within a few seconds when set.
       report: called with progress.
-      notify: called with a message when a process is restarted, and with errors of the learner, such as a full disk.
+      notify: called with a message when a process is restarted, and with errors of the learner,
+      such as a full disk.
 
     Raises:
       CongraspError: a process failed permanently; the message has the last line of its log.
     """
     launch = plan.launch
-    endpoint = launch.listen or local_url(launch.ranks + 1)  # one more for the ports through which the ranks join
+    # One more for the ports through which the ranks join
+    endpoint = launch.listen or local_url(launch.ranks + 1)
     logs = run_dir / LOGS
     logs.mkdir(exist_ok=True)
-    learners, actors = _learners(run_dir, plan, endpoint), _actors(run_dir, plan, config.name, endpoint)
+    learners, actors = (
+        _learners(run_dir, plan, endpoint),
+        _actors(run_dir, plan, config.name, endpoint),
+    )
     try:
         with stage("start of the learner's process"):
             for child in (*learners, *actors):
@@ -209,12 +235,16 @@ def _learners(run_dir: pathlib.Path, plan: Plan, endpoint: str) -> list[Child]:
     coordinator = rank_url(reachable_url(endpoint), launch.ranks).partition("/")[2]
     for rank in range(launch.ranks):
         name = f"rank-{rank}" if launch.ranks > 1 else "learner"
-        arguments = command("learner", run_dir=run_dir, resume=True, listen=endpoint, certs=launch.certs)
+        arguments = command(
+            "learner", run_dir=run_dir, resume=True, listen=endpoint, certs=launch.certs
+        )
         arguments += command(insecure=launch.insecure, inside=inside)
         if launch.ranks > 1:
             arguments += command(rank=rank, ranks=launch.ranks, coordinator=coordinator)
         if rank == 0:
-            arguments += command(metrics_port=launch.metrics_port, metric_writers=launch.metric_writers)
+            arguments += command(
+                metrics_port=launch.metrics_port, metric_writers=launch.metric_writers
+            )
         environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if plan.gpus else {}
         found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log", environment))
     return found
@@ -227,8 +257,13 @@ def _actors(run_dir: pathlib.Path, plan: Plan, run: str, endpoint: str) -> list[
     patience = 60 if launch.ranks == 1 else 300
     for number in range(launch.ranks * plan.actors):
         name, url = f"actor-{number}", rank_url(reachable_url(endpoint), number // plan.actors)
-        kept = {"audit": run_dir / AUDIT / f"{name}.jsonl", "references": references_file(run_dir, name)}
-        arguments = command("actor", connect=url, certs=launch.certs, run=run, id=name, physics=plan.physics, **kept)
+        kept = {
+            "audit": run_dir / AUDIT / f"{name}.jsonl",
+            "references": references_file(run_dir, name),
+        }
+        arguments = command(
+            "actor", connect=url, certs=launch.certs, run=run, id=name, physics=plan.physics, **kept
+        )
         arguments += command(threads=threads, patience=patience)
         found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log"))
     return found
@@ -240,7 +275,9 @@ def _gpu(rank: int) -> str:
     return visible[rank] if visible else str(rank)
 
 
-def _connect(url: str, learner: Child, stop: threading.Event, certs: pathlib.Path | None) -> Transport | None:
+def _connect(
+    url: str, learner: Child, stop: threading.Event, certs: pathlib.Path | None
+) -> Transport | None:
     """Connects to the learner once it listens; returns None if the run is stopped before."""
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline and not stop.is_set():
@@ -251,7 +288,9 @@ def _connect(url: str, learner: Child, stop: threading.Event, certs: pathlib.Pat
                 break
     if stop.is_set():
         return None
-    raise CongraspError(f"The learner did not start: {learner.last_line()}", f"Its log is {learner.log}.")
+    raise CongraspError(
+        f"The learner did not start: {learner.last_line()}", f"Its log is {learner.log}."
+    )
 
 
 def _supervise(
@@ -263,7 +302,9 @@ def _supervise(
     report: Report,
     notify: Callable[[str], None],
 ) -> None:
-    """Restarts processes that die and reports progress, until rank 0 has finished or the run is stopped."""
+    """Restarts processes that die and reports progress, until rank 0 has finished or the run is
+    stopped.
+    """
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
     events = transport.subscribe(Keys(run).log("event", "learner", "0"), depth=16)
     while not stop.is_set():
@@ -289,12 +330,16 @@ def _supervise(
         report({**(received[1].meta if received else {}), "actors": alive})
 
 
-def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: Callable[[str], None]) -> None:
+def _restart_learners(
+    learners: Sequence[Child], stop: threading.Event, notify: Callable[[str], None]
+) -> None:
     """Restarts all ranks after one died; the others notice and end, or are terminated."""
     first = next(child for child in learners if child.code)
     wait_for([child.process for child in learners if child.process], CHILD_GRACE)
     # A rank that lost another one says no more than that.
-    dead = [child for child in learners if child.code and child.code != TransportError.exit_code] or [first]
+    dead = [
+        child for child in learners if child.code and child.code != TransportError.exit_code
+    ] or [first]
     died = " ".join(child.death() for child in dead)
     end_all(learners)
     for child in (*dead, *learners):
@@ -353,8 +398,12 @@ def train_in_background(
             "Repeat the command to resume it; --patience gives it more time.",
         )
     if code or not (run_dir / POLICY_FILE).exists():
-        raise CongraspError(f"The training of {name} failed: {child.last_line()}", f"Its log is {child.log}.")
-    write_atomically(run_dir / _TRAINED, json.dumps({"seconds": round(time.monotonic() - began, 1)}).encode())
+        raise CongraspError(
+            f"The training of {name} failed: {child.last_line()}", f"Its log is {child.log}."
+        )
+    write_atomically(
+        run_dir / _TRAINED, json.dumps({"seconds": round(time.monotonic() - began, 1)}).encode()
+    )
 
 
 def trained(run_dir: pathlib.Path) -> pathlib.Path | None:

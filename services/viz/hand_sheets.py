@@ -1,4 +1,6 @@
-"""Contact sheets of hands: poses with the grasp frame, the motion of every joint, and the grips of a self-check."""
+"""Contact sheets of hands: poses with the grasp frame, the motion of every joint, and the grips of
+a self-check.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -8,12 +10,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions, transmission
+from congrasp.common.hands.motors import (
+    joint_positions,
+    motor_limits,
+    motor_positions,
+    transmission,
+)
 from congrasp.common.hands.skin import Skin
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
 from congrasp.services.viz.raster import render_fitted, render_scene
-from congrasp.services.viz.shapes import Shape, arrow, beads, fit, object_shape, posed_hand, shape_points, upright
+from congrasp.services.viz.shapes import (
+    Shape,
+    arrow,
+    beads,
+    fit,
+    object_shape,
+    posed_hand,
+    shape_points,
+    upright,
+)
 from congrasp.services.viz.sheets import contact_sheet, stacked
 
 if TYPE_CHECKING:
@@ -22,7 +38,9 @@ if TYPE_CHECKING:
 _VIEW = np.array([0.75, 0.65, 0.35])
 
 
-def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = (), skin: Skin | None = None) -> list[Shape]:
+def _placed(
+    hand: Hand, q: np.ndarray, moved: Sequence[int] = (), skin: Skin | None = None
+) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
     shares = np.isin(np.arange(len(hand.links)), moved)
     return [posed_hand(hand, q, np.zeros(3), upright(hand), OBJECT, shares, skin=skin)]
@@ -30,17 +48,26 @@ def _placed(hand: Hand, q: np.ndarray, moved: Sequence[int] = (), skin: Skin | N
 
 def _poses(hand: Hand, skin: Skin | None = None) -> dict[str, list[Shape]]:
     """The hand upright in three poses."""
-    poses = {"open": hand.q_open, "half closed": (hand.q_open + hand.q_closed) / 2, "closed": hand.q_closed}
+    poses = {
+        "open": hand.q_open,
+        "half closed": (hand.q_open + hand.q_closed) / 2,
+        "closed": hand.q_closed,
+    }
     return {name: _placed(hand, q, skin=skin) for name, q in poses.items()}
 
 
 def _frame(hand: Hand) -> list[Shape]:
-    """The open hand's grasp frame: the heading axis up to the hand centre, and w from the thumb to the others."""
+    """The open hand's grasp frame: the heading axis up to the hand centre, and w from the thumb to
+    the others.
+    """
     frame, turn = grasp_frame(hand), upright(hand)
     reach = 0.7 * frame.opening
     ends = frame.center + np.outer([-0.5, 0.5], frame.opening * frame.cross)
     forward = turn.apply(np.array([frame.center - reach * frame.heading, frame.center]))
-    return [*arrow(forward[0], forward[1], 0.0028, HEADING), beads(turn.apply(ends), 0.005, WAYPOINT)]
+    return [
+        *arrow(forward[0], forward[1], 0.0028, HEADING),
+        beads(turn.apply(ends), 0.005, WAYPOINT),
+    ]
 
 
 def _side(hand: Hand) -> np.ndarray:
@@ -55,7 +82,9 @@ def _points(shapes: Sequence[Shape]) -> np.ndarray:
 
 
 def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
-    """The hand open, half closed and closed (columns), from the palm, the thumb's side and in between (rows)."""
+    """The hand open, half closed and closed (columns), from the palm, the thumb's side and in
+    between (rows).
+    """
     placed = _poses(hand)
     points = np.concatenate([_points(shapes) for shapes in placed.values()])
     thumb = np.sign(_side(hand)[1])
@@ -74,21 +103,31 @@ def hands_sheet(
 ) -> np.ndarray:
     """A row for each hand: open with its grasp frame, half closed, closed; each row on one scale.
 
-    `skins` replace the default surfaces of the hands (`common.hands.skin.skin_of`); None keeps the default.
+    `skins` replace the default surfaces of the hands (`common.hands.skin.skin_of`); None keeps the
+    default.
     """
     images, labels = [], []
     for hand, skin in itertools.zip_longest(hands, skins):
         rows = _poses(hand, skin)
         rows["open"] += _frame(hand)
-        camera = fit(np.concatenate([_points(shapes) for shapes in rows.values()]), _side(hand), size[0] / size[1])
+        camera = fit(
+            np.concatenate([_points(shapes) for shapes in rows.values()]),
+            _side(hand),
+            size[0] / size[1],
+        )
         images += [render_scene(shapes, camera, size) for shapes in rows.values()]
         labels += [f"{hand.name}, {name}" for name in rows]
-    title = "heading axis v (blue) into the hand centre, cross-finger axis w (violet) from the thumb to the fingers"
+    title = (
+        "heading axis v (blue) into the hand centre, cross-finger axis w (violet) from the thumb "
+        "to the fingers"
+    )
     return contact_sheet(images, labels, columns=3, title=title)
 
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
-    """The hand's three poses, its zero position, and every motor at both limits with the links that it moves tinted."""
+    """The hand's three poses, its zero position, and every motor at both limits with the links that
+    it moves tinted.
+    """
     rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
     rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]
@@ -101,7 +140,9 @@ def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarra
         for position in motor_limits(hand)[:, m]:
             motors = motor_positions(hand, hand.q_open).copy()
             motors[m] = position
-            rows[f"{motor.name} {position:.2f}"] = _placed(hand, joint_positions(hand, motors), sorted(moved))
+            rows[f"{motor.name} {position:.2f}"] = _placed(
+                hand, joint_positions(hand, motors), sorted(moved)
+            )
     points = np.concatenate([_points(shapes) for shapes in rows.values()])
     camera = fit(points, _side(hand), size[0] / size[1])
     images = [render_scene(shapes, camera, size) for shapes in rows.values()]
@@ -116,7 +157,9 @@ _VIEWS = {"": np.array([0.75, 0.65, 0.35]), ", other side": np.array([0.75, -0.6
 
 
 def check_sheet(hand: Hand, grips: "Sequence[Grip]") -> np.ndarray:
-    """The grips of a hand from two sides, with the links in contact in colour, above its joints (`joints_sheet`)."""
+    """The grips of a hand from two sides, with the links in contact in colour, above its joints
+    (`joints_sheet`).
+    """
     images, labels = [], []
     for grip in grips:
         shapes = _grip(hand, grip)
@@ -126,7 +169,9 @@ def check_sheet(hand: Hand, grips: "Sequence[Grip]") -> np.ndarray:
             images.append(render_fitted(shapes[:near], view, _SIZE, shapes[near:]))
             labels.append(f"{grip.obj.name} {'held' if grip.held else 'lost'}{side}")
     title = f"{hand.name}: self-check, links in contact in violet"
-    return stacked([contact_sheet(images, labels, columns=len(images), title=title), joints_sheet(hand)])
+    return stacked(
+        [contact_sheet(images, labels, columns=len(images), title=title), joints_sheet(hand)]
+    )
 
 
 def _grip(hand: Hand, grip: "Grip") -> list[Shape]:

@@ -1,4 +1,6 @@
-"""Compiled loops over triangles and over the samples of a picture, which Numba caches between processes."""
+"""Compiled loops over triangles and over the samples of a picture, which Numba caches between
+processes.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -21,7 +23,9 @@ _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 
 
 def _compiled(function: Function) -> Function:
-    """Compiles a function; machine code is cached in the user's cache, unless that cannot be written."""
+    """Compiles a function; machine code is cached in the user's cache, unless that cannot be
+    written.
+    """
     folder = cache_folder("kernels")
     options: dict[str, Any] = {
         "nogil": True,
@@ -41,7 +45,12 @@ _Weights = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 @_compiled
 def cover(
-    corners: np.ndarray, value: np.ndarray, faces: np.ndarray, closed: np.ndarray, top: np.ndarray, owner: np.ndarray
+    corners: np.ndarray,
+    value: np.ndarray,
+    faces: np.ndarray,
+    closed: np.ndarray,
+    top: np.ndarray,
+    owner: np.ndarray,
 ) -> None:
     """Finds the triangle with the greatest value at each sample of a grid.
 
@@ -49,20 +58,31 @@ def cover(
       corners: (V, 2) columns and rows of points, in samples; rows count downwards.
       value: (V,) of the points, linear in between; a triangle with a NaN covers nothing.
       faces: (F, 3) the triangles.
-      closed: (F,) bool, True for triangles that are drawn only if they face the viewer (closed surfaces).
-      top: (height, width) greatest value so far; changed in place.
+      closed: (F,) bool, True for triangles that are drawn only if they face the viewer (closed
+      surfaces). top: (height, width) greatest value so far; changed in place.
       owner: (height, width) the triangle that has it; changed in place.
     """
     height, width = top.shape
     for face in range(len(faces)):
         i, j, k = faces[face]
         area, weights = _weights(corners, i, j, k)
-        # Rows count downwards, so that triangles of a closed surface that face the viewer have negative areas.
-        if not abs(area) > _SMALL or (closed[face] and area > 0) or not np.isfinite(value[i] + value[j] + value[k]):
+        # Rows count downwards, so that triangles of a closed surface that face the viewer have
+        # negative areas.
+        if (
+            not abs(area) > _SMALL
+            or (closed[face] and area > 0)
+            or not np.isfinite(value[i] + value[j] + value[k])
+        ):
             continue
         (x0, x1, x2), (y0, y1, y2) = _each(corners, i, j, k, 0), _each(corners, i, j, k, 1)
-        left, right = max(int(np.ceil(min(x0, x1, x2))), 0), min(int(np.floor(max(x0, x1, x2))), width - 1)
-        upper, lower = max(int(np.ceil(min(y0, y1, y2))), 0), min(int(np.floor(max(y0, y1, y2))), height - 1)
+        left, right = (
+            max(int(np.ceil(min(x0, x1, x2))), 0),
+            min(int(np.floor(max(x0, x1, x2))), width - 1),
+        )
+        upper, lower = (
+            max(int(np.ceil(min(y0, y1, y2))), 0),
+            min(int(np.floor(max(y0, y1, y2))), height - 1),
+        )
         for row in range(upper, lower + 1):
             for column in range(left, right + 1):
                 first, second, third = _at(weights, column, row)
@@ -101,7 +121,7 @@ def _at(weights: _Weights, column: int, row: int) -> tuple[float, float, float]:
 
 
 @_compiled
-def shade(
+def shade(  # noqa: PLR0913
     corners: np.ndarray,
     nearness: np.ndarray,
     faces: np.ndarray,
@@ -112,14 +132,15 @@ def shade(
     alpha: float,
     image: np.ndarray,
 ) -> None:
-    """Shades the samples of a picture: a key light with a highlight, the sky, and a little ambient light.
+    """Shades the samples of a picture: a key light with a highlight, the sky, and a little ambient
+    light.
 
     Args:
       corners: (V, 2) columns and rows of points, in samples.
       nearness: (V,) one over their depths.
       faces: (F, 3) the triangles.
-      values: (V, 13) position, normal, linear colour, shares of key light and sky, strength of the highlight, opacity.
-      owner: (height, width) the triangle that a sample shows, or `NOTHING`.
+      values: (V, 13) position, normal, linear colour, shares of key light and sky, strength of the
+      highlight, opacity. owner: (height, width) the triangle that a sample shows, or `NOTHING`.
       eye: (3,) position of the camera.
       key: (3,) unit direction towards the key light.
       alpha: opacity over the image so far.
@@ -135,18 +156,33 @@ def shade(
             first, second, third = first * nearness[i], second * nearness[j], third * nearness[k]
             depth = 1 / (first + second + third)
             for n in range(len(here)):
-                here[n] = depth * (first * values[i, n] + second * values[j, n] + third * values[k, n])
+                here[n] = depth * (
+                    first * values[i, n] + second * values[j, n] + third * values[k, n]
+                )
             lit, sky, shine = here[9], here[10], here[11]
             # Tuples: a new array for each sample would take most of the time.
-            ray, normal = (here[0] - eye[0], here[1] - eye[1], here[2] - eye[2]), (here[3], here[4], here[5])
+            ray, normal = (
+                (here[0] - eye[0], here[1] - eye[1], here[2] - eye[2]),
+                (here[3], here[4], here[5]),
+            )
             away, length = np.sqrt(_dot(ray, ray)), np.sqrt(_dot(normal, normal)) + 1e-12
             half = key[0] - ray[0] / away, key[1] - ray[1] / away, key[2] - ray[2] / away
             facing = max(_dot(normal, key) / length, 0.0)
-            light = _KEY_STRENGTH * lit * facing + _SKY_STRENGTH * sky * (0.6 + 0.4 * normal[2] / length) + _BOUNCE
-            gloss = shine * lit * max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0) ** _HIGHLIGHT
+            light = (
+                _KEY_STRENGTH * lit * facing
+                + _SKY_STRENGTH * sky * (0.6 + 0.4 * normal[2] / length)
+                + _BOUNCE
+            )
+            gloss = (
+                shine
+                * lit
+                * max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0) ** _HIGHLIGHT
+            )
             cover = alpha * here[12]
             for n in range(3):
-                srgb = np.float32(min(max(here[6 + n] * light + gloss, 0.0), 1.0)) ** np.float32(1 / GAMMA)
+                srgb = np.float32(min(max(here[6 + n] * light + gloss, 0.0), 1.0)) ** np.float32(
+                    1 / GAMMA
+                )
                 image[row, column, n] = cover * srgb + (1 - cover) * image[row, column, n]
 
 
@@ -168,15 +204,15 @@ def add_light(
 ) -> None:
     """Adds the light of a distant lamp to points that no body shadows (a shadow map).
 
-    The four samples of the lamp's picture around a point are compared with it and interpolated bilinearly, so that the
-    edge of a shadow is one sample wide.
+    The four samples of the lamp's picture around a point are compared with it and interpolated
+    bilinearly, so that the edge of a shadow is one sample wide.
 
     Args:
       points: (n, 3).
       strength: (n,) light of the lamp without shadow.
       axes: (3, 3) rows: the lamp's right, up, and the direction towards it.
-      origin: (3,) along these: of the first sample of the lamp's picture, and the bias added to a point's height.
-      sample: size of a sample, m.
+      origin: (3,) along these: of the first sample of the lamp's picture, and the bias added to a
+      point's height. sample: size of a sample, m.
       top: (height, width) height of the body nearest to the lamp.
       total: (n,) light; changed in place.
     """

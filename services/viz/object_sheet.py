@@ -1,4 +1,6 @@
-"""Pictures of one object: its surface, convex pieces and headings, its constraint set, and the import of its mesh."""
+"""Pictures of one object: its surface, convex pieces and headings, its constraint set, and the
+import of its mesh.
+"""
 
 import dataclasses
 import itertools
@@ -44,8 +46,9 @@ _VIEW = (0.8, -0.6, 0.6)
 def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     """Three views of the object in its most likely resting pose.
 
-    Left: the surface, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
-    the headings that the human hand can reach over the table, drawn from 8 cm before the heading position up to it.
+    Left: the surface, the graspable region green and the avoid region red. Middle: the convex
+    pieces. Right: some of the headings that the human hand can reach over the table, drawn from 8
+    cm before the heading position up to it.
 
     Returns:
       (H, W, 3) uint8.
@@ -62,7 +65,10 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
         dataclasses.replace(whole, colour=PIECES[i % len(PIECES)], vertices=vertices, faces=faces)
         for i, (vertices, faces) in enumerate(map(tessellate, obj.pieces))
     ]
-    arrows = [arrow(tip - _LENGTH * way, tip, 0.0015, HEADING) for tip, way in zip(tips, ways, strict=True)]
+    arrows = [
+        arrow(tip - _LENGTH * way, tip, 0.0015, HEADING)
+        for tip, way in zip(tips, ways, strict=True)
+    ]
     panels = {
         "surface: graspable region green, avoid region red": [painted],
         f"{len(obj.pieces)} convex pieces": pieces,
@@ -79,14 +85,18 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
 
 
 def rest_picture(obj: GraspObject, rest: int, size: tuple[int, int] = _SMALL) -> np.ndarray:
-    """(height, width, 3) uint8: the object on the table in one of its resting poses; size (width, height), pixels."""
+    """(height, width, 3) uint8: the object on the table in one of its resting poses; size (width,
+    height), pixels.
+    """
     pose = np.asarray(obj.rest_poses[rest], float)
     shape = object_shape((obj.visual_vertices, obj.visual_faces), pose[:3], pose[3:])
     return render_fitted([shape], _VIEW, size, [table_shape(pose[:3])])
 
 
 def rests_sheet(obj: GraspObject) -> np.ndarray:
-    """(H, W, 3) uint8: the object in each of its resting poses, by the numbers that `congrasp grasp --rest` takes."""
+    """(H, W, 3) uint8: the object in each of its resting poses, by the numbers that `congrasp grasp
+    --rest` takes.
+    """
     images = [rest_picture(obj, rest) for rest in range(len(obj.rest_poses))]
     tilts = np.degrees(rest_tilts(obj))
     labels = [
@@ -98,7 +108,9 @@ def rests_sheet(obj: GraspObject) -> np.ndarray:
 
 
 def overview(objects: Sequence[GraspObject]) -> np.ndarray:
-    """(H, W, 3) uint8: each object in its likeliest resting pose, graspable region green and avoid region red."""
+    """(H, W, 3) uint8: each object in its likeliest resting pose, graspable region green and avoid
+    region red.
+    """
     images, titles = [], []
     for obj in objects:
         shape = _painted(obj)
@@ -153,15 +165,21 @@ class _Placed:
     def paths(self, region: int, chosen: np.ndarray) -> list[Shape]:
         """Strings of beads along trajectories."""
         points = self.arrays["trajectory/position"][region]
-        return [beads(self.rotation.apply(points[m]) + self.position, 0.003, WAYPOINT) for m in chosen]
+        return [
+            beads(self.rotation.apply(points[m]) + self.position, 0.003, WAYPOINT) for m in chosen
+        ]
 
     def grasps(self, region: int, chosen: np.ndarray) -> list[Shape]:
         """Hands in reference poses."""
-        q, position, quaternion = (self.arrays[f"pose/{name}"][region] for name in ("q", "position", "quaternion"))
+        q, position, quaternion = (
+            self.arrays[f"pose/{name}"][region] for name in ("q", "position", "quaternion")
+        )
         shapes: list[Shape] = []
         for m in chosen:
             wrist = self.rotation * Rotation.from_quat(quaternion[m], scalar_first=True)
-            shapes.append(posed_hand(self.hand, q[m], self.rotation.apply(position[m]) + self.position, wrist))
+            shapes.append(
+                posed_hand(self.hand, q[m], self.rotation.apply(position[m]) + self.position, wrist)
+            )
         return shapes
 
     @property
@@ -173,10 +191,11 @@ class _Placed:
 
 
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
-    """Six pictures of the object in one of its resting poses, with a random sample of its constraints.
+    """Six pictures of the object in one of its resting poses, with a random sample of its
+    constraints.
 
-    Heading arrows end before the surface, two centimetres short of the heading positions. The graspable region is
-    green, the avoid region red.
+    Heading arrows end before the surface, two centimetres short of the heading positions. The
+    graspable region is green, the avoid region red.
 
     Returns:
       (H, W, 3) uint8.
@@ -193,26 +212,37 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     whole, region = some(clear[0], _PATHS), some(clear[1], _PATHS)
     reference = placed.grasps(1, region[:1]) + placed.paths(1, region[:1])
     panels = {
-        f"headings, {int(allowed[0].sum())} allowed": placed.headings(0, some(allowed[0], _HEADINGS)),
+        f"headings, {int(allowed[0].sum())} allowed": placed.headings(
+            0, some(allowed[0], _HEADINGS)
+        ),
         f"headings on the graspable region, {int(allowed[1].sum())} allowed": placed.headings(
             1, some(allowed[1], _HEADINGS)
         ),
         f"wrist trajectories, {int(clear[0].sum())} allowed": placed.paths(0, whole),
-        "reference pose and its trajectory": placed.grasps(0, whole[:1]) + placed.paths(0, whole[:1]),
+        "reference pose and its trajectory": placed.grasps(0, whole[:1])
+        + placed.paths(0, whole[:1]),
         "another reference pose": placed.grasps(0, whole[1:2]),
         "reference pose on the graspable region and its trajectory": reference,
     }
     body, images = placed.body, []
     for shapes in panels.values():
         images.append(render_fitted([*shapes, body], _SIDE, _FRAME, [table_shape(placed.position)]))
-    title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
-    return contact_sheet(images, list(panels), columns=3, title=f"{title}; avoid region in dark red")
+    title = (
+        f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
+    )
+    return contact_sheet(
+        images, list(panels), columns=3, title=f"{title}; avoid region in dark red"
+    )
 
 
 _PANEL = (460, 360)
 _CORNER = (0.9, -0.6, 0.45)
 _BETWEEN = 0.03  # m between the hand and the object
-_LARGEST, _SMALLEST = 1.5, 0.01  # m; the file's mesh is drawn at the object's size if it is beyond them
+# M; the file's mesh is drawn at the object's size if it is beyond them
+_LARGEST, _SMALLEST = (
+    1.5,
+    0.01,
+)
 _LARGE_FILE = 30 << 20  # bytes
 
 
@@ -231,13 +261,15 @@ class Body(NamedTuple):
 def import_sheet(
     hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None, avoid: np.ndarray | None = None
 ) -> np.ndarray:
-    """Pictures next to the open hand: the file, the object on the table, its affordance, and its convex pieces.
+    """Pictures next to the open hand: the file, the object on the table, its affordance, and its
+    convex pieces.
 
     Args:
       hand: the hand.
       obj: the imported object.
       before: the mesh of the file, in the file's unit; None omits its picture.
-      avoid: (P,) bool, surface points of the avoid region; None omits the picture of the affordance.
+      avoid: (P,) bool, surface points of the avoid region; None omits the picture of the
+      affordance.
 
     Returns:
       (H, W, 3) uint8.
@@ -250,7 +282,13 @@ def import_sheet(
         drawn = size if _SMALLEST <= size <= _LARGEST else max(sides)
         scaled = "" if drawn == size else " (not drawn to scale)"
         label = f"the file: {len(before.faces):,} triangles, {length(size)} long in metres{scaled}"
-        parts[label] = [Body(rest.apply(np.asarray(before.vertices) * drawn / size), np.asarray(before.faces), OBJECT)]
+        parts[label] = [
+            Body(
+                rest.apply(np.asarray(before.vertices) * drawn / size),
+                np.asarray(before.faces),
+                OBJECT,
+            )
+        ]
     parts[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [
         Body(
             rest.apply(obj.visual_vertices),
@@ -263,21 +301,31 @@ def import_sheet(
         label = "the affordance: green may be grasped, red must not be touched"
         parts[label] = [
             Body(
-                rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT, region_colours(rest.apply(obj.points), avoid)
+                rest.apply(obj.visual_vertices),
+                obj.visual_faces,
+                OBJECT,
+                region_colours(rest.apply(obj.points), avoid),
             )
         ]
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
-    parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
-        Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
+    parts[
+        f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"
+    ] = [
+        Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)])
+        for i, (vertices, faces) in pieces
     ]
     images = [render_fitted(_beside(hand, bodies), _CORNER, _PANEL) for bodies in parts.values()]
     title = f"{obj.name} and the {hand.name} hand at true scale"
-    return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
+    return contact_sheet(
+        images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes])
+    )
 
 
 def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
-    """The surface in an object's files, in their unit; None if the files are too large to read twice."""
+    """The surface in an object's files, in their unit; None if the files are too large to read
+    twice.
+    """
     files = [file.path for file in source.visuals or source.pieces]
     if sum(path.stat().st_size for path in files) > _LARGE_FILE:
         return None

@@ -1,4 +1,6 @@
-"""Figures of a run from its recordings: learning curves, reward terms, episodes and all other metrics."""
+"""Figures of a run from its recordings: learning curves, reward terms, episodes and all other
+metrics.
+"""
 
 import dataclasses
 import io
@@ -31,18 +33,30 @@ TITLES = {
         for block in constraint.blocks
     },
     **{
-        f"episode/{spec.name}": (f"{constraint.title.capitalize()} error: {_KINDS[spec.unit]}", spec.unit or "share")
+        f"episode/{spec.name}": (
+            f"{constraint.title.capitalize()} error: {_KINDS[spec.unit]}",
+            spec.unit or "share",
+        )
         for constraint in CONSTRAINTS
         for spec in constraint.errors
     },
 }
 """Title, unit and, where these are not enough, the meaning of each metric."""
-_UNITS = {"_per_second": "1/s", "_seconds": "s", "_rad": "rad", "_m": "m", "_bytes": "bytes", "_ratio": "share"}
+_UNITS = {
+    "_per_second": "1/s",
+    "_seconds": "s",
+    "_rad": "rad",
+    "_m": "m",
+    "_bytes": "bytes",
+    "_ratio": "share",
+}
 """Units of metrics without a title, by the endings of their names."""
 
 
 def titled(metric: str) -> tuple[str, str]:
-    """Title and unit of a metric by its name after the process; the title of an unknown one is its name in words."""
+    """Title and unit of a metric by its name after the process; the title of an unknown one is its
+    name in words.
+    """
     if metric in TITLES:
         title, unit, *_ = TITLES[metric]
         return title, unit
@@ -53,7 +67,9 @@ def titled(metric: str) -> tuple[str, str]:
         return words.capitalize(), "reward"
     if group == "failure":
         return f"Lost objects: {words}", "share of episodes"
-    return (f"{group.replace('_', ' ')}: {words}" if group else words).capitalize(), _UNITS.get(ending, "")
+    return (f"{group.replace('_', ' ')}: {words}" if group else words).capitalize(), _UNITS.get(
+        ending, ""
+    )
 
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
@@ -70,7 +86,9 @@ _LEGEND = 8
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One plot: its title, the unit of its vertical axis, and the metrics (after the process's name) it shows."""
+    """One plot: its title, the unit of its vertical axis, and the metrics (after the process's
+    name) it shows.
+    """
 
     title: str
     unit: str
@@ -83,7 +101,10 @@ def _panel(metric: str) -> Panel:
 
 
 LEARNING = (
-    *map(_panel, ("episode/return", "episode/success", "episode/links_at_removal", "steps_per_second")),
+    *map(
+        _panel,
+        ("episode/return", "episode/success", "episode/links_at_removal", "steps_per_second"),
+    ),
     Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
     *map(_panel, ("kl", "imitation_kl", "policy_loss", "value_loss", "explained_variance")),
     *map(_panel, ("action_std", "learning_rate", "clip_fraction")),
@@ -111,7 +132,9 @@ def plot_runs(
     for path, label in zip(paths, _labels(paths), strict=True):
         runs[label] = read_metrics(path)
         if not runs[label]:
-            raise CongraspError(f"The recordings in {path} hold no metrics.", "Was the learner recorded?")
+            raise CongraspError(
+                f"The recordings in {path} hold no metrics.", "Was the learner recorded?"
+            )
     written = []
     for name, (title, panels) in figures(runs).items():
         written += save(draw(title, panels, runs), out / name, formats)
@@ -119,7 +142,9 @@ def plot_runs(
 
 
 def _labels(paths: Sequence[pathlib.Path]) -> list[str]:
-    """Names of runs for a legend: those of their folders, or the whole paths if two have the same name."""
+    """Names of runs for a legend: those of their folders, or the whole paths if two have the same
+    name.
+    """
     names = [path.resolve().name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
@@ -137,7 +162,8 @@ def encoded(figure: Any, kind: str = "png") -> bytes:
     """A figure as the content of a file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=130)
-    figure.set_layout_engine("none")  # the layout is computed; another format would compute it again
+    # The layout is computed; another format would compute it again
+    figure.set_layout_engine("none")
     return buffer.getvalue()
 
 
@@ -176,8 +202,8 @@ def style(axes: Any, title: str, x: str, y: str) -> None:
 def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
     """Title and panels of each figure by file name.
 
-    Every metric of the runs is in exactly one panel, except those whose mean has no meaning, and constant ones outside
-    of the learning curves.
+    Every metric of the runs is in exactly one panel, except those whose mean has no meaning, and
+    constant ones outside of the learning curves.
     """
     names = {_metric(name) for series in runs.values() for name in series} - _MEANINGLESS
     learning = [
@@ -185,12 +211,17 @@ def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
         for panel in LEARNING
         if (shown := tuple(metric for metric in panel.metrics if metric in names))
     ]
-    rest = sorted(names - {metric for panel in learning for metric in panel.metrics} - _constants(runs))
+    rest = sorted(
+        names - {metric for panel in learning for metric in panel.metrics} - _constants(runs)
+    )
     groups = {
         "learning": ("Learning", learning),
         "reward_terms": ("Reward terms, sum over an episode", _panels(rest, "term/")),
         "episodes": ("Episodes", _panels(rest, "episode/")),
-        "details": ("Details", [_panel(m) for m in rest if not m.startswith(("term/", "episode/"))]),
+        "details": (
+            "Details",
+            [_panel(m) for m in rest if not m.startswith(("term/", "episode/"))],
+        ),
     }
     return {name: group for name, group in groups.items() if group[1]}
 
@@ -211,8 +242,8 @@ def _constants(runs: Runs) -> set[str]:
 def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
     """Draws one figure of small multiples.
 
-    The label of a line names its run if there are several, its process if there are several, and its metric if the
-    panel has two.
+    The label of a line names its run if there are several, its process if there are several, and
+    its metric if the panel has two.
     """
     figure, grid = panel_grid(len(panels), 2.5, title)
     for axes, panel in zip(grid, panels, strict=True):
@@ -236,7 +267,8 @@ def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
     """(n,) running mean of the last `window` values, of fewer at the beginning; ignores NaN."""
     finite = np.isfinite(values)
-    base = values[finite][0] if finite.any() else 0.0  # sums of differences stay exact where nothing changes
+    # Sums of differences stay exact where nothing changes
+    base = values[finite][0] if finite.any() else 0.0
     total = np.cumsum(np.where(finite, values - base, 0.0))
     count = np.cumsum(finite)
     total[window:] = total[window:] - total[:-window]
@@ -249,7 +281,9 @@ def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label:
     window = len(values) // 40
     if window < 3:
         marker = "o" if len(values) < 20 else ""
-        axes.plot(steps, values, color=colour, linewidth=1.5, label=label, marker=marker, markersize=3)
+        axes.plot(
+            steps, values, color=colour, linewidth=1.5, label=label, marker=marker, markersize=3
+        )
     else:
         axes.plot(steps, values, color=colour, linewidth=0.6, alpha=0.3)
         axes.plot(steps, smooth(values, window), color=colour, linewidth=1.6, label=label)
@@ -263,11 +297,18 @@ def _metric(name: str) -> str:
 def _label(run: str, name: str, panel: Panel, runs: Runs) -> str:
     """Label of a line in a legend."""
     role, process, metric = name.split("/", 2)
-    processes = {found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric}
+    processes = {
+        found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric
+    }
     who = process if process.startswith(role) else f"{role} {process}"
     several = who if len(processes) > 1 or len(runs) == 1 else ""
-    words = [run if len(runs) > 1 else "", several if len(panel.metrics) == 1 or len(runs) > 1 else ""]
-    return ", ".join(word for word in (*words, titled(metric)[0] if len(panel.metrics) > 1 else "") if word)
+    words = [
+        run if len(runs) > 1 else "",
+        several if len(panel.metrics) == 1 or len(runs) > 1 else "",
+    ]
+    return ", ".join(
+        word for word in (*words, titled(metric)[0] if len(panel.metrics) > 1 else "") if word
+    )
 
 
 def _panels(metrics: Sequence[str], prefix: str) -> list[Panel]:

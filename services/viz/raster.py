@@ -1,4 +1,5 @@
-"""Pictures of shapes without OpenGL, EGL or a display: triangles into a depth buffer, a soft key light and the sky.
+"""Pictures of shapes without OpenGL, EGL or a display: triangles into a depth buffer, a soft key
+light and the sky.
 
 Both lights are sets of distant lamps with shadow maps.
 """
@@ -32,7 +33,9 @@ _KEY_SIZE = 0.12  # radius of the key light at a distance of one
 _SKIN = 1.5  # height above the surface at which its light is looked up, in samples
 
 
-def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: Lamps) -> np.ndarray:
+def light_on(
+    points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: Lamps
+) -> np.ndarray:
     """(n, 2) shares of the key light and of the sky that bodies let through to points of surfaces.
 
     Args:
@@ -44,9 +47,12 @@ def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np
     """
     light, whole = np.zeros((2, len(points))), np.full(len(points), 1e-6)
     for lamp in _disc(key, lamps.key, _KEY_SIZE):
-        _add(lamp, lamps.grid, np.full(len(points), 1 / lamps.key), points, normals, bodies, light[0])
+        _add(
+            lamp, lamps.grid, np.full(len(points), 1 / lamps.key), points, normals, bodies, light[0]
+        )
     for lamp in _dome(lamps.sky):
-        facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp represents a patch of the sky
+        # A lamp represents a patch of the sky
+        facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)
         _add(lamp, lamps.grid, facing, points, normals, bodies, light[1])
         whole += facing
     light[1] /= whole
@@ -62,7 +68,9 @@ def _add(
     bodies: Triangles,
     total: np.ndarray,
 ) -> None:
-    """Adds the visible share of a distant lamp in direction (3,), times a strength (n,), to the points' light (n,)."""
+    """Adds the visible share of a distant lamp in direction (3,), times a strength (n,), to the
+    points' light (n,).
+    """
     if not len(bodies.faces):
         total += strength
         return
@@ -103,10 +111,16 @@ SAMPLES = 2
 """Samples along each side of a pixel."""
 _NEAR = 0.01  # m
 _LARGE = 500_000  # pixels
-_TOP, _BOTTOM = np.array([0.93, 0.945, 0.965], np.float32), np.array([0.80, 0.82, 0.85], np.float32)  # background, sRGB
+# Background, sRGB
+_TOP, _BOTTOM = (
+    np.array([0.93, 0.945, 0.965], np.float32),
+    np.array([0.80, 0.82, 0.85], np.float32),
+)
 
 
-def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+def render_scene(
+    shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] = (640, 480)
+) -> np.ndarray:
     """Draws the shapes.
 
     Args:
@@ -133,9 +147,14 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
 
 
 def render_fitted(
-    shapes: Sequence[Shape], view: Sequence[float] | np.ndarray, size: tuple[int, int], around: Sequence[Shape] = ()
+    shapes: Sequence[Shape],
+    view: Sequence[float] | np.ndarray,
+    size: tuple[int, int],
+    around: Sequence[Shape] = (),
 ) -> np.ndarray:
-    """Renders shapes and others around them by the nearest camera in direction `view` (3,) that sees `shapes`."""
+    """Renders shapes and others around them by the nearest camera in direction `view` (3,) that
+    sees `shapes`.
+    """
     points = np.concatenate([shape_points(shape) for shape in shapes])
     return render_scene([*shapes, *around], fit(points, np.array(view), size[0] / size[1]), size)
 
@@ -149,7 +168,9 @@ def visible(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
 
 
 def _turned(triangles: Triangles, camera: Camera) -> Triangles:
-    """Triangles with the normals of open surfaces, which may wind either way, towards the camera."""
+    """Triangles with the normals of open surfaces, which may wind either way, towards the
+    camera.
+    """
     first, second, third = np.moveaxis(triangles.corners, 1, 0)
     away = _dot(np.cross(second - first, third - first), first - camera.position) > 0
     normals = triangles.normals.copy()
@@ -173,17 +194,31 @@ class _Picture:
 
     def finer(self) -> "_Picture":
         """Returns the same picture with more samples."""
-        image, nearness = (each.repeat(SAMPLES, 0).repeat(SAMPLES, 1) for each in (self.image, self._nearness))
+        image, nearness = (
+            each.repeat(SAMPLES, 0).repeat(SAMPLES, 1) for each in (self.image, self._nearness)
+        )
         return _Picture(self._camera, image, nearness)
 
     def add(self, triangles: Triangles, light: np.ndarray, alpha: float = 1.0) -> None:
-        """Draws triangles where they are nearest, with the shares of light (V, 2) at their points."""
+        """Draws triangles where they are nearest, with the shares of light (V, 2) at their
+        points.
+        """
         corners, nearness = self._projected(triangles.points)
         top, owner = self._covered(corners, nearness, triangles)
         more = triangles.shine[:, None], triangles.opacity[:, None]
         values = np.concatenate([*triangles[:3], light, *more], -1, dtype=np.float32)
         key = self._camera.key_light()
-        shade(corners, nearness, triangles.faces, values, owner, self._camera.position, key, alpha, self.image)
+        shade(
+            corners,
+            nearness,
+            triangles.faces,
+            values,
+            owner,
+            self._camera.position,
+            key,
+            alpha,
+            self.image,
+        )
         if alpha >= 1:
             self._nearness = top
 
@@ -194,15 +229,20 @@ class _Picture:
     def _projected(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(V, 2) columns and rows of points (V, 3), and (V,) one over their depths."""
         x, y, depth = self._camera.axes() @ (points - self._camera.position).T
-        depth = np.where(depth > _NEAR, depth, np.nan)  # omits triangles that are not entirely before the camera
+        # Omits triangles that are not entirely before the camera
+        depth = np.where(depth > _NEAR, depth, np.nan)
         height, width = self._nearness.shape
         focus = height / 2 / np.tan(np.radians(self._camera.field_of_view) / 2)
-        return np.stack([width / 2 + focus * x / depth, height / 2 - focus * y / depth], -1) - 0.5, 1 / depth
+        return np.stack(
+            [width / 2 + focus * x / depth, height / 2 - focus * y / depth], -1
+        ) - 0.5, 1 / depth
 
     def _covered(
         self, corners: np.ndarray, nearness: np.ndarray, triangles: Triangles
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse depth of each sample with the triangles in the picture, and the index of the one that it shows."""
+        """Inverse depth of each sample with the triangles in the picture, and the index of the one
+        that it shows.
+        """
         top, owner = self._nearness.copy(), np.full(self._nearness.shape, NOTHING, np.int32)
         cover(corners, nearness, triangles.faces, triangles.closed, top, owner)
         return top, owner

@@ -45,20 +45,29 @@ def film_of(size: str, fps: float, overlays: bool) -> Film:
         width, height = map(int, numbers)
         if all(64 <= side <= 4096 and side % 2 == 0 for side in (width, height)):
             return Film((width, height), fps, overlays)
-    raise CongraspError(f"--size is '{size}'.", "Write two even numbers from 64 to 4096: --size 1920x1080")
+    raise CongraspError(
+        f"--size is '{size}'.", "Write two even numbers from 64 to 4096: --size 1920x1080"
+    )
 
 
 def grasp_picture(
     episode: Message, step: int, size: tuple[int, int] = (1280, 720), view: View | None = None
 ) -> np.ndarray:
-    """(height, width, 3) uint8, a step without overlays: from a view, by default the best one, and from its side."""
+    """(height, width, 3) uint8, a step without overlays: from a view, by default the best one, and
+    from its side.
+    """
     width, height = size
     left = 2 * width // 3
     shapes = episode_shapes(episode, step, overlays=False)
     best, aside = views(episode, [step])
     widths = left, width - left
-    cameras = [camera_of(episode, [step], w / height, v) for w, v in zip(widths, (view or best, aside), strict=True)]
-    halves = [render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)]
+    cameras = [
+        camera_of(episode, [step], w / height, v)
+        for w, v in zip(widths, (view or best, aside), strict=True)
+    ]
+    halves = [
+        render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)
+    ]
     halves[1][:, :_GAP] = 255
     return np.concatenate(halves, 1)
 
@@ -86,7 +95,9 @@ def render_episode_frames(
     seen_from = camera or camera_of(episode, steps, size[0] / size[1], overlays=overlays)
 
     def drawn(step: int) -> np.ndarray:
-        return render_scene([*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size)
+        return render_scene(
+            [*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size
+        )
 
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(drawn, steps)
@@ -100,7 +111,8 @@ def episode_sheet(
     steps: Sequence[int] | None = None,
     camera: Camera | None = None,
 ) -> np.ndarray:
-    """An episode in a few frames, by default with its first and last step and the table's removal, and its metrics.
+    """An episode in a few frames, by default with its first and last step and the table's removal,
+    and its metrics.
 
     Args:
       episode: the episode.
@@ -117,7 +129,13 @@ def episode_sheet(
 
 
 def episode_strip(
-    episode: Message, frames: int, size: tuple[int, int], first: str, last: str, *, until: int | None = None
+    episode: Message,
+    frames: int,
+    size: tuple[int, int],
+    first: str,
+    last: str,
+    *,
+    until: int | None = None,
 ) -> tuple[list[np.ndarray], list[str]]:
     """A contact sheet's row: pictures of an episode's key frames, and their labels.
 
@@ -132,16 +150,26 @@ def episode_strip(
     table = np.asarray(episode.arrays["table"], bool)
     steps = key_steps(table if until is None else table[: until + 1], frames)
     seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-    return list(render_episode_frames(episode, steps, size)), [first, *seconds[1:-1], f"{seconds[-1]}{last}"]
+    return list(render_episode_frames(episode, steps, size)), [
+        first,
+        *seconds[1:-1],
+        f"{seconds[-1]}{last}",
+    ]
 
 
 def grasp_steps(episode: Message) -> tuple[int, int]:
-    """The first step of the grasp itself, and the first one after it: of the lift, or without the table."""
-    return grasp_span(episode.meta, float(episode.meta["control_dt"]), np.asarray(episode.arrays["table"], bool))
+    """The first step of the grasp itself, and the first one after it: of the lift, or without the
+    table.
+    """
+    return grasp_span(
+        episode.meta, float(episode.meta["control_dt"]), np.asarray(episode.arrays["table"], bool)
+    )
 
 
 def _phase(episode: Message, step: int) -> str:
-    """Label of the phase of a step: table removed, or a phase of an episode with approach or lift; else empty."""
+    """Label of the phase of a step: table removed, or a phase of an episode with approach or lift;
+    else empty.
+    """
     if not episode.arrays["table"][step]:
         return "table removed"
     phases = phases_of(episode.meta)
@@ -153,7 +181,9 @@ def _phase(episode: Message, step: int) -> str:
 
 
 def key_steps(table: np.ndarray, frames: int) -> list[int]:
-    """Steps spread evenly over an episode, with that of the table's removal; `table` (T,) bool is True at first."""
+    """Steps spread evenly over an episode, with that of the table's removal; `table` (T,) bool is
+    True at first.
+    """
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, frames)})
     if not table.all() and len(steps) > 2:
         removal = int(np.argmin(table))
@@ -169,9 +199,16 @@ def episode_title(episode: Message) -> str:
     result = "success" if meta["success"] else "no success"
     metrics = meta.get("metrics", {})
     shown = [
-        f"{name.replace('_', ' ')} {metrics[name]:.3g}" for name in ("return", "links_at_removal") if name in metrics
+        f"{name.replace('_', ' ')} {metrics[name]:.3g}"
+        for name in ("return", "links_at_removal")
+        if name in metrics
     ]
-    parts = [f"{known_hand(meta['hand']).name} hand, {meta['object']}", " + ".join(["heading", *names]), result, *shown]
+    parts = [
+        f"{known_hand(meta['hand']).name} hand, {meta['object']}",
+        " + ".join(["heading", *names]),
+        result,
+        *shown,
+    ]
     return "   |   ".join([*parts, f"policy version {meta['version']}"])
 
 
@@ -200,12 +237,16 @@ def save_episode_video(
       CongraspError: the package for videos is absent, or the file cannot be written.
     """
     step = 1 / (film.fps * float(episode.meta["control_dt"]))
-    last = len(episode.arrays["table"]) if until is None else min(until, len(episode.arrays["table"]))
+    last = (
+        len(episode.arrays["table"]) if until is None else min(until, len(episode.arrays["table"]))
+    )
     steps = [int(i * step) for i in range(int(np.ceil(last / step)))]
 
     def frames() -> Iterator[np.ndarray]:
         """Yields the frames in order."""
-        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays, around=around)
+        drawn = render_episode_frames(
+            episode, steps, film.size, camera, overlays=film.overlays, around=around
+        )
         for done, frame in enumerate(drawn, 1):
             yield frame
             progress(done / len(steps))

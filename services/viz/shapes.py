@@ -34,18 +34,21 @@ _STILL = 1e-3  # m of a curl that is too small for a direction
 class Shape:
     """A shape to draw.
 
-    `size` is a radius and a half length along z, zeros for a mesh; `position` (3,) and `quaternion` (4,) are in the
-    world frame. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is transparent, and casts no `shadow`.
-    `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. With `paint`, in the shape's frame, each point of a mesh has
-    the mean colour of the nearest paint points. With `normals` (V, 3) and `colours` (V, 3), the mesh is drawn
-    unchanged: it must be closed, wound outwards, and fine enough.
+    `size` is a radius and a half length along z, zeros for a mesh; `position` (3,) and `quaternion`
+    (4,) are in the world frame. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is
+    transparent, and casts no `shadow`. `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. With
+    `paint`, in the shape's frame, each point of a mesh has the mean colour of the nearest paint
+    points. With `normals` (V, 3) and `colours` (V, 3), the mesh is drawn unchanged: it must be
+    closed, wound outwards, and fine enough.
     """
 
     kind: Kind
     size: tuple[float, float]
     colour: tuple[float, float, float]
     position: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
-    quaternion: np.ndarray = dataclasses.field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    quaternion: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0])
+    )
     alpha: float = 1.0
     shine: float = 0.25
     shadow: bool = True
@@ -58,7 +61,9 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at `position` that looks at `target`, both (3,) in the world frame; z is up."""
+    """A pinhole camera at `position` that looks at `target`, both (3,) in the world frame; z is
+    up.
+    """
 
     position: np.ndarray
     target: np.ndarray
@@ -81,9 +86,16 @@ class Camera:
 
 
 def between(
-    start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float, float, float], *, shadow: bool = True
+    start: np.ndarray,
+    end: np.ndarray,
+    radius: float,
+    colour: tuple[float, float, float],
+    *,
+    shadow: bool = True,
 ) -> Shape:
-    """A capsule from `start` to `end` (3,), or a ball if they coincide; for the other arguments see `Shape`."""
+    """A capsule from `start` to `end` (3,), or a ball if they coincide; for the other arguments see
+    `Shape`.
+    """
     along = np.subtract(end, start)
     length = float(np.linalg.norm(along))
     middle = np.add(start, end) / 2
@@ -111,7 +123,9 @@ def skin_shape(
       shares: (L,) shares of that colour on each link; zero by default.
       alpha: opacity; below one the hand is transparent.
     """
-    points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+    points, normals = skin.posed(
+        position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    )
     own = skin_colours(skin)
     share = (skin.weights @ np.asarray(shares, np.float32))[:, None] if shares is not None else 0.0
     return Shape(
@@ -133,7 +147,9 @@ def skin_colours(skin: Skin) -> np.ndarray:
 
 
 def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> list[Shape]:
-    """The hand's capsules with its links' frames at positions (L, 3) and orientations (L, 4) in the world."""
+    """The hand's capsules with its links' frames at positions (L, 3) and orientations (L, 4) in the
+    world.
+    """
     shapes = []
     for i, link in enumerate(hand.links):
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
@@ -143,14 +159,18 @@ def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> 
     return shapes
 
 
-def link_frames(hand: Hand, q: np.ndarray, position: np.ndarray, wrist: Rotation) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (L, 3) and orientations (L, 4) of the links at finger angles (F,), in the frame of the wrist's pose."""
+def link_frames(
+    hand: Hand, q: np.ndarray, position: np.ndarray, wrist: Rotation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (L, 3) and orientations (L, 4) of the links at finger angles (F,), in the frame of
+    the wrist's pose.
+    """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = wrist * Rotation.from_quat(quaternion, scalar_first=True)
     return wrist.apply(links) + position, turned.as_quat(scalar_first=True)
 
 
-def posed_hand(
+def posed_hand(  # noqa: PLR0913
     hand: Hand,
     q: np.ndarray,
     position: np.ndarray,
@@ -160,11 +180,14 @@ def posed_hand(
     alpha: float = 1.0,
     skin: Skin | None = None,
 ) -> Shape:
-    """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world frame.
+    """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the
+    world frame.
 
     Tint, shares and alpha are those of `skin_shape`; the skin is `skin_of(hand)` by default.
     """
-    return skin_shape(skin or skin_of(hand), *link_frames(hand, q, position, wrist), tint, shares, alpha)
+    return skin_shape(
+        skin or skin_of(hand), *link_frames(hand, q, position, wrist), tint, shares, alpha
+    )
 
 
 def object_shape(
@@ -210,7 +233,14 @@ def arm_shapes(arm: MovedArm, frame: int) -> list[Shape]:
 
 def table_shape(below: np.ndarray) -> Shape:
     """A table top at height zero under a point (3,), whose edge fades away."""
-    return Shape("table", (_TABLE_RADIUS, 0.0), TABLE, np.array([below[0], below[1], 0.0]), shine=0.0, shadow=False)
+    return Shape(
+        "table",
+        (_TABLE_RADIUS, 0.0),
+        TABLE,
+        np.array([below[0], below[1], 0.0]),
+        shine=0.0,
+        shadow=False,
+    )
 
 
 def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> list[Shape]:
@@ -220,11 +250,15 @@ def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> 
     neck = end - 6 * radius * direction
     turn = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])[0].as_quat(scalar_first=True)
     angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-    ring = np.stack([2.4 * radius * np.cos(angles), 2.4 * radius * np.sin(angles), np.zeros(32)], -1)
+    ring = np.stack(
+        [2.4 * radius * np.cos(angles), 2.4 * radius * np.sin(angles), np.zeros(32)], -1
+    )
     vertices = np.concatenate([ring, [[0, 0, 6 * radius], [0, 0, 0]]])
     here = np.arange(32)
     after = (here + 1) % 32
-    faces = np.concatenate([np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)])
+    faces = np.concatenate(
+        [np.stack([here, after, np.full(32, 32)], -1), np.stack([after, here, np.full(32, 33)], -1)]
+    )
     cone = Shape("mesh", (0, 0), colour, neck, turn, shadow=False, vertices=vertices, faces=faces)
     return [between(start, neck, radius, colour, shadow=False), cone]
 
@@ -232,20 +266,26 @@ def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> 
 def beads(points: np.ndarray, radius: float, colour: Colour) -> Shape:
     """Balls at points (N, 3) on a string, without a shadow."""
     balls = [trimesh.creation.icosphere(1, radius).apply_translation(point) for point in points]
-    pairs = [pair for pair in itertools.pairwise(points) if np.linalg.norm(np.subtract(*pair)) > 1e-6]
+    pairs = [
+        pair for pair in itertools.pairwise(points) if np.linalg.norm(np.subtract(*pair)) > 1e-6
+    ]
     string = [trimesh.creation.cylinder(0.4 * radius, segment=pair, sections=8) for pair in pairs]
     mesh: Any = trimesh.util.concatenate([*balls, *string])
     return Shape("mesh", (0, 0), colour, shadow=False, vertices=mesh.vertices, faces=mesh.faces)
 
 
 def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:
-    """The nearest camera that sees all points (N, 3) from `direction` (3,), which leads from them to the camera."""
+    """The nearest camera that sees all points (N, 3) from `direction` (3,), which leads from them
+    to the camera.
+    """
     tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2) / _SPACE
     direction = np.asarray(direction, float) / np.linalg.norm(direction)
     target = (points.min(0) + points.max(0)) / 2
     axes = Camera(target + direction, target).axes()
     distance = 1.0
-    for _ in range(8):  # distance and centre in turn; a few rounds converge to a fraction of a pixel
+    for _ in range(
+        8
+    ):  # distance and centre in turn; a few rounds converge to a fraction of a pixel
         x, y, z = axes @ (points - target).T
         distance = max((np.abs(x) / (tangent * aspect) - z).max(), (np.abs(y) / tangent - z).max())
         sides = np.stack([x, y]) / (distance + z)
@@ -263,13 +303,19 @@ def shape_points(shape: Shape) -> np.ndarray:
 
 
 def upright(hand: Hand) -> Rotation:
-    """Rotation of the wrist frame after which the fingers point up and the palm, towards which they curl, faces +x."""
+    """Rotation of the wrist frame after which the fingers point up and the palm, towards which they
+    curl, faces +x.
+    """
     fingers = hand.keypoints[len(hand.links) + 1 :].mean(0)
     up = fingers / np.linalg.norm(fingers)
     links = list(hand.tip_links[1:])
-    curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
+    curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[
+        links
+    ].mean(0)
     palm = curl - (curl @ up) * up
-    if np.linalg.norm(palm) < _STILL:  # fingers with one joint, or around an axis, do not curl: use the thumb
+    if (
+        np.linalg.norm(palm) < _STILL
+    ):  # fingers with one joint, or around an axis, do not curl: use the thumb
         thumb = hand.keypoints[len(hand.links)] - fingers
         palm = thumb - (thumb @ up) * up
     palm = palm / np.linalg.norm(palm)

@@ -16,12 +16,15 @@ _QUIET, _PAPER = (96, 103, 116), (251, 251, 252)
 _MARGIN, _LABEL, _TITLE = 10, 24, 44  # pixels
 
 
-def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: int, title: str = "") -> np.ndarray:
+def contact_sheet(
+    images: Sequence[np.ndarray], labels: Sequence[str], columns: int, title: str = ""
+) -> np.ndarray:
     """Pictures in rows, each with its label below it, under a title.
 
     Args:
       images: (height, width, 3) uint8, all of one size.
-      labels: one for each picture; shrunk and cut until it fits, as is the title. Different ones that would then look
+      labels: one for each picture; shrunk and cut until it fits, as is the title. Different ones
+      that would then look
         equal get the picture's number.
       columns: pictures in a row.
       title: one line.
@@ -33,11 +36,17 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
       CongraspError: there are no pictures, or not one label for each.
     """
     if not images or len(images) != len(labels):
-        raise CongraspError(f"{len(images)} pictures and {len(labels)} labels do not make a contact sheet.")
+        raise CongraspError(
+            f"{len(images)} pictures and {len(labels)} labels do not make a contact sheet."
+        )
     height, width = images[0].shape[:2]
     rows = -(-len(images) // columns)
     top = _TITLE if title else _MARGIN
-    sheet = Image.new("RGB", (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN), _PAPER)
+    sheet = Image.new(
+        "RGB",
+        (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN),
+        _PAPER,
+    )
     draw = ImageDraw.Draw(sheet)
     if title:
         title, font = _fitted(title, 19, sheet.width - 2 * _MARGIN)
@@ -61,8 +70,12 @@ def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(wide)
 
 
-def _fitted(text: str, size: int, width: int) -> tuple[str, ImageFont.FreeTypeFont | ImageFont.ImageFont]:
-    """A text and the largest font up to a size with which it fits a width in pixels; a longer one loses its middle."""
+def _fitted(
+    text: str, size: int, width: int
+) -> tuple[str, ImageFont.FreeTypeFont | ImageFont.ImageFont]:
+    """A text and the largest font up to a size with which it fits a width in pixels; a longer one
+    loses its middle.
+    """
     while (font := ImageFont.load_default(size)).getlength(text) > width and size > 8:
         size -= 1
     half, shown = len(text) // 2, text
@@ -81,7 +94,9 @@ def png_of(image: np.ndarray) -> bytes:
 
 
 def save_png(path: pathlib.Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) uint8 as PNG, atomically; raises a CongraspError if the path cannot be written."""
+    """Writes (H, W, 3) uint8 as PNG, atomically; raises a CongraspError if the path cannot be
+    written.
+    """
     write_atomically(path, png_of(image))
 
 
@@ -92,7 +107,8 @@ def save_video(
     frame_rate: float,
     encoding: Sequence[str] = (),
 ) -> None:
-    """Writes pictures (height, width, 3) uint8 of `size` (width, height, both even) as an MP4 (H.264).
+    """Writes pictures (height, width, 3) uint8 of `size` (width, height, both even) as an MP4
+    (H.264).
 
     `encoding` are further options of ffmpeg for the file.
 
@@ -105,9 +121,16 @@ def save_video(
     with os_errors_as(f"{path} could not be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(
-            str(path), size, fps=frame_rate, quality=8, macro_block_size=2, output_params=[*encoding]
+            str(path),
+            size,
+            fps=frame_rate,
+            quality=8,
+            macro_block_size=2,
+            output_params=[*encoding],
         )
-        with warnings.catch_warnings():  # JAX warns of forks, which are safe if another program is executed
+        with (
+            warnings.catch_warnings()
+        ):  # JAX warns of forks, which are safe if another program is executed
             warnings.simplefilter("ignore", RuntimeWarning)
             writer.send(None)
         for frame in frames:

@@ -16,14 +16,20 @@ from congrasp.services.viz.shapes import Shape
 CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
 _Size = tuple[float, int]
-_PLAIN, _PAINTED = (0.005, 12_000), (0.0025, 40_000)  # longest side of a mesh's triangles, m, and their number, about
+# Longest side of a mesh's triangles, m, and their number, about
+_PLAIN, _PAINTED = (
+    (0.005, 12_000),
+    (0.0025, 40_000),
+)
 _RINGS, _SECTIONS = 72, 160  # of a table top
 _DENSER = 1.6  # exponent of the radii of its rings; above one they are denser around the middle
 _FADES = 0.55  # share of its radius from which it fades into the background
 
 
 class Triangles(NamedTuple):
-    """F triangles between V points with one normal each; a sharp edge has a point for each of its surfaces."""
+    """F triangles between V points with one normal each; a sharp edge has a point for each of its
+    surfaces.
+    """
 
     points: np.ndarray
     """(V, 3) float32."""
@@ -36,7 +42,9 @@ class Triangles(NamedTuple):
     faces: np.ndarray
     """(F, 3) indices of their corners."""
     closed: np.ndarray
-    """(F,) bool, True for a closed surface that winds outwards, of which only the outside is visible."""
+    """(F,) bool, True for a closed surface that winds outwards, of which only the outside is
+    visible.
+    """
     opacity: np.ndarray
     """(V,) float32 opacity."""
 
@@ -60,7 +68,9 @@ class _Surface(NamedTuple):
 
 
 def triangles_of(shapes: Iterable[Shape], *, fine: bool = True) -> Triangles:
-    """The triangles of shapes in the world frame, one shape after the other; small ones if `fine`."""
+    """The triangles of shapes in the world frame, one shape after the other; small ones if
+    `fine`.
+    """
     none = np.zeros((0, 3), np.float32)
     found = [Triangles(none, none, none, none[:, 0], none.astype(int), none[:, 0] > 0, none[:, 0])]
     return joined([*found, *(_triangles(shape, fine) for shape in shapes)])
@@ -69,7 +79,9 @@ def triangles_of(shapes: Iterable[Shape], *, fine: bool = True) -> Triangles:
 def joined(parts: Sequence[Triangles]) -> Triangles:
     """The triangles of all parts, one after the other."""
     firsts = np.cumsum([0, *(len(part.points) for part in parts)])
-    parts = [part._replace(faces=part.faces + first) for part, first in zip(parts, firsts, strict=False)]
+    parts = [
+        part._replace(faces=part.faces + first) for part, first in zip(parts, firsts, strict=False)
+    ]
     return Triangles(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -77,7 +89,9 @@ def _triangles(shape: Shape, fine: bool) -> Triangles:
     """The triangles of one shape in the world frame."""
     if shape.normals is not None and shape.colours is not None:
         points, normals = (np.asarray(part, np.float32) for part in (shape.vertices, shape.normals))
-        surface = _Surface(points, normals, np.asarray(shape.faces), True, _linear(np.asarray(shape.colours)))
+        surface = _Surface(
+            points, normals, np.asarray(shape.faces), True, _linear(np.asarray(shape.colours))
+        )
     elif shape.kind == "mesh":
         surface = _mesh(
             _content(shape.vertices, float),
@@ -108,15 +122,25 @@ def _content(array: np.ndarray | None, kind: type) -> bytes:
 
 
 @functools.lru_cache(maxsize=64)
-def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_values: bytes, fine: bool) -> _Surface:
-    """A mesh; cached by the content of its arrays, so that a mesh that moves between pictures is refined once."""
-    corners, triples = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, int).reshape(-1, 3)
+def _mesh(
+    vertices: bytes, faces: bytes, paint_points: bytes, paint_values: bytes, fine: bool
+) -> _Surface:
+    """A mesh; cached by the content of its arrays, so that a mesh that moves between pictures is
+    refined once.
+    """
+    corners, triples = (
+        np.frombuffer(vertices).reshape(-1, 3),
+        np.frombuffer(faces, int).reshape(-1, 3),
+    )
     closed = bool(trimesh.Trimesh(corners, triples).is_volume)
     size = (_PAINTED if paint_points else _PLAIN) if fine else None
     surface = _surface(*smooth_corners(corners, triples), closed, size)
     if not paint_points:
         return surface
-    paint = Colours(np.frombuffer(paint_points).reshape(-1, 3), np.frombuffer(paint_values, np.uint8).reshape(-1, 3))
+    paint = Colours(
+        np.frombuffer(paint_points).reshape(-1, 3),
+        np.frombuffer(paint_values, np.uint8).reshape(-1, 3),
+    )
     return surface._replace(paint=_linear(colours_at(surface.points, paint) / 255))
 
 
@@ -125,15 +149,22 @@ def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
     """A capsule along z, or a ball."""
     ball = trimesh.creation.icosphere(2 if fine else 1, 1.0)
     normals, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-    # Scaled to the area of the round one, and split at its equator: triangles across the equator become the shaft.
-    lift = np.where(normals[:, 2] > 1e-6, half_length, np.where(normals[:, 2] < -1e-6, -half_length, 0.0))
-    points = radius * np.sqrt(4 * np.pi / ball.area) * normals + lift[:, None] * np.array([0.0, 0.0, 1.0])
+    # Scaled to the area of the round one, and split at its equator: triangles across the equator
+    # become the shaft.
+    lift = np.where(
+        normals[:, 2] > 1e-6, half_length, np.where(normals[:, 2] < -1e-6, -half_length, 0.0)
+    )
+    points = radius * np.sqrt(4 * np.pi / ball.area) * normals + lift[:, None] * np.array(
+        [0.0, 0.0, 1.0]
+    )
     return _surface(points[faces], normals[faces], True, _PLAIN if fine else None)
 
 
 @functools.lru_cache(maxsize=8)
 def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
-    """A disc at the upper end, finest in the middle, with a fading edge; opaque and of few triangles if not `fine`."""
+    """A disc at the upper end, finest in the middle, with a fading edge; opaque and of few
+    triangles if not `fine`.
+    """
     rings, sections = (_RINGS, _SECTIONS) if fine else (1, 96)
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     share = (np.arange(1, rings + 1) / rings) ** _DENSER
@@ -152,8 +183,12 @@ def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
     return _Surface(points, up, np.concatenate(faces), True, opacity=opacity)
 
 
-def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size | None) -> _Surface:
-    """Triangles (F, 3, 3) with normals (F, 3, 3), refined if a size is given; equal corners become one point."""
+def _surface(
+    corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size | None
+) -> _Surface:
+    """Triangles (F, 3, 3) with normals (F, 3, 3), refined if a size is given; equal corners become
+    one point.
+    """
     if size:
         corners, normals = cut(corners, normals, *size)
     rows = np.concatenate([corners, normals], -1).reshape(-1, 6)
@@ -165,7 +200,8 @@ def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size
 def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners and normals (F, 3, 3) of a mesh (V, 3), (F, 3), without its degenerate faces.
 
-    A corner's normal is the mean, weighted by area, of the faces around it that are within the crease angle.
+    A corner's normal is the mean, weighted by area, of the faces around it that are within the
+    crease angle.
     """
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     corners = vertices[faces]
@@ -189,16 +225,25 @@ def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     return corners, (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3, 3)
 
 
-def cut(corners: np.ndarray, normals: np.ndarray, side: float, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface (F, 3, 3) in smaller triangles: those with a long side are bisected repeatedly.
+def cut(
+    corners: np.ndarray, normals: np.ndarray, side: float, most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface (F, 3, 3) in smaller triangles: those with a long side are bisected
+    repeatedly.
 
     Args:
       corners: (F, 3, 3).
       normals: (F, 3, 3) at the corners.
       side: longest side, m.
-      most: approximate limit of the number of triangles; sides stay longer on a surface that needs more.
+      most: approximate limit of the number of triangles; sides stay longer on a surface that needs
+      more.
     """
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+        ).sum()
+        / 2
+    )
     longest = max(side, 3 * float(np.sqrt(area / most)))
     corners, normals = np.split(bisected(np.concatenate([corners, normals], -1), longest), 2, -1)
     return corners, normals

@@ -1,4 +1,6 @@
-"""Constraint banks: references that the table allows, and references renewed by the policy's own grasps."""
+"""Constraint banks: references that the table allows, and references renewed by the policy's own
+grasps.
+"""
 
 import dataclasses
 import functools
@@ -44,7 +46,9 @@ def test_headings_of_a_flat_object_stay_above_the_table(bank):
             height = np.asarray(rotations.rotate(quaternion, position))[:, 2] + rest[n, r, 2]
             assert height.min() >= 0.006  # fingertips are that thick
             assert np.asarray(rotations.rotate(quaternion, direction))[:, 2].max() <= 0.1 + 1e-5
-    assert (np.asarray(bank.heading_back) > 0).any()  # the hammer is thinner than twice two centimetres
+    assert (
+        np.asarray(bank.heading_back) > 0
+    ).any()  # the hammer is thinner than twice two centimetres
     assert (np.asarray(bank.heading_back) <= 0.03 + 1e-5).all()
 
 
@@ -91,7 +95,9 @@ def test_an_object_that_cannot_be_approached_is_named():
 
 
 def test_a_task_that_draws_no_references_gets_none_and_the_same_headings():
-    own = build_bank(HAND, dataclasses.replace(TASK, constraints=("heading", "affordance")), suite.OBJECTS, 0)
+    own = build_bank(
+        HAND, dataclasses.replace(TASK, constraints=("heading", "affordance")), suite.OBJECTS, 0
+    )
     assert not np.any(own.pose_valid)
     for name in SHARED:
         got, whole = np.asarray(getattr(own, name)), np.asarray(getattr(suite.bank(), name))
@@ -108,10 +114,17 @@ def lying(bank):
 
 
 def _grasps(angle: float, count: int = 4) -> Grasps:
-    """Grasps of the graspable region of the second object from straight above, of which `count` were found."""
+    """Grasps of the graspable region of the second object from straight above, of which `count`
+    were found.
+    """
     second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
     return Grasps(
-        jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([pointing(-1.0)] * 4)
+        jnp.arange(4) < count,
+        second,
+        second,
+        jnp.full((4, F), angle),
+        above,
+        jnp.stack([pointing(-1.0)] * 4),
     )
 
 
@@ -119,7 +132,8 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
     grasp, key = _grasps(0.123, 1), jax.random.key(1)
     used = lying._replace(pose_valid=lying.pose_valid.at[1, 1, :, 7].set(False))
     new = renew(HAND, TASK, used, grasp, key)
-    assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]  # where there was none to use
+    # Where there was none to use
+    assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]
     new = renew(HAND, TASK, lying, grasp, key)
     changed = np.asarray((new.pose_q != lying.pose_q).any(-1))
     assert changed[1, 1].sum() == 1 and changed.sum() == 1
@@ -127,14 +141,18 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
     np.testing.assert_allclose(new.pose_q[1, 1, slot], 0.123)
     np.testing.assert_allclose(new.trajectory_position[1, 1, slot, -1], [0, 0, 0.2], atol=2e-3)
     others = np.delete(np.arange(POSES), slot)
-    np.testing.assert_array_equal(new.trajectory_position[1, 1, others], lying.trajectory_position[1, 1, others])
+    np.testing.assert_array_equal(
+        new.trajectory_position[1, 1, others], lying.trajectory_position[1, 1, others]
+    )
     np.testing.assert_array_equal(new.pose_valid[0], lying.pose_valid[0])
     nothing = renew(HAND, TASK, lying, _grasps(0.123, 0), key)
     jax.tree.map(np.testing.assert_array_equal, nothing, lying)
 
 
 def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(lying):
-    """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the places."""
+    """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the
+    places.
+    """
     now = lying
     for age in range(64):
         now = renew(HAND, TASK, now, _grasps(age / 100), jax.random.key(age))
@@ -149,7 +167,9 @@ def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):
     path = tmp_path / "new folder" / "a.safetensors"
     read = functools.partial(with_kept_references, path, HAND, TASK)
     assert read(bank) is bank
-    grown = bank._replace(pose_q=bank.pose_q.at[1, 1, 0].set(0.5), grasps=bank.grasps.at[1, 1].add(3))
+    grown = bank._replace(
+        pose_q=bank.pose_q.at[1, 1, 0].set(0.5), grasps=bank.grasps.at[1, 1].add(3)
+    )
     save_references(path, grown)
     kept = read(bank)
     np.testing.assert_array_equal(kept.grasps, grown.grasps)

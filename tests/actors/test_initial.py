@@ -1,4 +1,6 @@
-"""What episodes start from: references that are drawn, and a hand that begins where its constraints let it."""
+"""What episodes start from: references that are drawn, and a hand that begins where its constraints
+let it.
+"""
 
 import dataclasses
 import functools
@@ -33,10 +35,11 @@ BATCH, M = 2000, 6
 
 
 def _bank(valid: np.ndarray) -> ConstraintBank:
-    """Two objects with a graspable point at x = 10 cm and one to avoid at -10 cm, in one resting pose.
+    """Two objects with a graspable point at x = 10 cm and one to avoid at -10 cm, in one resting
+    pose.
 
-    Pose m has the angle m in all its joints, and trajectory m ends at x = m - 2.5 cm: nearer to the graspable point
-    from m = 3 on.
+    Pose m has the angle m in all its joints, and trajectory m ends at x = m - 2.5 cm: nearer to the
+    graspable point from m = 3 on.
 
     Args:
       valid: (M,) bool, the references that the table leaves room for.
@@ -76,12 +79,16 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
 @functools.partial(jax.jit, static_argnums=0)
 def _sample(task: TaskConfig, bank: ConstraintBank, together: float) -> InitialConditions:
     """Initial conditions of many episodes; `together` is the task's `p_together`."""
-    return sample(HAND, dataclasses.replace(task, p_together=together), bank, jax.random.key(3), BATCH)
+    return sample(
+        HAND, dataclasses.replace(task, p_together=together), bank, jax.random.key(3), BATCH
+    )
 
 
 @jax.jit
 def _begun(surface: Surface, asked: Goal, constraints: dict[str, np.ndarray]) -> tuple[Any, ...]:
-    """The goal after the priority rules, the fingers at the start, and the wrist that aligns them with the heading."""
+    """The goal after the priority rules, the fingers at the start, and the wrist that aligns them
+    with the heading.
+    """
     goal = resolve(HAND, surface, asked, constraints).goal
     rest = jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1))
     q = initial_hand(HAND, TASK, goal, surface, rest)[0]
@@ -107,14 +114,18 @@ def _heading(task: TaskConfig) -> Callable:
 def _drawn(
     task: TaskConfig, valid: tuple[int, ...] = tuple(range(M)), together: float = 0.0
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Which blocks are active, and numbers of pose and trajectory, in many episodes; an affordance that a pose
-    overrides is not active, but is told by the region."""
+    """Which blocks are active, and numbers of pose and trajectory, in many episodes; an affordance
+    that a pose overrides is not active, but is told by the region."""
     drawn = jax.device_get(_sample(task, _bank(np.isin(np.arange(M), valid)), together))
     active = {name: np.asarray(block) for name, block in drawn.goal.active.items()} | {
         "region": np.asarray(drawn.region) == 1
     }
     trajectory = np.asarray(drawn.goal["trajectory"].position)[:, -1, 0] / 0.01 + 2.5
-    return active, np.asarray(drawn.goal["pose"].q)[:, 0].round().astype(int), trajectory.round().astype(int)
+    return (
+        active,
+        np.asarray(drawn.goal["pose"].q)[:, 0].round().astype(int),
+        trajectory.round().astype(int),
+    )
 
 
 def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside_an_affordance():
@@ -126,14 +137,17 @@ def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside
 
 
 def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
-    """Trajectories 3, 4 and 5 end 5, 15 and 25 mm on the graspable side, and disturbances have up to 10 mm."""
+    """Trajectories 3, 4 and 5 end 5, 15 and 25 mm on the graspable side, and disturbances have up
+    to 10 mm.
+    """
     task = dataclasses.replace(TASK, disturbed_references=1.0)
     drawn = jax.device_get(_sample(task, _bank(np.ones(M, bool)), 0.0))
     region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
     end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
     both = region & on
     assert (end[both, 0] > 0).all()
-    # Those that would have contradicted it are as they were; the rest, and those without affordance, are disturbed.
+    # Those that would have contradicted it are as they were; the rest, and those without
+    # affordance, are disturbed.
     exact = np.isclose(end[:, 0], 0.005, atol=1e-6) & np.isclose(end[:, 1], 0.0, atol=1e-9)
     assert 0.02 < exact[both].mean() < 0.2 and not exact[on & ~region].any()
     assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
@@ -141,7 +155,9 @@ def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
 
 @pytest.mark.parametrize("share", [0.6, 1.0])
 def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
-    """By hand: 1/2 of the episodes have an affordance, 1/2 of these no pose, 1/2 of these a trajectory anyway."""
+    """By hand: 1/2 of the episodes have an affordance, 1/2 of these no pose, 1/2 of these a
+    trajectory anyway.
+    """
     active, _, trajectory = _drawn(TASK, together=share)
     both = active["trajectory"] & active["affordance"]
     assert both.mean() == pytest.approx(0.25 * (0.5 + 0.5 * share), abs=0.03)
@@ -167,14 +183,16 @@ def test_pose_and_trajectory_are_drawn_independently():
     both = active["pose_finger"] & active["trajectory"] & ~active["region"]
     pairs = np.histogram2d(pose[both], trajectory[both], bins=np.arange(M + 1) - 0.5)[0]
     assert pairs.min() > 0
-    expected = pairs.sum() / M**2  # 36 cells of some seven each: chi squared with 35 degrees of freedom
+    # 36 cells of some seven each: chi squared with 35 degrees of freedom
+    expected = pairs.sum() / M**2
     assert ((pairs - expected) ** 2 / expected).sum() < 80
 
 
 @pytest.mark.parametrize("few", [False, True])
 def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
     active, pose, trajectory = _drawn(
-        dataclasses.replace(TASK, aligned_references=True), (0, 1, 2, 3, 5) if few else tuple(range(M))
+        dataclasses.replace(TASK, aligned_references=True),
+        (0, 1, 2, 3, 5) if few else tuple(range(M)),
     )
     both = active["pose_finger"] & active["trajectory"]
     np.testing.assert_array_equal(pose[both], trajectory[both])
@@ -189,11 +207,14 @@ def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
 def test_heading_guidance_and_reward_know_one_center(dynamic, on):
     """Where the hand is at its target, the heading that the rules made is met to 0 m.
 
-    With the fingers of its start, but under a trajectory alone with those of the partly closed hand.
+    With the fingers of its start, but under a trajectory alone with those of the partly closed
+    hand.
     """
     task = dataclasses.replace(TASK, dynamic_center=dynamic)
     state, surface, goal = scene(21)
-    goal, q, aligned = _begun(surface, goal, {c.name: np.full(4, c.name in on) for c in optional(TASK)})
+    goal, q, aligned = _begun(
+        surface, goal, {c.name: np.full(4, c.name in on) for c in optional(TASK)}
+    )
     if on == {"trajectory"}:
         q = np.tile(closing(HAND), (4, 1))
     wrist = goal["trajectory"] if "trajectory" in on else goal["pose"] if on else aligned

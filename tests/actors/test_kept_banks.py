@@ -69,7 +69,13 @@ def test_whatever_a_bank_depends_on_makes_another(hand, task, objects, seed):
 def test_what_no_bank_depends_on_does_not():
     build = Builder()
     kept_bank(HAND, TASK, OBJECTS, 0, build)
-    kept_bank(HAND, dataclasses.replace(TASK, reward=RewardWeights(force=7.0), p_pose=0.1), OBJECTS, 0, build)
+    kept_bank(
+        HAND,
+        dataclasses.replace(TASK, reward=RewardWeights(force=7.0), p_pose=0.1),
+        OBJECTS,
+        0,
+        build,
+    )
     assert build.built == 1
 
 

@@ -29,7 +29,9 @@ class Learner:
         self.received = []
         self.tickets = []
         self.pulls = 0
-        self.transport.serve(KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"]))
+        self.transport.serve(
+            KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"])
+        )
         self.transport.serve(KEYS.tickets, self.on_ticket)
         self.transport.serve(below(KEYS.weights), self.on_weights)
         self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
@@ -48,11 +50,19 @@ class Learner:
             self.state["session_id"],
         ):
             return self.reply()
-        return Message({"w": np.ones(2)}, {"version": self.state["version"], "run_id": self.state["run_id"]})
+        return Message(
+            {"w": np.ones(2)}, {"version": self.state["version"], "run_id": self.state["run_id"]}
+        )
 
     def on_rollout(self, key, message):
         self.received.append(message)
-        outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0] if self.outcomes else "accepted"
+        outcome = (
+            self.outcomes.pop(0)
+            if len(self.outcomes) > 1
+            else self.outcomes[0]
+            if self.outcomes
+            else "accepted"
+        )
         if isinstance(outcome, Exception):
             raise outcome
         if callable(outcome):
@@ -119,7 +129,13 @@ def test_identity_is_added_and_counts(ends):
     assert make().incarnation != link.incarnation
     for n, message in enumerate(learner.received):
         assert message.arrays["reward"][0] == n
-        expected = {"actor": "a", "incarnation": link.incarnation, "sequence": n, "run_id": "e", "ticket": f"t{n}"}
+        expected = {
+            "actor": "a",
+            "incarnation": link.incarnation,
+            "sequence": n,
+            "run_id": "e",
+            "ticket": f"t{n}",
+        }
         assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
 
 
@@ -135,8 +151,11 @@ def test_tickets_are_waited_for_and_asked_for_under_one_id(joined):
     assert {meta["ticket"] for meta in learner.tickets} == {first.id, second.id}
     link.give_back(second)
     assert learner.tickets[-1] == {
-        "actor": "a", "incarnation": link.incarnation, "ticket": second.id, "give_back": True,
-    }  # fmt: skip
+        "actor": "a",
+        "incarnation": link.incarnation,
+        "ticket": second.id,
+        "give_back": True,
+    }
 
 
 def test_an_announcement_ends_the_wait_for_a_ticket(joined):
@@ -201,7 +220,9 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(joined):
     gate = threading.Event()
     learner.outcomes = [lambda: gate.wait(10) and "accepted"]
     outcomes = [link.upload(rollout(n), TICKET) for n in range(2)]  # both return at once
-    third = threading.Thread(target=lambda: outcomes.append(link.upload(rollout(2), TICKET)), daemon=True)
+    third = threading.Thread(
+        target=lambda: outcomes.append(link.upload(rollout(2), TICKET)), daemon=True
+    )
     third.start()
     third.join(0.3)
     assert third.is_alive() and len(learner.received) == 2
@@ -215,8 +236,15 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(joined):
 def test_refusals_in_a_row_stop_the_actor_with_a_reason(joined):
     learner, link = joined(max_refusals=3)
     learner.outcomes = ["refused", "refused", "stale", "refused", "refused", "refused"]
-    assert [link.upload(rollout(), TICKET).result(60) for _ in range(6)][2:4] == ["stale", "refused"]
-    for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
+    assert [link.upload(rollout(), TICKET).result(60) for _ in range(6)][2:4] == [
+        "stale",
+        "refused",
+    ]
+    for use in (
+        lambda: link.upload(rollout(), TICKET),
+        lambda: link.acquire_ticket(1),
+        lambda: link.weights(0),
+    ):
         with pytest.raises(CongraspError, match="refused 3 rollouts in a row: because"):
             use()
     assert len(learner.received) == 6
@@ -260,7 +288,8 @@ def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joine
     outcome = link.upload(rollout(), TICKET)
     assert link.acquire_ticket(0.2) is None
     running = time.monotonic
-    monkeypatch.setattr(time, "monotonic", lambda: running() + 60.0)  # what a process sees that was stopped
+    # What a process sees that was stopped
+    monkeypatch.setattr(time, "monotonic", lambda: running() + 60.0)
     assert link.acquire_ticket(0.2) is None
     assert not outcome.done()
     Learner(learner.hub, session_id="2")

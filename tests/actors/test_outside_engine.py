@@ -1,4 +1,6 @@
-"""An engine that only this file knows: it is registered here, and episodes and tables are made on it."""
+"""An engine that only this file knows: it is registered here, and episodes and tables are made on
+it.
+"""
 
 import queue
 import threading
@@ -58,7 +60,9 @@ def test_it_is_prepared_once_and_in_the_background(monkeypatch):
 
 @pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    own = Experiment(suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps)
+    own = Experiment(
+        suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps
+    )
     (result,) = own.run([Variation()])
     assert result.row.episodes == 2 * BATCH
     assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)
@@ -68,13 +72,16 @@ def test_a_run_and_errors_name_it():
     config = RunConfig(physics="counting")
     assert run_config_from_json(to_json(config)) == config
     assert resolve_physics("counting") == "counting" and resolve_physics("auto", "cpu") == "native"
-    with pytest.raises(CongraspError, match=r"no physics engine 'abacus'\. Choose from: auto, warp, .*, counting\."):
+    with pytest.raises(
+        CongraspError, match=r"no physics engine 'abacus'\. Choose from: auto, warp, .*, counting\."
+    ):
         make_physics("abacus", HAND, TASK, OBJECTS, threads=1)
 
 
 def test_command_lines_offer_it():
     program = (
-        "from congrasp.actors.physics import ENGINES, Engine; from congrasp.services.cli.main import run; "
+        "from congrasp.actors.physics import ENGINES, Engine; from congrasp.services.cli.main "
+        "import run; "
         "ENGINES['counting'] = Engine(None, batch=1); run(['train', '--help'])"
     )
     done = python("-c", program)

@@ -1,4 +1,6 @@
-"""Environments whose policy sees a camera's cloud: the true pose of the object is not among its inputs."""
+"""Environments whose policy sees a camera's cloud: the true pose of the object is not among its
+inputs.
+"""
 
 import dataclasses
 
@@ -20,9 +22,16 @@ from tests.task import HAND
 OBJECTS = suite.OBJECTS[1:2]
 # A policy that is shown a camera's cloud, in episodes of 20 control steps.
 TASK = TaskConfig(
-    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=3,
-    observation="camera", surface_normals=True, sensing=SensingConfig(period=(0.05, 0.05)),
-)  # fmt: skip
+    constraints=("heading",),
+    surface_points=64,
+    approach_steps=16,
+    hold_steps=4,
+    hold_steps_max=4,
+    history=3,
+    observation="camera",
+    surface_normals=True,
+    sensing=SensingConfig(period=(0.05, 0.05)),
+)
 BATCH = 2
 
 
@@ -32,9 +41,18 @@ def running():
 
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     worker = RolloutWorker(
-        HAND, TASK, physics, suite.bank_of(1, TASK.surface_points), suite.commanded, batch=BATCH, seed=0,
-        half_precision=False, traced="all", taught=True, privileged=OBJECTS,
-    )  # fmt: skip
+        HAND,
+        TASK,
+        physics,
+        suite.bank_of(1, TASK.surface_points),
+        suite.commanded,
+        batch=BATCH,
+        seed=0,
+        half_precision=False,
+        traced="all",
+        taught=True,
+        privileged=OBJECTS,
+    )
     return worker, worker.collect(suite.command(fingers=0.8), 18)
 
 
@@ -50,13 +68,19 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
     )
     away = state.reset_state._replace(object_position=state.reset_state.object_position + 0.2)
     away = state._replace(reset_state=away)
-    elsewhere = state.camera._replace(cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01))
-    tilted = state.camera._replace(cloud=state.camera.cloud._replace(normals=-state.camera.cloud.normals))
+    elsewhere = state.camera._replace(
+        cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01)
+    )
+    tilted = state.camera._replace(
+        cloud=state.camera.cloud._replace(normals=-state.camera.cloud.normals)
+    )
 
     @jax.jit
     def shown(state, physics_state):
         scene = env.seen(env.with_scene(state, physics_state))
-        return observation.observe(scene), decode(scene, TASK.control, jnp.ones((BATCH, len(HAND.motors) + 6)))
+        return observation.observe(scene), decode(
+            scene, TASK.control, jnp.ones((BATCH, len(HAND.motors) + 6))
+        )
 
     (before, targets), (after, others) = shown(state, physics_state), shown(away, moved)
     np.testing.assert_array_equal(before, after)
@@ -84,7 +108,9 @@ def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     start = sum(size for name, size in observation.layout(HAND, TASK)[:1])
     block = np.asarray(own[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
     features = scene.features
-    expected = rotations.inverse_transform(features.wrist_position, features.wrist_quaternion, points)
+    expected = rotations.inverse_transform(
+        features.wrist_position, features.wrist_quaternion, points
+    )
     np.testing.assert_allclose(block[..., :3], expected, atol=1e-6)
     assert not block[..., 3].any()
 
@@ -97,4 +123,6 @@ def test_teacher_and_critic_see_the_true_state(running):
     assert "cloud" not in names and rollout.teacher_observation.shape[-1] > size
     assert rollout.privileged.shape[-1] == sum(size for _, size in privileged.layout(HAND, TASK))
     described = {field.name for block in observation.fields(HAND, TASK).values() for field in block}
-    assert not {"object_displacement", "object_rotation", "past object_position", "force"} & described
+    assert (
+        not {"object_displacement", "object_rotation", "past object_position", "force"} & described
+    )

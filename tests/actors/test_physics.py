@@ -36,9 +36,12 @@ def one_each(objects: Sequence[GraspObject]) -> ResetState:
     rest = np.array([obj.rest_poses[0] for obj in objects], np.float32)
     index = np.arange(len(objects), dtype=np.int32)
     return start._replace(
-        object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:], q=_opened(len(objects)),
+        object_index=index,
+        object_position=rest[:, :3],
+        object_quaternion=rest[:, 3:],
+        q=_opened(len(objects)),
         u_velocity=np.zeros((len(objects), 6), np.float32),
-    )  # fmt: skip
+    )
 
 
 def _opened(count: int) -> np.ndarray:
@@ -67,21 +70,28 @@ def grasp(start: ResetState, step: int) -> np.ndarray:
 
 
 def servoed(start: ResetState) -> tuple[ResetState, np.ndarray]:
-    """A start in the air with half the fingers' gains to one and a half times, and targets ahead of all joints."""
+    """A start in the air with half the fingers' gains to one and a half times, and targets ahead of
+    all joints.
+    """
     start = above(start, 0.3)
     batch = len(start.q)
     start = start._replace(gain_scale=np.linspace(0.5, 1.5, batch).astype(np.float32))
-    return start, np.concatenate([np.full((batch, 6), 0.01), np.asarray(start.q) + 0.1], 1).astype(np.float32)
+    return start, np.concatenate([np.full((batch, 6), 0.01), np.asarray(start.q) + 0.1], 1).astype(
+        np.float32
+    )
 
 
 def test_gains_scale_the_finger_servos_alone(native, env):
-    """After one substep a joint at rest has the speed that the torque kp * ahead gave it: proportional to the gain."""
+    """After one substep a joint at rest has the speed that the torque kp * ahead gave it:
+    proportional to the gain.
+    """
     physics = native([OBJECTS[0]] * 3, dataclasses.replace(TASK, control_dt=0.0005, substeps=1))
     start, target = servoed(env._replace(object_index=np.zeros(ENVIRONMENTS, int)))
     state = physics.start(start)
     _, after = physics.step(state, target, np.ones(ENVIRONMENTS, bool))
     speed = np.abs(np.asarray(after.q_velocity)).max(1)
-    np.testing.assert_allclose(speed / speed[1], [0.5, 1.0, 1.5], rtol=0.1)  # damping takes its part
+    # Damping takes its part
+    np.testing.assert_allclose(speed / speed[1], [0.5, 1.0, 1.5], rtol=0.1)
     physics.reset(state, np.array([True, False, False]), start._replace(gain_scale=np.ones(3)))
     gains = np.array([instance.model.actuator_gainprm[:, 0] for instance in physics.instances])
     np.testing.assert_allclose(gains[:, 6:], gains[1, 6:] * np.array([[1.0], [1.0], [1.5]]))
@@ -126,16 +136,24 @@ def test_a_stationary_object_stays_when_pushed(native, env):
 
 def test_a_scaled_mass_is_the_mass_of_a_heavier_object(native, env):
     """Its inertia and the weights of its constraints change with it."""
-    heavy = [dataclasses.replace(obj, mass=3 * obj.mass, inertia=3 * obj.inertia) for obj in OBJECTS]
+    heavy = [
+        dataclasses.replace(obj, mass=3 * obj.mass, inertia=3 * obj.inertia) for obj in OBJECTS
+    ]
     scaled, compiled = native(OBJECTS), native(heavy)
     scaled.start(env._replace(mass_scale=np.full(ENVIRONMENTS, 3.0)))
     compiled.start(env._replace(mass_scale=np.ones(ENVIRONMENTS)))
-    names = {name for name in dir(mujoco.MjModel) if name.startswith(("body_", "dof_"))} - {"dof_M0"}  # the compiler's
+    # The compiler's
+    names = {name for name in dir(mujoco.MjModel) if name.startswith(("body_", "dof_"))} - {
+        "dof_M0"
+    }
     for ours, theirs in zip(scaled.instances, compiled.instances, strict=True):
         for name in names:
             if isinstance(value := getattr(ours.model, name), np.ndarray):
-                world = name.startswith("body_")  # nothing depends on the mass of everything together
-                np.testing.assert_allclose(value[world:], getattr(theirs.model, name)[world:], 1e-5, 1e-9, err_msg=name)
+                # Nothing depends on the mass of everything together
+                world = name.startswith("body_")
+                np.testing.assert_allclose(
+                    value[world:], getattr(theirs.model, name)[world:], 1e-5, 1e-9, err_msg=name
+                )
 
 
 def test_contact_force_is_that_of_the_object_on_the_link(native, env):
@@ -157,7 +175,9 @@ def test_contact_force_is_that_of_the_object_on_the_link(native, env):
     np.testing.assert_allclose(np.mean(forces[-40:], 0)[2], -box.mass * 9.81, rtol=0.1)
 
 
-def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(native, env, tmp_path, monkeypatch):
+def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(
+    native, env, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     physics = native(OBJECTS, threads=2)
     start = above(env, 0.3)
@@ -193,7 +213,9 @@ def test_an_environment_that_was_used_before_is_as_good_as_new(native, env):
     physics, fresh = native(OBJECTS), native(OBJECTS)
     start = above(env, 0.19)
     everywhere = np.ones(ENVIRONMENTS, bool)
-    state = physics.start(start._replace(mass_scale=np.full(ENVIRONMENTS, 3.0), stationary=everywhere))
+    state = physics.start(
+        start._replace(mass_scale=np.full(ENVIRONMENTS, 3.0), stationary=everywhere)
+    )
     for step in range(30):
         physics.step(state, grasp(start, step), ~everywhere)
     swapped = start._replace(object_index=np.array([2, 0, 0]))
@@ -226,7 +248,9 @@ def test_slots_are_the_same_bodies_as_models_of_their_own():
     leaves = pool.leaves(OBJECTS)
     for i, obj in enumerate(OBJECTS):
         np.testing.assert_allclose(leaves["body_mass"][i, body], obj.mass)
-        np.testing.assert_allclose(np.sort(leaves["body_inertia"][i, body]), np.linalg.eigvalsh(obj.inertia), rtol=1e-6)
+        np.testing.assert_allclose(
+            np.sort(leaves["body_inertia"][i, body]), np.linalg.eigvalsh(obj.inertia), rtol=1e-6
+        )
     assert set(leaves) == set(LEAVES)
 
 
@@ -239,7 +263,9 @@ def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
 
 @pytest.fixture
 def optimised():
-    """MJX's program takes longer without the compiler's optimisations, which other tests do without."""
+    """MJX's program takes longer without the compiler's optimisations, which other tests do
+    without.
+    """
     name = "jax_disable_most_optimizations"
     before = jax.config.read(name)
     jax.config.update(name, False)
@@ -248,7 +274,9 @@ def optimised():
 
 
 def side_by_side(native, step, start, state, targets):
-    """Measurements of both engines after each step, and the state of the other, whose step this is."""
+    """Measurements of both engines after each step, and the state of the other, whose step this
+    is.
+    """
     ours, table = native.start(start), np.ones(len(start.q), bool)
     for target in targets:
         ours, x = native.step(ours, target, table)
@@ -257,13 +285,17 @@ def side_by_side(native, step, start, state, targets):
 
 
 def agreeing(native, step, start, begin):
-    """A scripted grasp, which agrees tightly until something is touched and squeezed, statistically after that."""
+    """A scripted grasp, which agrees tightly until something is touched and squeezed, statistically
+    after that.
+    """
     force, targets = np.zeros((2, len(start.q))), [grasp(start, i) for i in range(40)]
     for i, (x, y, state) in enumerate(side_by_side(native, step, start, begin, targets)):
         if i < 10:
             assert not x.contact_found.any()
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
-                np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
+                np.testing.assert_allclose(
+                    getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}"
+                )
         force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
         yield i, x, y, state
     assert (force[0] > 0).all(), "the script must touch every object"
@@ -288,7 +320,8 @@ def test_jax_agrees_with_native(native, env, optimised):
     step = jax.jit(other.step)
     *_, (_, x, y, b) = steps = [*agreeing(engine, step, start, _begun(other, start))]
     assert not any(x.occupancy[:2].any() or y.occupancy.any() for _, x, y, _ in steps)
-    # A finger that slips a step earlier lands elsewhere, so not every joint; nearly all of them, though.
+    # A finger that slips a step earlier lands elsewhere, so not every joint; nearly all of them,
+    # though.
     apart = np.abs(np.asarray(x.q) - np.asarray(y.q))
     assert np.quantile(apart, 0.95) < 0.15 and np.median(apart) < 0.02, np.sort(apart.ravel())
     # A reset puts the masked environments back and leaves the rest.
@@ -304,7 +337,9 @@ def test_jax_agrees_with_native(native, env, optimised):
 def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(native, env, monkeypatch):
     monkeypatch.setattr("congrasp.actors.physics.native.memory", lambda: 1_500_000)
     physics = native(OBJECTS)
-    with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"):
+    with pytest.raises(
+        CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"
+    ):
         physics.start(env)
 
 
@@ -320,7 +355,9 @@ def test_object_velocity_is_in_the_world_frame(native, env):
     instance = physics.instances[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
     quaternion = jnp.asarray(instance.data.qpos[physics._where.object_qpos[3:]], jnp.float32)
-    local = np.asarray(rotations.rotate(rotations.conjugate(quaternion), jnp.asarray(spin, jnp.float32)))
+    local = np.asarray(
+        rotations.rotate(rotations.conjugate(quaternion), jnp.asarray(spin, jnp.float32))
+    )
     instance.data.qvel[physics._where.object_qvel[3:]] = local
     physics._qpos[0], physics._qvel[0] = instance.data.qpos, instance.data.qvel
     np.testing.assert_allclose(physics.read(state).object_angular_velocity[0], spin, atol=1e-5)
@@ -330,7 +367,9 @@ PLAIN = TaskConfig()
 
 
 def _scene(**settings):
-    return compile_scene(HAND, dataclasses.replace(PLAIN, **settings), procedural.generate(0, "box"))
+    return compile_scene(
+        HAND, dataclasses.replace(PLAIN, **settings), procedural.generate(0, "box")
+    )
 
 
 def test_fingertips_alone_resist_turning():
@@ -367,7 +406,9 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
     spec = scene_spec(hand, task)
     palm = next(body for body in spec.bodies if body.name == hand.links[0].name)
     load = palm.add_body(pos=(0.05, 0.0, 0.08))
-    load.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.03, 0, 0), mass=1.5, contype=0, conaffinity=0)
+    load.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.03, 0, 0), mass=1.5, contype=0, conaffinity=0
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     data.mocap_pos[model.body("table").mocapid[0]] = TABLE_AWAY
@@ -378,10 +419,14 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
     @jax.jit
     def law(momentum, u, v):
         load = wrist_load(hand, task, momentum, u, v)
-        state = scene(0, batch=1)[0]._replace(u=u, u_velocity=v, wrist_load=load, table=jnp.zeros(1, bool))
+        state = scene(0, batch=1)[0]._replace(
+            u=u, u_velocity=v, wrist_load=load, table=jnp.zeros(1, bool)
+        )
         far = jnp.full(1, task.control.guidance_position_limit)
         given = Guided(-u, far, v, state.table)
-        return u + wrist_lead(hand, task.control, given, jnp.zeros((1, 6))) + carried_lead(hand, state)
+        return (
+            u + wrist_lead(hand, task.control, given, jnp.zeros((1, 6))) + carried_lead(hand, state)
+        )
 
     after = jax.jit(lambda momentum, u, v, target: track_load(hand, task, momentum, u, v, target))
     sunk, speed = [], []
@@ -407,7 +452,12 @@ def test_the_observer_measures_a_constant_acceleration():
     u, v = jnp.zeros((1, 6)), jnp.zeros((1, 6))
     for _ in range(steps):
         mean = v + 0.5 * task.control_dt * down
-        halfway, u, v = u + 0.5 * task.control_dt * mean, u + task.control_dt * mean, v + task.control_dt * down
-        # Targets at which the servos give no acceleration on average: stiffness (u_tgt - u) = damping v.
+        halfway, u, v = (
+            u + 0.5 * task.control_dt * mean,
+            u + task.control_dt * mean,
+            v + task.control_dt * down,
+        )
+        # Targets at which the servos give no acceleration on average: stiffness (u_tgt - u) =
+        # damping v.
         momentum = track_load(hand, task, momentum, u, v, halfway + damping / stiffness * mean)
     np.testing.assert_allclose(wrist_load(hand, task, momentum, u, v), down, atol=1e-3)

@@ -1,4 +1,6 @@
-"""Warp on a CPU: a mesh for each environment, resets, other objects, compiled loops, agreement with native."""
+"""Warp on a CPU: a mesh for each environment, resets, other objects, compiled loops, agreement with
+native.
+"""
 
 import dataclasses
 import os
@@ -22,13 +24,27 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.transport.ports import free_port
-from tests.actors.test_physics import HAND, TASK, above, agreeing, grasp, one_each, servoed, side_by_side
+from tests.actors.test_physics import (
+    HAND,
+    TASK,
+    above,
+    agreeing,
+    grasp,
+    one_each,
+    servoed,
+    side_by_side,
+)
 from tests.conftest import ROOT
 from tests.solids import mujoco_mass_properties
 from tests.task import warp_engine
 
-OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bowl", "mug", "ring"])]
-OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
+OBJECTS = [
+    procedural.generate(i, family) for i, family in enumerate(["box", "bowl", "mug", "ring"])
+]
+OTHERS = [
+    procedural.generate(i, family)
+    for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)
+]
 
 
 def _starts(objects: Sequence[GraspObject]) -> ResetState:
@@ -54,7 +70,9 @@ def _picked(start: ResetState, index: list[int]) -> ResetState:
     return ResetState(*(leaf[np.array(index)] for leaf in start))
 
 
-def _agrees_with_native(native: NativePhysics, objects: Sequence[GraspObject], start: ResetState) -> None:
+def _agrees_with_native(
+    native: NativePhysics, objects: Sequence[GraspObject], start: ResetState
+) -> None:
     warp = warp_engine(objects)
     for i, x, y, _ in agreeing(native, jax.jit(warp.step), start, warp.start(start)):
         if i == 20:
@@ -83,14 +101,21 @@ def test_gains_of_each_environment_agree_with_native(native):
 
 def _scanned(folder: pathlib.Path) -> GraspObject:
     """The convex pieces of a scanned object, as if it had been imported with all their vertices."""
-    hulls = [trimesh.load(file).convex_hull.vertices for file in sorted(folder.glob("contact*.stl"))]
+    hulls = [
+        trimesh.load(file).convex_hull.vertices for file in sorted(folder.glob("contact*.stl"))
+    ]
     pieces = [Piece("mesh", (0.0, 0.0, 0.0), vertices=vertices) for vertices in hulls]
     mass, center, inertia = mujoco_mass_properties(pieces, [500.0] * len(pieces))
     pieces = [dataclasses.replace(piece, pos=tuple(-center)) for piece in pieces]
     low = min(vertices[:, 2].min() for vertices in hulls) - center[2]
     rest = np.array([[0.0, 0.0, -low, 1.0, 0.0, 0.0, 0.0]])
     return dataclasses.replace(
-        OBJECTS[1], name=folder.name, pieces=tuple(pieces), mass=mass, inertia=inertia, rest_poses=rest
+        OBJECTS[1],
+        name=folder.name,
+        pieces=tuple(pieces),
+        mass=mass,
+        inertia=inertia,
+        rest_poses=rest,
     )
 
 
@@ -103,7 +128,9 @@ def test_scanned_objects_agree_with_native(native, shared_objects):
 
 
 def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(start):
-    """One control step by JAX and three repeats are four control steps with the same targets; and nobody notices."""
+    """One control step by JAX and three repeats are four control steps with the same targets; and
+    nobody notices.
+    """
     physics, batch = warp_engine(OBJECTS), len(OBJECTS)
     target, table, step = jnp.asarray(grasp(start, 5)), jnp.ones(batch, bool), jax.jit(physics.step)
     first, _ = step(physics.start(start), target, table)
@@ -139,17 +166,27 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
     physics.close()
 
 
-def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends_on_the_environments(monkeypatch):
+def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends_on_the_environments(
+    monkeypatch,
+):
     import warp as wp  # takes seconds in every worker
 
     from congrasp.actors.physics.warp import WarpBuffers
 
     monkeypatch.setattr(WarpBuffers, "_load_kernels", lambda buffers: None)
-    monkeypatch.setattr(wp, "get_suggested_block_size", lambda *query: pytest.fail("this would build a kernel"))
-    monkeypatch.setattr(wp._src.context.Module, "load", lambda *module: pytest.fail("this builds a module"))
+    monkeypatch.setattr(
+        wp, "get_suggested_block_size", lambda *query: pytest.fail("this would build a kernel")
+    )
+    monkeypatch.setattr(
+        wp._src.context.Module, "load", lambda *module: pytest.fail("this builds a module")
+    )
     engines = warp_engine(OBJECTS), warp_engine(OBJECTS[:1], mesh_slots=9)
-    few, many = ([module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1))
-    assert len(many) > 40 and many[0].startswith("_nxn_broadphase"), "the first are those that are queried"
+    few, many = (
+        [module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1)
+    )
+    assert len(many) > 40 and many[0].startswith("_nxn_broadphase"), (
+        "the first are those that are queried"
+    )
     assert all(name.startswith("_nxn_broadphase") for name in {*few} ^ {*many})
 
 
@@ -159,7 +196,10 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
     from congrasp.actors.physics import warp
     from congrasp.actors.physics.warp import _one_builder
 
-    program = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
+    program = (
+        "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); "
+        "print(flush=True); input()"
+    )
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     entered = threading.Event()
 
@@ -194,7 +234,10 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
 
 def test_rows_are_what_mujoco_compiles():
     catalogue = Catalogue(HAND, TASK, OBJECTS[0], 8)
-    before = {name: getattr(catalogue.model, name).copy() for name in ("geom_dataid", "geom_size", "body_mass")}
+    before = {
+        name: getattr(catalogue.model, name).copy()
+        for name in ("geom_dataid", "geom_size", "body_mass")
+    }
     rows, meshes = catalogue.rows(OBJECTS)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(catalogue.model, name), value)
@@ -203,17 +246,23 @@ def test_rows_are_what_mujoco_compiles():
         body = scene.body("object").id
         np.testing.assert_allclose(rows["body_mass"][n], obj.mass)
         np.testing.assert_allclose(rows["body_subtreemass"][n], scene.body_subtreemass[[0, body]])
-        np.testing.assert_allclose(rows["body_invweight0"][n], scene.body_invweight0[body], rtol=1e-4)
+        np.testing.assert_allclose(
+            rows["body_invweight0"][n], scene.body_invweight0[body], rtol=1e-4
+        )
         for name in ("body_invweight0", "dof_invweight0"):
             hand = slice(0, scene.nv - 6) if name.startswith("dof") else slice(0, body)
-            np.testing.assert_allclose(getattr(catalogue.model, name)[hand], getattr(scene, name)[hand], rtol=1e-6)
+            np.testing.assert_allclose(
+                getattr(catalogue.model, name)[hand], getattr(scene, name)[hand], rtol=1e-6
+            )
         used = [g for g in range(scene.ngeom) if scene.geom_bodyid[g] == body]
         meshed = any(piece.kind == "mesh" for piece in obj.pieces)
         filled = rows["geom_dataid"][n] >= 0 if meshed else rows["geom_rbound"][n] > 0.002
         assert filled.sum() == len(used)
         for name in ("geom_size", "geom_rbound", "geom_aabb"):
             mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
-            np.testing.assert_allclose(mine, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6)
+            np.testing.assert_allclose(
+                mine, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6
+            )
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
 
@@ -226,7 +275,10 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
     swapped = _picked(start, [3, 2, 1, 0])
     mask = jnp.array([True, True, False, True])
     mixed = ResetState(
-        *(jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(swapped, start, strict=True))
+        *(
+            jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            for a, b in zip(swapped, start, strict=True)
+        )
     )
     started = jax.jit(warp.reset)(state, mask, swapped)
     _same(jax.tree.map(lambda leaf: leaf[2], started), jax.tree.map(lambda leaf: leaf[2], state))
@@ -237,12 +289,16 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
     assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
     for name in ("contact_force", "object_position", "q"):
         given, expected = getattr(y, name)[mask], getattr(x, name)[mask]
-        np.testing.assert_allclose(given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
+        )
     assert step._cache_size() == 1
 
 
 @pytest.mark.slow
-def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(native, start, others):
+def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
+    native, start, others
+):
     warp, untouched = warp_engine(OBJECTS), warp_engine(OBJECTS)
     step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
     state, expected = warp.start(start), untouched.start(start)
@@ -257,7 +313,9 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     new = _picked(others, [4, 3, 2, 0])._replace(object_index=jnp.array([0, 1, 2, 4]))
     # Until every object is touched; what slips a moment later does so in each engine by itself.
     targets = [grasp(new, i) for i in range(18)]
-    *_, (x, y, _) = side_by_side(native(OTHERS[::-1]), step, new, warp.reset(state, table, new), targets)
+    *_, (x, y, _) = side_by_side(
+        native(OTHERS[::-1]), step, new, warp.reset(state, table, new), targets
+    )
     assert x.contact_found.any((1, 2)).all()
     np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-4)
@@ -342,7 +400,9 @@ def test_what_had_no_room_is_counted(start, monkeypatch):
 
 
 def test_steps_whose_solver_reached_its_limit_are_counted(start):
-    """An iteration limit of 1 is reached in every physics step of these environments in contact with the table."""
+    """An iteration limit of 1 is reached in every physics step of these environments in contact
+    with the table.
+    """
     limited = []
     for iterations in (1, 100):
         warp = warp_engine(OBJECTS)
@@ -353,7 +413,9 @@ def test_steps_whose_solver_reached_its_limit_are_counted(start):
 
 
 def test_more_pieces_than_slots_are_one_clear_line(start):
-    with pytest.raises(CongraspError, match=r"'bowl.*' has 8 mesh pieces, but the environments have only 3 slots"):
+    with pytest.raises(
+        CongraspError, match=r"'bowl.*' has 8 mesh pieces, but the environments have only 3 slots"
+    ):
         warp_engine(OBJECTS, mesh_slots=3)
     warp = warp_engine([OBJECTS[0]], mesh_slots=0)
     state = warp.start(_picked(start, [0]))
@@ -372,7 +434,9 @@ def test_an_engine_uses_its_own_ranks_device():
     port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "tests.actors.rank_engine"]
     ranks = [
-        subprocess.Popen([*command, str(rank), str(port)], env=environment, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [*command, str(rank), str(port)], env=environment, stdout=subprocess.PIPE, text=True
+        )
         for rank in range(2)
     ]
     try:

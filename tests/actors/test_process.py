@@ -53,7 +53,9 @@ FIELDS = episode_fields(CONFIG.task)
 
 
 def invented(episodes: np.ndarray) -> Rollout:
-    """A rollout of zeros in which every environment ended an episode with these metrics (B, fields)."""
+    """A rollout of zeros in which every environment ended an episode with these metrics (B,
+    fields).
+    """
     zeros = {
         **dict.fromkeys(("q", "q_target"), (T, len(HAND.joints))),
         **dict.fromkeys(("u", "u_target"), (T, 6)),
@@ -70,7 +72,9 @@ def invented(episodes: np.ndarray) -> Rollout:
         "episodes": episodes,
         "occupancy": np.zeros((T, 3), np.float32),
         "has_episode": np.ones(B, bool),
-        "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
+        "trace": Trace(
+            **{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags
+        ),
     }
     defaults = dict.fromkeys(Rollout._fields, np.zeros((T, B), np.float32))
     return Rollout(**{**defaults, **given})
@@ -88,7 +92,9 @@ class InventedWorker:
         goal = jax.tree.map(lambda array: array[None], neutral)
         surface = Surface(np.zeros((1, 8, 3), np.float32), np.zeros((1, 8), bool))
         reset_state = types.SimpleNamespace(object_index=np.zeros(1, int))
-        self.state = types.SimpleNamespace(time=np.zeros(1), goal=goal, surface=surface, reset_state=reset_state)
+        self.state = types.SimpleNamespace(
+            time=np.zeros(1), goal=goal, surface=surface, reset_state=reset_state
+        )
 
     def configure(self, *args, **options):
         pass
@@ -123,23 +129,44 @@ def heard(monkeypatch):
         invented = types.SimpleNamespace(weight=np.ones(len(objects)))
         found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
         numbers, prepared = [], []
-        monkeypatch.setattr(process, "prepare_physics", lambda *engine: prepared.append(len(numbers)))
-        monkeypatch.setattr(process, "training_set", lambda hand, config, number: numbers.append(number) or found)
+        monkeypatch.setattr(
+            process, "prepare_physics", lambda *engine: prepared.append(len(numbers))
+        )
+        monkeypatch.setattr(
+            process, "training_set", lambda hand, config, number: numbers.append(number) or found
+        )
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
             hub, rollouts = learner_hub(
-                server, "t", config_json=to_json(config), schema=SPEC.schema, form=FORM,
+                server,
+                "t",
+                config_json=to_json(config),
+                schema=SPEC.schema,
+                form=FORM,
                 staleness=StalenessManager(0, 1),
-            )  # fmt: skip
+            )
             algorithm = make_algorithm(SPEC, CONFIG)
             policy = jax.device_get(algorithm.policy(algorithm.init(0)))
-            bundle = PolicyBundle(spec=SPEC, task=CONFIG.task, version=0, run_id="e", transitions=0, **policy._asdict())
+            bundle = PolicyBundle(
+                spec=SPEC,
+                task=CONFIG.task,
+                version=0,
+                run_id="e",
+                transitions=0,
+                **policy._asdict(),
+            )
             hub.publish_weights(bundle.to_message(), 0)
             actor = threading.Thread(
                 target=process.run_actor,
                 args=(peer,),
-                kwargs={"run": "t", "actor": "a", "stop": stop, "physics": "native", "patience": 5.0},
+                kwargs={
+                    "run": "t",
+                    "actor": "a",
+                    "stop": stop,
+                    "physics": "native",
+                    "patience": 5.0,
+                },
             )
             actor.start()
             batch = rollouts.next_batch(1, 30.0)
@@ -147,7 +174,8 @@ def heard(monkeypatch):
             actor.join(30.0)
             received = list(iter(lambda: logs.receive(0.0), None))
         assert prepared == [0], "the engine is prepared before there are objects"
-        assert list(np.diff(numbers)) == [1] * len(InventedWorker.pools)  # the next objects by their seeds
+        # The next objects by their seeds
+        assert list(np.diff(numbers)) == [1] * len(InventedWorker.pools)
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 
     return run
@@ -160,18 +188,24 @@ def started(info: RunInfo) -> None:
 
 
 def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
-    with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"):
+    with pytest.raises(
+        CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"
+    ):
         started(RunInfo("{}", "e", SPEC.schema, ("reward", "torque")))
 
 
 def test_an_actor_of_another_version_is_one_line_before_anything_is_built(monkeypatch):
     monkeypatch.setattr(process, "training_set", lambda *_: pytest.fail("its objects were built"))
-    with pytest.raises(CongraspError, match=rf"schema 0; this actor's have {SPEC.schema}\. Start the actor with"):
+    with pytest.raises(
+        CongraspError, match=rf"schema 0; this actor's have {SPEC.schema}\. Start the actor with"
+    ):
         started(RunInfo("{}", "e", "0", ("reward",)))
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():
-    occupancy = np.array([[0.5, 0.1, 0.0], [1.0, 0.2, 0.5], [1.25, 0.2, 0.25], [0.3, 1.5, 0.25]], np.float32)
+    occupancy = np.array(
+        [[0.5, 0.1, 0.0], [1.0, 0.2, 0.5], [1.25, 0.2, 0.25], [0.3, 1.5, 0.25]], np.float32
+    )
     metrics = {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5, "solver_limited": 0.25}
     assert process.buffer_occupancy(occupancy) == metrics
 
@@ -187,9 +221,12 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]
-    assert "heading_rad" not in episode and episode["heading_m"] == FIELDS.index("episode/heading_m")
+    assert "heading_rad" not in episode and episode["heading_m"] == FIELDS.index(
+        "episode/heading_m"
+    )
     for message in logs.values():
-        encode(message)  # a number that JSON has not would be an error here, and the end of the actor
+        # A number that JSON has not would be an error here, and the end of the actor
+        encode(message)
     validate(logs["episode"], EPISODE)
 
 
@@ -198,7 +235,10 @@ def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
     episodes = invented(np.zeros((B, len(FIELDS)), np.float32))
     heard(episodes)
     assert InventedWorker.pools == []
-    heard(episodes, dataclasses.replace(CONFIG, objects=dataclasses.replace(CONFIG.objects, renew_every=1)))
+    heard(
+        episodes,
+        dataclasses.replace(CONFIG, objects=dataclasses.replace(CONFIG.objects, renew_every=1)),
+    )
     assert InventedWorker.pools[0] == ["box_0", "mug_0"]
 
 
@@ -206,10 +246,13 @@ def test_objects_that_fall_sometimes_are_drawn_more_often_where_the_run_says_so(
     monkeypatch.setattr(InventedWorker, "weights", [])
     episodes = np.zeros((B, len(FIELDS)), np.float32)
     episodes[:, FIELDS.index("episode/object_index")] = np.arange(B) % 2
-    episodes[:, FIELDS.index("episode/held")] = np.arange(B) > 0  # of the two boxes one falls, the mug does not
+    # Of the two boxes one falls, the mug does not
+    episodes[:, FIELDS.index("episode/held")] = np.arange(B) > 0
     heard(invented(episodes))
     assert InventedWorker.weights == []
-    config = dataclasses.replace(CONFIG, objects=dataclasses.replace(CONFIG.objects, by_failure=True))
+    config = dataclasses.replace(
+        CONFIG, objects=dataclasses.replace(CONFIG.objects, by_failure=True)
+    )
     _, logs = heard(invented(episodes), config)
     box, mug = InventedWorker.weights[0]
     assert 1.0 < box <= 2.0 and 0.5 <= mug < 1.0
@@ -248,12 +291,23 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     assert (found.goal, found.object_index) == ("next", 3)
     assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
     # It follows nothing then, until one is due again.
-    assert follower.add(rollout(0, 1, 2, 3, 4, 5, ended=[5]), state("fresh"), state("none"), due=False) is None
-    found = follower.add(rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True)
+    assert (
+        follower.add(rollout(0, 1, 2, 3, 4, 5, ended=[5]), state("fresh"), state("none"), due=False)
+        is None
+    )
+    found = follower.add(
+        rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True
+    )
     assert (found.goal, found.object_index, len(found.trace.q)) == ("fresh", 2, 6)
     # What a rollout says of its last episode is not said of another.
-    assert follower.add(rollout(0, 1, 0, 1, 2, ended=[1, 4]), state("fresh"), state("none"), due=True) is None
-    assert follower.add(rollout(0, 1, ended=[1]), state("last"), state("none"), due=True).goal == "last"
+    assert (
+        follower.add(rollout(0, 1, 0, 1, 2, ended=[1, 4]), state("fresh"), state("none"), due=True)
+        is None
+    )
+    assert (
+        follower.add(rollout(0, 1, ended=[1]), state("last"), state("none"), due=True).goal
+        == "last"
+    )
 
 
 def test_what_ends_with_a_rollout_begins_nothing_in_it_and_what_is_forgotten_is_not_joined():

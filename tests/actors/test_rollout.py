@@ -46,17 +46,25 @@ def test_masks_have_the_shares_of_the_task(drawn):
 
 
 def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(drawn):
-    """Exactly, as far back as the random number of each episode says; a hand in the table is raised to 5 mm over it."""
+    """Exactly, as far back as the random number of each episode says; a hand in the table is raised
+    to 5 mm over it.
+    """
     start, goal, *_ = drawn
     direction, v, center, target, lowest = jax.device_get(_heading(start, goal))
     near, far = TASK.back_off_range
-    back = near + (far - near) * np.asarray(_distances(jax.random.split(jax.random.key(3), len(center) // BATCH)))
+    back = near + (far - near) * np.asarray(
+        _distances(jax.random.split(jax.random.key(3), len(center) // BATCH))
+    )
     turn = Rotation.from_quat(start.object_quaternion, scalar_first=True)
     first = turn.apply(goal["trajectory"].position[:, 0]) + start.object_position
     trajectory = goal.active["trajectory"][:, None]
-    raised = np.where(trajectory, start.base_position - first, center - target + back.reshape(-1, 1) * direction)
+    raised = np.where(
+        trajectory, start.base_position - first, center - target + back.reshape(-1, 1) * direction
+    )
     np.testing.assert_allclose(raised[:, :2], 0.0, atol=1e-4)
-    np.testing.assert_allclose(raised[:, 2], np.maximum(0.005 - (lowest - raised[:, 2]), 0.0), atol=1e-4)
+    np.testing.assert_allclose(
+        raised[:, 2], np.maximum(0.005 - (lowest - raised[:, 2]), 0.0), atol=1e-4
+    )
     assert 0.01 < (raised[:, 2] > 1e-4).mean() < 0.1
     np.testing.assert_allclose(np.where(trajectory, direction, v), direction, atol=1e-4)
     pose = goal.active["pose_finger"]
@@ -66,13 +74,17 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(d
 @jax.jit
 @jax.vmap
 def _distances(key):
-    """(B,) random numbers in [0, 1) that decide on the starts of a batch: sixth of those of training."""
+    """(B,) random numbers in [0, 1) that decide on the starts of a batch: sixth of those of
+    training.
+    """
     return chance.uniforms(key, {"training": 8}, BATCH)["training"][:, 5]
 
 
 @jax.jit
 def _heading(start, goal):
-    """Desired and actual direction of the hand, its centre and the desired one, and its lowest point, world frame."""
+    """Desired and actual direction of the hand, its centre and the desired one, and its lowest
+    point, world frame.
+    """
     allowed = goal["fingers"].allowed | ~goal.active["fingers"][:, None]
     links = link_transforms(HAND, start.q)
     center = hand_center(HAND, keypoints(HAND, links), allowed)
@@ -80,7 +92,9 @@ def _heading(start, goal):
     ends = rotations.rotate(start.base_quaternion[:, None], ends) + start.base_position[:, None]
     return (
         rotations.rotate(start.object_quaternion, goal["heading"].direction),
-        rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, center.shape)),
+        rotations.rotate(
+            start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, center.shape)
+        ),
         rotations.rotate(start.base_quaternion, center) + start.base_position,
         rotations.rotate(start.object_quaternion, goal["heading"].position) + start.object_position,
         jnp.min(ends[..., 2] - np.repeat(HAND.capsule_radii, 2), -1),
@@ -97,21 +111,27 @@ def test_rollouts_go_through_whole_episodes_and_on():
     assert terminal[-1].all() and not terminal[:-1].any()
     episodes = finished_episodes(first, TASK)
     assert set(episodes) == set(episode_fields(TASK)) and len(episodes["episode/return"]) == BATCH
-    np.testing.assert_allclose(episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3)
+    np.testing.assert_allclose(
+        episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3
+    )
     terms = sum(values for name, values in episodes.items() if name.startswith("term/"))
     np.testing.assert_allclose(terms, episodes["episode/return"], rtol=1e-3, atol=1e-2)
     assert np.all(episodes["episode/length"] == STEPS)
     present = np.arange(1, STEPS + 1) < TASK.approach_steps
     np.testing.assert_array_equal(first.trace.table, np.tile(present[:, None], BATCH))
     second = worker.collect(NOISY, 30)
-    assert not np.asarray(second.terminal).any() and not len(finished_episodes(second, TASK)["episode/return"])
+    assert not np.asarray(second.terminal).any() and not len(
+        finished_episodes(second, TASK)["episode/return"]
+    )
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
     assert np.all(np.asarray(worker.state.time) == 30)
     worker.restart()
     assert not np.asarray(worker.state.time).any()
     third = worker.collect(NOISY, 1)
-    np.testing.assert_allclose(third.trace.object_position[0], worker.state.reset_state.object_position, atol=0.01)
+    np.testing.assert_allclose(
+        third.trace.object_position[0], worker.state.reset_state.object_position, atol=0.01
+    )
     _replaced_objects_rest_where_they_were_placed(worker)
     worker.physics.close()
 
@@ -127,11 +147,15 @@ def _replaced_objects_rest_where_they_were_placed(worker):
         assert np.abs(others[i].rest_poses[:, 2] - height).min() < 1e-5
     worker.collect(NOISY, 3)
     # A wrong shape would fall, or the table would throw it up.
-    np.testing.assert_allclose(np.asarray(worker.state.views.true.state.object_position)[:, 2], heights, atol=2e-3)
+    np.testing.assert_allclose(
+        np.asarray(worker.state.views.true.state.object_position)[:, 2], heights, atol=2e-3
+    )
 
 
 def test_success_needs_the_object_to_stay_up():
-    """Hands that go up from half a metre above the table touch nothing: every object falls, and none succeeds."""
+    """Hands that go up from half a metre above the table touch nothing: every object falls, and
+    none succeeds.
+    """
     worker, drawn = suite.worker(), suite.episodes(BATCH)
     far = drawn.reset_state.base_position + np.array([0.0, 0.0, 0.5], np.float32)
     worker.begin(drawn._replace(reset_state=drawn.reset_state._replace(base_position=far)))
@@ -145,11 +169,15 @@ def test_success_needs_the_object_to_stay_up():
 
 @pytest.fixture
 def follow():
-    """A function that returns the state after steps whose readouts of the engine are invented, and its transitions."""
+    """A function that returns the state after steps whose readouts of the engine are invented, and
+    its transitions.
+    """
     worker = suite.worker()
 
     def run(hold, steps, shown):
-        """`shown(step, first)` is the readout of a step, from 1 on, of episodes that hold for so long."""
+        """`shown(step, first)` is the readout of a step, from 1 on, of episodes that hold for so
+        long.
+        """
         worker.begin(suite.episodes(BATCH)._replace(hold=np.full(BATCH, hold, np.int32)))
         programs, key_data = worker.programs, np.asarray(jax.random.key_data(jax.random.key(0)))
         parameters, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
@@ -162,14 +190,18 @@ def follow():
             )
             state = state._replace(**changed)
             transitions.append(jax.device_get(transition))
-        return dict(zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True)), transitions
+        return dict(
+            zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True)
+        ), transitions
 
     yield run
     worker.physics.close()
 
 
 def _touched(first, force, fallen, drop=0.06):
-    """A readout in which one link presses with a force, and objects fell by more than the 5 cm that count."""
+    """A readout in which one link presses with a force, and objects fell by more than the 5 cm that
+    count.
+    """
     found, forces = np.zeros_like(first.contact_found), np.zeros_like(first.contact_force)
     found[:, 0, 0], forces[:, 0, 0, 0] = True, force
     position = first.object_position.copy()
@@ -179,14 +211,17 @@ def _touched(first, force, fallen, drop=0.06):
 
 def test_a_lifted_object_that_stays_is_a_success(follow):
     finished, _ = follow(
-        TASK.hold_steps, STEPS, lambda step, first: _touched(first, 1.0, [1] if step > TASK.approach_steps + 5 else [])
+        TASK.hold_steps,
+        STEPS,
+        lambda step, first: _touched(first, 1.0, [1] if step > TASK.approach_steps + 5 else []),
     )
     np.testing.assert_array_equal(finished["episode/success"], np.arange(BATCH) != 1)
     assert set(metric_names(TASK)) <= {name.removeprefix("episode/") for name in finished}
 
 
 def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
-    """Errors and forces are those of the paper's 25 steps; only `held` depends on the end of the hold.
+    """Errors and forces are those of the paper's 25 steps; only `held` depends on the end of the
+    hold.
 
     The first object falls in step 131 of 140, after these; its episode ends there.
     """
@@ -197,27 +232,37 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
     finished, transitions = follow(TASK.hold_steps + 15, STEPS + 15, shown)
     terminal = np.array([transition.terminal for transition in transitions])
     truncated = np.array([transition.truncated for transition in transitions])
-    np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, [STEPS + 6, *[STEPS + 15] * (BATCH - 1)])
+    np.testing.assert_array_equal(
+        np.argmax(terminal, 0) + 1, [STEPS + 6, *[STEPS + 15] * (BATCH - 1)]
+    )
     # The clock ends the others: an end of an object that is up is a truncation.
-    np.testing.assert_array_equal(np.argwhere(truncated), [[STEPS + 14, i] for i in range(1, BATCH)])
+    np.testing.assert_array_equal(
+        np.argwhere(truncated), [[STEPS + 14, i] for i in range(1, BATCH)]
+    )
     assert finished["episode/success"].all()
     np.testing.assert_array_equal(finished["episode/held"], np.arange(BATCH) > 0)
     np.testing.assert_allclose(finished["episode/force_sum"], 3.0, rtol=1e-5)
 
 
 def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
-    """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no truncation."""
+    """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no
+    truncation.
+    """
     physics = NativePhysics(HAND, TASK, suite.OBJECTS, 1)
     first = jax.device_get(physics.start((drawn := suite.episodes(BATCH)).reset_state).read(None))
     env = GraspEnv(HAND, dataclasses.replace(TASK, end_when_fallen=False), None)
     state = env.state_of(drawn._replace(hold=np.full(BATCH, TASK.hold_steps + 1, np.int32)), None)
     state = state._replace(time=jnp.full(BATCH, STEPS - 1))
     advance = jax.jit(
-        lambda state, after: env.advance(state, Action(state.q_target, state.u_target), after, env.settings)
+        lambda state, after: env.advance(
+            state, Action(state.q_target, state.u_target), after, env.settings
+        )
     )
     for end in (False, True):
         state, transition = advance(state._replace(views=None), _touched(first, 1.0, slice(None)))
-        assert (np.asarray(transition.terminal) == end).all() and not np.asarray(transition.truncated).any()
+        assert (np.asarray(transition.terminal) == end).all() and not np.asarray(
+            transition.truncated
+        ).any()
     physics.close()
 
 
@@ -228,7 +273,9 @@ def test_workers_with_the_same_seed_agree_bit_for_bit():
 
 
 class _Touching:
-    """A compiled engine in which every hand touches always, and whose `read` knows no contacts, as that of MJX."""
+    """A compiled engine in which every hand touches always, and whose `read` knows no contacts, as
+    that of MJX.
+    """
 
     name, compiled = "touching", True
 
@@ -269,18 +316,35 @@ class _Touching:
 
 def _compiled(caplog):
     """Names of the programs that this thread lowered or compiled."""
-    found = [re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage()) for record in caplog.records]
+    found = [
+        re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage())
+        for record in caplog.records
+    ]
     return {match[2] for match in found if match}
 
 
 def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplog):
-    """A compiled engine's program is one loop, which shares nothing with other tests': here of headings alone."""
+    """A compiled engine's program is one loop, which shares nothing with other tests': here of
+    headings alone.
+    """
     physics, task = _Touching(), dataclasses.replace(TASK, constraints=("heading",))
     worker = RolloutWorker(
-        HAND, task, physics, None, suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
+        HAND,
+        task,
+        physics,
+        None,
+        suite.commanded,
+        batch=2,
+        seed=0,
+        half_precision=False,
+        traced="none",
     )
-    with jax.log_compiles():  # its programs are compiled before there is a bank or a policy, and not again
-        worker.compile(jax.eval_shape(suite.bank), jax.ShapeDtypeStruct(NOISY.shape, NOISY.dtype), 7)
+    with (
+        jax.log_compiles()
+    ):  # its programs are compiled before there is a bank or a policy, and not again
+        worker.compile(
+            jax.eval_shape(suite.bank), jax.ShapeDtypeStruct(NOISY.shape, NOISY.dtype), 7
+        )
         ahead = _compiled(caplog)
         caplog.clear()
         worker.start(suite.bank())
@@ -304,14 +368,24 @@ def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplo
 def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
     """A program of its own, of headings alone: five environments restart, two at a time."""
     task = dataclasses.replace(TASK, constraints=("heading",))
-    settings = {"batch": BATCH, "half_precision": True, "probe": no_probe, "traced": "none", "taught": False}
+    settings = {
+        "batch": BATCH,
+        "half_precision": True,
+        "probe": no_probe,
+        "traced": "none",
+        "taught": False,
+    }
     programs = Programs(HAND, task, None, suite.commanded, **settings)
     programs._together = 2
     bank, (old, new) = suite.bank(), jax.random.split(jax.random.key(0))
     ended = np.array([True, False, True, True, False, True, False, True])
-    state = programs.begin(programs.sample(bank, old, np.array(False)), None)._replace(time=jnp.full(BATCH, 9))
+    state = programs.begin(programs.sample(bank, old, np.array(False)), None)._replace(
+        time=jnp.full(BATCH, 9)
+    )
     renewed = programs.renew(bank, state, new, np.array(False), ended)
-    drawn = programs.begin(programs.sample(bank, new, np.array(False)), None)._replace(grasps=state.grasps)
+    drawn = programs.begin(programs.sample(bank, new, np.array(False)), None)._replace(
+        grasps=state.grasps
+    )
     for after, fresh, before in zip(*map(jax.tree.leaves, (renewed, drawn, state)), strict=True):
         np.testing.assert_array_equal(after[~ended], before[~ended])
         np.testing.assert_allclose(after[ended], fresh[ended], rtol=1e-5, atol=1e-6)
@@ -319,7 +393,9 @@ def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
 
 
 def test_workers_of_one_task_share_programs_that_compile_once():
-    """A worker's seed, the number of steps, and whether the parameters are committed to a device do not matter."""
+    """A worker's seed, the number of steps, and whether the parameters are committed to a device do
+    not matter.
+    """
     programs, sizes = suite.programs(), set()
     for steps, parameters in enumerate((NOISY, jnp.asarray(NOISY), suite.placed(NOISY)), 1):
         worker = suite.worker(seed=steps)
@@ -337,7 +413,9 @@ def test_workers_of_one_task_share_programs_that_compile_once():
 
 @pytest.mark.parametrize(("name", "most"), [("sample", 4100), ("advance", 4750), ("decide", 1630)])
 def test_programs_stay_small(name, most):
-    """Compiling costs in proportion to a program's equations; a bound is a tenth above what there is."""
+    """Compiling costs in proportion to a program's equations; a bound is a tenth above what there
+    is.
+    """
     worker, programs = suite.worker(), suite.programs()
     still, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
     readout, state = worker.physics.read(None), worker.state
@@ -345,7 +423,14 @@ def test_programs_stay_small(name, most):
     arguments = {
         "sample": (suite.bank(), key, np.array(False)),
         "decide": (still, settings, state, key),
-        "advance": (still, settings, state._replace(views=None), readout, decision, jax.random.key_data(key)),
+        "advance": (
+            still,
+            settings,
+            state._replace(views=None),
+            readout,
+            decision,
+            jax.random.key_data(key),
+        ),
     }
     counted = _equations(jax.make_jaxpr(getattr(programs, f"_{name}"))(*arguments[name]).jaxpr)
     assert 0.6 * most < counted <= most, counted
@@ -354,13 +439,20 @@ def test_programs_stay_small(name, most):
 
 def _equations(program) -> int:
     """Equations of a jaxpr and of those within it."""
-    inner = [[part for value in equation.params.values() for part in _programs_in(value)] for equation in program.eqns]
+    inner = [
+        [part for value in equation.params.values() for part in _programs_in(value)]
+        for equation in program.eqns
+    ]
     return sum(sum(map(_equations, parts)) if parts else 1 for parts in inner)
 
 
 def _programs_in(value):
     values = value if isinstance(value, (tuple, list)) else (value,)
-    return [getattr(one, "jaxpr", one) for one in values if hasattr(one, "eqns") or hasattr(one, "jaxpr")]
+    return [
+        getattr(one, "jaxpr", one)
+        for one in values
+        if hasattr(one, "eqns") or hasattr(one, "jaxpr")
+    ]
 
 
 def test_sizes_are_real_numbers_for_objects_of_meshes_too():

@@ -22,24 +22,41 @@ OBJECTS = suite.OBJECTS[1:2]
 BATCH, DELAY, LATENCY = 2, 3, 2
 # A policy that is shown a tracker's poses, in episodes of 20 control steps.
 TASK = TaskConfig(
-    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=6,
+    constraints=("heading",),
+    surface_points=64,
+    approach_steps=16,
+    hold_steps=4,
+    hold_steps_max=4,
+    history=6,
     observation="tracked",
-    sensing=SensingConfig(delay=(DELAY * 0.01, DELAY * 0.01), latency=(LATENCY * 0.01, LATENCY * 0.01)),
-)  # fmt: skip
+    sensing=SensingConfig(
+        delay=(DELAY * 0.01, DELAY * 0.01), latency=(LATENCY * 0.01, LATENCY * 0.01)
+    ),
+)
 
 
 @pytest.fixture(scope="module")
 def late():
-    """Environments with a tracker and servos that are late, and 18 of an episode's 20 control steps.
+    """Environments with a tracker and servos that are late, and 18 of an episode's 20 control
+    steps.
 
     The wrist follows its guidance while the fingers close.
     """
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     bank = suite.bank_of(1, TASK.surface_points)
     running = RolloutWorker(
-        HAND, TASK, physics, bank, suite.commanded, batch=BATCH, seed=0, half_precision=False, traced="all",
-        taught=True, privileged=OBJECTS,
-    )  # fmt: skip
+        HAND,
+        TASK,
+        physics,
+        bank,
+        suite.commanded,
+        batch=BATCH,
+        seed=0,
+        half_precision=False,
+        traced="all",
+        taught=True,
+        privileged=OBJECTS,
+    )
     yield running, running.collect(suite.command(fingers=0.8), 18)
     physics.close()
 
@@ -51,9 +68,15 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
         now = 17 - age
         np.testing.assert_allclose(readings.q[:, age], trace.q[now], atol=1e-6)
         if age >= LATENCY:  # the trace has the targets that the servos followed
-            np.testing.assert_allclose(readings.u_target[:, age], trace.u_target[now + LATENCY], atol=1e-6)
-        np.testing.assert_allclose(readings.object_position[:, age], trace.object_position[now - DELAY], atol=1e-6)
-        np.testing.assert_allclose(readings.object_quaternion[:, age], trace.object_quaternion[now - DELAY], atol=1e-6)
+            np.testing.assert_allclose(
+                readings.u_target[:, age], trace.u_target[now + LATENCY], atol=1e-6
+            )
+        np.testing.assert_allclose(
+            readings.object_position[:, age], trace.object_position[now - DELAY], atol=1e-6
+        )
+        np.testing.assert_allclose(
+            readings.object_quaternion[:, age], trace.object_quaternion[now - DELAY], atol=1e-6
+        )
     seen, true = running.env.seen(running.state).state, running.env.scene_of(running.state).state
     np.testing.assert_array_equal(true.object_position, trace.object_position[17])
     np.testing.assert_array_equal(seen.object_position, readings.object_position[:, 0])
@@ -69,17 +92,26 @@ def test_servos_follow_the_target_of_so_many_steps_ago(late):
     readings, action = state.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
     _, (command, _) = jax.jit(env.targets)(state, action, env.settings)
     np.testing.assert_allclose(command[:, :6], readings.u_target[:, LATENCY - 1], atol=1e-6)
-    np.testing.assert_allclose(command[:, 6:], motor_positions(HAND, readings.q_target[:, LATENCY - 1]), atol=1e-6)
+    np.testing.assert_allclose(
+        command[:, 6:], motor_positions(HAND, readings.q_target[:, LATENCY - 1]), atol=1e-6
+    )
     np.testing.assert_array_equal(env.scene_of(state).state.q_target, readings.q_target[:, LATENCY])
     np.testing.assert_array_equal(env.seen(state).state.q_target, readings.q_target[:, 0])
     moving = np.abs(np.diff(rollout.trace.q_target, axis=0)).max((1, 2))
-    assert moving.max() > 0.05 and moving[: LATENCY - 1].max() == 0.0  # nothing is followed before it arrives
+    # Nothing is followed before it arrives
+    assert moving.max() > 0.05 and moving[: LATENCY - 1].max() == 0.0
 
 
 def test_a_teacher_sees_all_beside_a_student(late):
     _, rollout = late
-    sizes = [sum(size for _, size in layout) for layout in (observation.layout(HAND, TASK), full_layout(TASK))]
-    assert [rollout.observation.shape[-1], rollout.teacher_observation.shape[-1] - extra(HAND)] == sizes
+    sizes = [
+        sum(size for _, size in layout)
+        for layout in (observation.layout(HAND, TASK), full_layout(TASK))
+    ]
+    assert [
+        rollout.observation.shape[-1],
+        rollout.teacher_observation.shape[-1] - extra(HAND),
+    ] == sizes
     start = 0
     for field in observation.fields(HAND, dataclasses.replace(TASK, observation="full"))["state"]:
         part = rollout.teacher_observation[1:, :, start : start + field.size]
@@ -95,7 +127,10 @@ def test_the_critic_sees_the_trackers_and_the_true_state(late):
     running, rollout = late
     names = [name for name, _ in privileged.layout(HAND, TASK)]
     size = sum(size for _, size in privileged.layout(HAND, TASK))
-    assert rollout.privileged.shape == (18, BATCH, size) and rollout.last_privileged.shape == (BATCH, size)
+    assert rollout.privileged.shape == (18, BATCH, size) and rollout.last_privileged.shape == (
+        BATCH,
+        size,
+    )
     numbers = dict(zip(names, np.moveaxis(rollout.privileged, -1, 0), strict=False))
     np.testing.assert_array_equal(numbers["delay"], DELAY)
     np.testing.assert_array_equal(numbers["period"], 1.0)

@@ -1,4 +1,6 @@
-"""Lift and pushes: the frame's profile, forces in every engine, what the policy sees, and what counts as survival."""
+"""Lift and pushes: the frame's profile, forces in every engine, what the policy sees, and what
+counts as survival.
+"""
 
 import dataclasses
 import functools
@@ -34,7 +36,12 @@ MASSES = tuple(obj.mass for obj in OBJECTS)
 
 def protocol(height: float = 0.15, start: int = 0, masses: tuple[float, ...] = MASSES) -> Protocol:
     steps = protocols.lift_steps(TASK, height)
-    return Protocol(np.float32(start), np.float32(height), np.float32(start + steps), np.array(masses, np.float32))
+    return Protocol(
+        np.float32(start),
+        np.float32(height),
+        np.float32(start + steps),
+        np.array(masses, np.float32),
+    )
 
 
 def frames(height: float) -> Frame:
@@ -49,7 +56,8 @@ _frame = jax.jit(lambda protocol, time: protocols.frame(protocol, TASK, time))
 
 def test_the_lift_is_of_15_cm_at_30_cm_a_second():
     found = frames(0.15)
-    # 3 m/s^2 for 0.1 s (1.5 cm), 0.3 m/s for 0.4 s, 3 m/s^2 downwards for 0.1 s; then 0.1 s of rest.
+    # 3 m/s^2 for 0.1 s (1.5 cm), 0.3 m/s for 0.4 s, 3 m/s^2 downwards for 0.1 s; then 0.1 s of
+    # rest.
     assert len(found.height) == 71
     at = [0, 5, 10, 30, 50, 55, 60, 70]
     heights = [0, 0.00375, 0.015, 0.075, 0.135, 0.14625, 0.15, 0.15]
@@ -62,15 +70,21 @@ def test_the_lift_is_of_15_cm_at_30_cm_a_second():
 def test_every_lift_is_smooth_and_ends_where_it_should(height):
     found = frames(height)
     assert found.height[-1] == pytest.approx(height, abs=1e-5) and abs(found.speed[-1]) < 1e-4
-    assert found.speed.max() <= protocols.LIFT_SPEED + 1e-5 and (np.diff(found.height) > -1e-6).all()
-    assert np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+    assert (
+        found.speed.max() <= protocols.LIFT_SPEED + 1e-5 and (np.diff(found.height) > -1e-6).all()
+    )
+    assert (
+        np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+    )
     way = 0.5 * TASK.control_dt * (found.speed[1:] + found.speed[:-1])
     # Where the speed has a kink within a step, the trapezoid is off by a dt^2 / 8 at most.
     kink = protocols.LIFT_ACCELERATION * TASK.control_dt**2 / 8
     np.testing.assert_allclose(np.diff(found.height), way, atol=kink + 1e-6)
 
 
-_push = jax.jit(lambda protocol, time, index, scale: protocols.push(protocol, TASK, time, index, scale))
+_push = jax.jit(
+    lambda protocol, time, index, scale: protocols.push(protocol, TASK, time, index, scale)
+)
 
 
 def test_pushes_follow_one_another_along_the_axes_of_the_world():
@@ -78,7 +92,12 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
     index, scale = np.array([1]), np.array([1.5], np.float32)
     forces = [
         np.asarray(_push(protocol(masses=(0.2, 0.4)), np.float32([time]), index, scale))[0]
-        for time in [0, first - 1, *(first + steps * np.arange(12) + steps // 2), first + 12 * steps]
+        for time in [
+            0,
+            first - 1,
+            *(first + steps * np.arange(12) + steps // 2),
+            first + 12 * steps,
+        ]
     ]
     assert not np.any([forces[0], forces[1], forces[-1]])
     half = 0.5 * 9.81 * 0.4 * 1.5
@@ -90,11 +109,13 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 
 @functools.cache
 def start():
-    """Objects at rest under headings alone, with the hand far above them and turned away from the heading by up to 40
-    degrees: so little that its wrist has come to it, and lags behind by the servos' acceleration alone, when it is
-    lifted."""
+    """Objects at rest under headings alone, with the hand far above them and turned away from the
+    heading by up to 40 degrees: so little that its wrist has come to it, and lags behind by the
+    servos' acceleration alone, when it is lifted."""
     drawn = suite.episodes(8 * BATCH)
-    headed = np.flatnonzero(~(drawn.goal.active["pose_finger"] | drawn.goal.active["trajectory"]))[:BATCH]
+    headed = np.flatnonzero(~(drawn.goal.active["pose_finger"] | drawn.goal.active["trajectory"]))[
+        :BATCH
+    ]
     fresh = jax.tree.map(lambda rows: rows[headed], drawn)
     goal = dataclasses.replace(fresh.goal, active=jax.tree.map(np.zeros_like, fresh.goal.active))
     aligned = Rotation.from_quat(fresh.reset_state.base_quaternion, scalar_first=True)
@@ -110,7 +131,9 @@ def start():
 
 def falls(physics, force: np.ndarray, steps: int = 10):
     """Objects after `steps` control steps without a table under a force, and without one before."""
-    target = np.concatenate([np.zeros((BATCH, 6)), np.tile(HAND.q_open, (BATCH, 1))], 1).astype(np.float32)
+    target = np.concatenate([np.zeros((BATCH, 6)), np.tile(HAND.q_open, (BATCH, 1))], 1).astype(
+        np.float32
+    )
     state = physics.start(start().reset_state)
     step = jax.jit(physics.step) if physics.compiled else physics.step
     for _ in range(steps):
@@ -177,11 +200,15 @@ class Seen(NamedTuple):
 def seen(scene, index, data) -> Seen:
     state = scene.state
     found = plausibility.sample(scene, index, data)
-    return Seen(found, scene.features.wrist_position, state.u, state.u_velocity, state.object_position)
+    return Seen(
+        found, scene.features.wrist_position, state.u, state.u_velocity, state.object_position
+    )
 
 
 def under(given: Protocol, conditions, time: int = 0):
-    """Environments under a protocol from a step of their episodes on; they have programs of their own."""
+    """Environments under a protocol from a step of their episodes on; they have programs of their
+    own.
+    """
     worker = suite.worker(probe=seen, renewed=False)
     worker.begin(conditions)
     worker.state = worker.state._replace(time=jnp.full_like(worker.state.time, time))
@@ -198,19 +225,30 @@ def released(given: Protocol, steps: int):
 
 
 def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
-    """It begins when the wrist has come to its guidance. Objects fall, in the world; the frame leaves them below."""
+    """It begins when the wrist has come to its guidance. Objects fall, in the world; the frame
+    leaves them below.
+    """
     still, moving = (
-        released(protocol(start=begin)._replace(push_start=np.float32(NEVER)), 215) for begin in (NEVER, 145)
+        released(protocol(start=begin)._replace(push_start=np.float32(NEVER)), 215)
+        for begin in (NEVER, 145)
     )
     # The policy sees the same within half a millimetre: targets are held for a control step each.
-    for name, size, tolerance in (("wrist_position", 3, 5e-4), ("u", 6, 5e-4), ("u_velocity", 3, 0.01)):
+    for name, size, tolerance in (
+        ("wrist_position", 3, 5e-4),
+        ("u", 6, 5e-4),
+        ("u_velocity", 3, 0.01),
+    ):
         shown = (getattr(rollout.probed, name)[..., :size] for rollout in (moving, still))
         np.testing.assert_allclose(*shown, atol=tolerance, err_msg=name)
     height = np.zeros(215)
     height[145:] = frames(0.15).height[1:71]
     up = height[:, None, None] * np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(moving.probed.object_position, moving.trace.object_position - up, atol=1e-6)
-    np.testing.assert_allclose(moving.trace.wrist_position - up, moving.probed.wrist_position, atol=1e-6)
+    np.testing.assert_allclose(
+        moving.probed.object_position, moving.trace.object_position - up, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        moving.trace.wrist_position - up, moving.probed.wrist_position, atol=1e-6
+    )
     assert height[-1] == pytest.approx(0.15, abs=1e-6)
     turns = Rotation.from_quat(start().reset_state.base_quaternion, scalar_first=True)
     risen = turns.apply((moving.trace.u - still.trace.u)[-1, :, :3])
@@ -233,13 +271,16 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypa
     plain = suite.worker(renewed=False)
     conditions, acts = suite.episodes(BATCH), suite.command(fingers=0.5)
     plain.begin(conditions)
-    ended, measured = (under(protocols.stress(TASK, OBJECTS, TASK.hold_steps), conditions) for _ in range(2))
+    ended, measured = (
+        under(protocols.stress(TASK, OBJECTS, TASK.hold_steps), conditions) for _ in range(2)
+    )
     measured.state = measured.state._replace(after=jnp.full_like(measured.state.after, after))
     bare, one, other = (each.collect(acts, steps) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.observation, other.observation)
     assert one.has_episode.all() and one.terminal[-1].all() and other.has_episode.all()
     np.testing.assert_array_equal(one.episodes, other.episodes)
-    # A program without the probe may round otherwise, and what is left of two lengths is as wrong as these are.
+    # A program without the probe may round otherwise, and what is left of two lengths is as wrong
+    # as these are.
     np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-5)
     assert not other.terminal.any()
     rest = measured.collect(acts, after)
@@ -247,21 +288,29 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypa
     assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
     samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed.sample, rest.probed.sample)
     found = protocols.assess(samples, np.ones(BATCH, bool), TASK, TASK.hold_steps)
-    assert set(found) == WITHOUT_MESHES and all(np.isfinite(value).all() for value in found.values())
+    assert set(found) == WITHOUT_MESHES and all(
+        np.isfinite(value).all() for value in found.values()
+    )
     short = protocols.assess(other.probed.sample, np.ones(BATCH, bool), TASK, TASK.hold_steps)
-    assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(found["wrist_speed"])
+    assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(
+        found["wrist_speed"]
+    )
     for each in (plain, ended, measured):
         each.physics.close()
 
 
 def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """The way of one grasp whose object moves (m) and turns (degrees) against the wrist at some of the steps."""
+    """The way of one grasp whose object moves (m) and turns (degrees) against the wrist at some of
+    the steps.
+    """
     steps = protocols.stress_steps(TASK) + 1
     position, angle = np.zeros((steps, 1, 3)), np.zeros(steps)
     for step, (metres, degrees) in moves.items():
         position[int(step[1:]) :, 0, 1] += metres
         angle[int(step[1:]) :] += degrees
-    return position, Rotation.from_euler("z", angle[:, None], degrees=True).as_quat(scalar_first=True)[:, None]
+    return position, Rotation.from_euler("z", angle[:, None], degrees=True).as_quat(
+        scalar_first=True
+    )[:, None]
 
 
 @pytest.mark.parametrize(
@@ -271,8 +320,16 @@ def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
         ({"s30": (0.051, 0.0)}, (0, 0, 0)),
         ({"s100": (0.051, 0.0)}, (1, 0, 0)),
         ({"s300": (0.0, 15.1)}, (1, 1, 0)),
-        ({"s30": (0.03, 10.0), "s100": (0.03, 10.0), "s300": (0.03, 10.0)}, (1, 1, 1)),  # each from where it began
-        ({"s300": (0.03, 8.0), "s310": (0.03, 0.0), "s320": (-0.03, 0.0)}, (1, 1, 0)),  # at any time
+        # Each from where it began
+        (
+            {"s30": (0.03, 10.0), "s100": (0.03, 10.0), "s300": (0.03, 10.0)},
+            (1, 1, 1),
+        ),
+        # At any time
+        (
+            {"s300": (0.03, 8.0), "s310": (0.03, 0.0), "s320": (-0.03, 0.0)},
+            (1, 1, 0),
+        ),
     ],
 )
 def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
@@ -288,8 +345,12 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     obj, count, hold = OBJECTS[1], TASK.surface_points, TASK.hold_steps
     drawn = suite.episodes(4 * BATCH)
     drawn = jax.tree.map(lambda rows: rows[drawn.reset_state.object_index == 1][:2], drawn)
-    rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
-    surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
+    rest = np.concatenate(
+        [drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1
+    )
+    surface = Surface(
+        np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1))
+    )
     asked = {constraint.name: np.zeros(2, bool) for constraint in optional(TASK)}
     attempts = Attempts(HAND, TASK, suite.policy(), threads=1, phases=Phases(lift=0.06, hold=0.0))
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
@@ -297,12 +358,21 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     approach, lift = TASK.approach_steps, protocols.lift_steps(TASK, 0.06)
     assert attempts.steps == approach + lift + hold == len(outcome.trace.q)
     dt = TASK.control_dt
-    assert attempts.begins == {"grasp": 0.0, "lift": approach * dt, "hold": pytest.approx((approach + lift) * dt)}
+    assert attempts.begins == {
+        "grasp": 0.0,
+        "lift": approach * dt,
+        "hold": pytest.approx((approach + lift) * dt),
+    }
     assert set(outcome.metrics) > WITHOUT_MESHES
     way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[approach - 1]
     slid = (outcome.trace.u[-1] - outcome.trace.u[approach - 1])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[approach:, :, 2], axis=0).max() < 0.02)
-    # The untrained hand leaves the object, and the table under it remains: it is where it was, and not held.
+    assert (way[:, 2] > 0.04).all() and (
+        np.diff(outcome.trace.wrist_position[approach:, :, 2], axis=0).max() < 0.02
+    )
+    # The untrained hand leaves the object, and the table under it remains: it is where it was, and
+    # not held.
     assert outcome.trace.table.all() and not outcome.metrics["held"].any()
     assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()
-    np.testing.assert_allclose(np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5
+    )

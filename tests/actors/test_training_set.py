@@ -43,7 +43,13 @@ def _banks_are_built_once(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sets():
     """Constraint sets of the suite's objects."""
-    return dict(zip((obj.name for obj in OBJECTS), make_sets(HAND, TASK, OBJECTS, 5, suite.bank()), strict=True))
+    return dict(
+        zip(
+            (obj.name for obj in OBJECTS),
+            make_sets(HAND, TASK, OBJECTS, 5, suite.bank()),
+            strict=True,
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +84,26 @@ def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, sca
 
 
 def test_constraint_sets_keep_their_split_and_their_references(folders):
-    """Grasps of the policy in training replace references of its procedural objects, never captured ones."""
+    """Grasps of the policy in training replace references of its procedural objects, never captured
+    ones.
+    """
     objects, constraints = folders
     mixed = training_set(HAND, _run(folder=objects, constraints=constraints, procedural=4), 0)
     assert mixed.objects[0].name == MUG.name and len(mixed.objects) == 5
     assert np.asarray(mixed.bank.renewable).tolist() == [False, True, True, True, True]
     apart = [
-        np.asarray(training_set(HAND, _run(folder=objects, constraints=constraints, split=split), 0).bank.pose_valid)
+        np.asarray(
+            training_set(
+                HAND, _run(folder=objects, constraints=constraints, split=split), 0
+            ).bank.pose_valid
+        )
         for split in ("training", "held-out", "all")
     ]
     assert not (apart[0] & apart[1]).any() and np.array_equal(apart[0] | apart[1], apart[2])
     index = np.array([0, 1], np.int32)
     q, position, quaternion = (
-        np.asarray(getattr(mixed.bank, f"pose_{name}"))[:2, 0, 0] for name in ("q", "position", "quaternion")
+        np.asarray(getattr(mixed.bank, f"pose_{name}"))[:2, 0, 0]
+        for name in ("q", "position", "quaternion")
     )
     grasps = Grasps(np.ones(2, bool), index, 0 * index, q + 0.01, position, quaternion)
     for _ in range(4):  # a random place each time
@@ -103,7 +116,10 @@ def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path, sets):
     allowed = mug["heading/allowed"] & mug["heading/training"][:, None]
     save(Message({**mug, "heading/allowed": allowed}, sets[MUG.name].meta), tmp_path)
     save(sets[BOX.name], tmp_path)
-    left = {split: [obj.name for obj in load_for(tmp_path, [MUG, BOX], split)[0]] for split in get_args(Split)}
+    left = {
+        split: [obj.name for obj in load_for(tmp_path, [MUG, BOX], split)[0]]
+        for split in get_args(Split)
+    }
     every = [MUG.name, BOX.name]
     assert left == {"all": every, "training": every, "held-out": every[1:]}
 
@@ -131,7 +147,10 @@ def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
 
 @pytest.mark.parametrize(
     ("objects", "text"),
-    [({"constraints": "x"}, "objects.folder"), ({"folder": 0, "constraints": 0}, "no constraint set")],
+    [
+        ({"constraints": "x"}, "objects.folder"),
+        ({"folder": 0, "constraints": 0}, "no constraint set"),
+    ],
 )
 def test_what_cannot_be_trained_on_is_said(folders, objects, text):
     given = {name: folders[0] if value == 0 else value for name, value in objects.items()}
@@ -140,13 +159,17 @@ def test_what_cannot_be_trained_on_is_said(folders, objects, text):
 
 
 def test_sets_of_another_hand_are_refused(folders):
-    config = dataclasses.replace(_run(folder=folders[0], constraints=folders[1]), task=TaskConfig(hand="allegro"))
+    config = dataclasses.replace(
+        _run(folder=folders[0], constraints=folders[1]), task=TaskConfig(hand="allegro")
+    )
     with pytest.raises(CongraspError, match="for the hand 'human'"):
         training_set(get_hand("allegro"), config, 0)
 
 
 def test_an_object_that_lies_too_flat_is_in_no_episode():
-    """A board of 24 x 13 cm, 8 mm thick: fingers find opposite surfaces only above and beneath it."""
+    """A board of 24 x 13 cm, 8 mm thick: fingers find opposite surfaces only above and beneath
+    it.
+    """
     board = procedural.generate(1_000_045, "board")
     assert np.ptp(board.points, axis=0).min() < 0.009
     row = headings_of(TASK, board, (0, 1), None, 1.0, outline(HAND))
@@ -160,7 +183,11 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
         np.testing.assert_array_equal(a, b)
     first = rows[0]._replace(
         pose_valid=rows[0].pose_valid[:, :, :3],
-        **{name: getattr(rows[0], name)[:, :3] for name in bank._fields if name in ("pose_q", "pose_position")},
+        **{
+            name: getattr(rows[0], name)[:, :3]
+            for name in bank._fields
+            if name in ("pose_q", "pose_position")
+        },
         pose_quaternion=rows[0].pose_quaternion[:, :3],
         trajectory_position=rows[0].trajectory_position[:, :3],
         trajectory_quaternion=rows[0].trajectory_quaternion[:, :3],
@@ -173,7 +200,9 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
 def test_objects_are_drawn_as_often_as_their_weights_say():
     bank = suite.bank()._replace(weight=np.array([1.0, 3.0, 0.0, 4.0], np.float32))
     drawn = suite.episodes(2000, bank).reset_state.object_index
-    assert np.bincount(drawn, minlength=4) / len(drawn) == pytest.approx([1 / 8, 3 / 8, 0.0, 1 / 2], abs=0.03)
+    assert np.bincount(drawn, minlength=4) / len(drawn) == pytest.approx(
+        [1 / 8, 3 / 8, 0.0, 1 / 2], abs=0.03
+    )
 
 
 def test_weights_by_hand():
@@ -181,7 +210,8 @@ def test_weights_by_hand():
     found = FailureWeights(np.array([1.0, 1.0, 3.0]), ["mug", "mug", "box"])
     np.testing.assert_array_equal(found.weights, [1, 1, 3])
     found.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
-    # Nothing was counted before, so that nothing is forgotten. All: 4/12. Mugs: (4 + 5/3) / (8 + 5), boxes: (5/3) / 9.
+    # Nothing was counted before, so that nothing is forgotten. All: 4/12. Mugs: (4 + 5/3) / (8 +
+    # 5), boxes: (5/3) / 9.
     mugs, boxes = 17 / 39, 5 / 27
     rates = np.array([(4 + 5 * mugs) / 9, 5 * mugs / 9, 5 * boxes / 9])
     variance = rates * (1 - rates)

@@ -1,7 +1,9 @@
-"""Hostile and slow peers, for benchmarks and tests: `python -m tests.benchmarks.attackers KIND ENDPOINT RUN [FILE]`.
+"""Hostile and slow peers, for benchmarks and tests: `python -m tests.benchmarks.attackers KIND
+ENDPOINT RUN [FILE]`.
 
-Each attacker does one thing without end, as fast as it can, over plain TCP and with Zenoh's own interface: nothing that
-the project's own peers do to be polite holds it back. It prints a line when it has begun.
+Each attacker does one thing without end, as fast as it can, over plain TCP and with Zenoh's own
+interface: nothing that the project's own peers do to be polite holds it back. It prints a line when
+it has begun.
 """
 
 import contextlib
@@ -29,10 +31,23 @@ _FOREVER = 3600.0
 
 
 @contextlib.contextmanager
-def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1) -> Iterator[None]:
+def attacked(
+    kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1
+) -> Iterator[None]:
     """Attackers of a kind, in processes of their own, while the block runs."""
-    command = [sys.executable, "-m", "tests.benchmarks.attackers", kind, endpoint, run, str(query or "")]
-    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.benchmarks.attackers",
+        kind,
+        endpoint,
+        run,
+        str(query or ""),
+    ]
+    processes = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        for _ in range(count)
+    ]
     try:
         for process in processes:
             assert process.stdout is not None
@@ -47,7 +62,9 @@ def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = No
 
 @contextlib.contextmanager
 def throttled(endpoint: str, rate: float) -> Iterator[str]:
-    """An endpoint through which another one, with all its flows, is reached at so many bytes a second each way."""
+    """An endpoint through which another one, with all its flows, is reached at so many bytes a
+    second each way.
+    """
     port, ended = free_port(), threading.Event()
 
     def pump(source: socket.socket, target: socket.socket) -> None:
@@ -70,7 +87,9 @@ def throttled(endpoint: str, rate: float) -> Iterator[str]:
     for index in range(len(FLOWS)):
         host, _, number = shifted(endpoint, index).partition("/")[2].rpartition(":")
         listeners.append(socket.create_server(("127.0.0.1", port + index)))
-        threading.Thread(target=accept, args=(listeners[-1], (host, int(number))), daemon=True).start()
+        threading.Thread(
+            target=accept, args=(listeners[-1], (host, int(number))), daemon=True
+        ).start()
     try:
         yield f"tcp/127.0.0.1:{port}"
     finally:
@@ -80,7 +99,9 @@ def throttled(endpoint: str, rate: float) -> Iterator[str]:
 
 
 def unread(endpoint: str, run: str, query: bytes) -> None:
-    """Sends queries to a policy server and never reads an answer: the thread that should is asleep."""
+    """Sends queries to a policy server and never reads an answer: the thread that should is
+    asleep.
+    """
     stopped: Callback[zenoh.Reply] = Callback(lambda reply: time.sleep(_FOREVER), indirect=False)
     with bare_session("client", connect=endpoint) as session:
         print("began", flush=True)
@@ -90,7 +111,9 @@ def unread(endpoint: str, run: str, query: bytes) -> None:
 
 
 def greedy(endpoint: str, run: str, query: bytes) -> None:
-    """Pulls all the weights of a learner 83 times a second, and every further chunk that it announces."""
+    """Pulls all the weights of a learner 83 times a second, and every further chunk that it
+    announces.
+    """
     request = encode(Message(meta={"newer_than": -1}))
     with bare_session("client", connect=shifted(endpoint, 1)) as session:
         print("began", flush=True)
@@ -146,16 +169,26 @@ def huge(endpoint: str, run: str, query: bytes) -> None:
     time.sleep(_FOREVER)
 
 
-KINDS: dict[str, Callable[[str, str, bytes], None]] = {kind.__name__: kind for kind in (unread, greedy, silent, huge)}
+KINDS: dict[str, Callable[[str, str, bytes], None]] = {
+    kind.__name__: kind for kind in (unread, greedy, silent, huge)
+}
 
 
 def _whole(session: zenoh.Session, key: str, request: bytes) -> None:
     """Sends a query, and requests four mebibytes more at a time while the answer has more."""
     offset, head = 0, b""
     while True:
-        attachment = head[:8] + offset.to_bytes(8, "little") + (4 << 20).to_bytes(4, "little") if head else None
+        attachment = (
+            head[:8] + offset.to_bytes(8, "little") + (4 << 20).to_bytes(4, "little")
+            if head
+            else None
+        )
         replies = session.get(
-            key, FifoChannel(4), payload=None if head else request, attachment=attachment, timeout=5.0
+            key,
+            FifoChannel(4),
+            payload=None if head else request,
+            attachment=attachment,
+            timeout=5.0,
         )
         piece = next((reply.ok for reply in replies if reply.ok), None)
         if piece is None or piece.attachment is None:

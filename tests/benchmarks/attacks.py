@@ -1,7 +1,9 @@
-"""What hostile and slow clients of a policy server cost an honest one: the same queries alone and beside each attack.
+"""What hostile and slow clients of a policy server cost an honest one: the same queries alone and
+beside each attack.
 
-The server is the real one with an untrained policy; the attackers (`tests.benchmarks.attackers`) are processes. The
-same attack on a second server shows what is due to this machine, which attackers, servers and client share.
+The server is the real one with an untrained policy; the attackers (`tests.benchmarks.attackers`)
+are processes. The same attack on a second server shows what is due to this machine, which
+attackers, servers and client share.
 """
 
 import contextlib
@@ -30,27 +32,46 @@ _START = 180.0  # seconds that the server may take to start
 _SETTLE = 1.0  # seconds of an attack that are not measured
 _KINDS = {"unread": 2, "silent": 1, "huge": 1}
 """Attacks, and the number of attackers of each."""
-_FIGURES = {"p99 of a query, ms": 2, "answers a second": 0, "a new connection, ms": 0, "server, MB": 0}
+_FIGURES = {
+    "p99 of a query, ms": 2,
+    "answers a second": 0,
+    "a new connection, ms": 0,
+    "server, MB": 0,
+}
 """What is measured, with the digits that are printed."""
 
 
 def attacks(seconds: float = 5.0, turns: int = 3) -> int:
-    """What hostile clients of a policy server cost an honest one that queries it 100 times a second.
+    """What hostile clients of a policy server cost an honest one that queries it 100 times a
+    second.
 
-    Two clients leave long answers unread, one opens 300 silent connections, one sends 60 MB at a time.
+    Two clients leave long answers unread, one opens 300 silent connections, one sends 60 MB at a
+    time.
 
     Args:
       seconds: Length of each measurement.
-      turns: Measurements alone, beside each attack on another server and on this one, in turn; medians are printed.
+      turns: Measurements alone, beside each attack on another server and on this one, in turn;
+      medians are printed.
 
     Examples:
       python -m tests.benchmarks attacks
       python -m tests.benchmarks attacks --seconds 2 --turns 1
     """
     table = Table(title=f"{turns} x {seconds:g} s; load average {os.getloadavg()[0]:.1f}")
-    for column in ("beside", "honest", "alone", "elsewhere", "attacked", "attacked / alone", "attacked / elsewhere"):
+    for column in (
+        "beside",
+        "honest",
+        "alone",
+        "elsewhere",
+        "attacked",
+        "attacked / alone",
+        "attacked / elsewhere",
+    ):
         table.add_column(column, justify="right" if table.columns[1:] else "left")
-    with tempfile.TemporaryDirectory() as name, _servers(folder := pathlib.Path(name), seconds) as (endpoints, measure):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        _servers(folder := pathlib.Path(name), seconds) as (endpoints, measure),
+    ):
         for kind, count in _KINDS.items():
             rows: list[list[list[float]]] = [[], [], []]
             for _ in range(turns):
@@ -69,8 +90,11 @@ def attacks(seconds: float = 5.0, turns: int = 3) -> int:
 
 
 @contextlib.contextmanager
-def _servers(folder: pathlib.Path, seconds: float) -> Iterator[tuple[list[str], Callable[[], list[float]]]]:
-    """Endpoints of another policy server and of the honest client's, and a function that returns the honest `_FIGURES`.
+def _servers(
+    folder: pathlib.Path, seconds: float
+) -> Iterator[tuple[list[str], Callable[[], list[float]]]]:
+    """Endpoints of another policy server and of the honest client's, and a function that returns
+    the honest `_FIGURES`.
 
     Writes a long query to `folder/query`.
     """

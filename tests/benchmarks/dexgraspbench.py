@@ -1,7 +1,8 @@
 """Grasps for DexGraspBench, with the objects in the benchmark's layout.
 
-The benchmark's files are pickles, which this project neither writes nor reads. This writes NPZ files with the same
-names and shapes, which `examples/dexgraspbench.py` converts in the benchmark's environment.
+The benchmark's files are pickles, which this project neither writes nor reads. This writes NPZ
+files with the same names and shapes, which `examples/dexgraspbench.py` converts in the benchmark's
+environment.
 """
 
 import io
@@ -28,16 +29,19 @@ def dexgraspbench(
     out: pathlib.Path = pathlib.Path("dexgraspbench"),
     replay: bool = False,
 ) -> int:
-    """Pregrasp, grasp and squeeze of motions with their objects, for DexGraspBench's tests of Allegro and Shadow hands.
+    """Pregrasp, grasp and squeeze of motions with their objects, for DexGraspBench's tests of
+    Allegro and Shadow hands.
 
-    Shadow hands are those imported from the benchmark's own file. The folder gets NPZ files with the benchmark's names,
-    of which examples/dexgraspbench.py makes its pickles.
+    Shadow hands are those imported from the benchmark's own file. The folder gets NPZ files with
+    the benchmark's names, of which examples/dexgraspbench.py makes its pickles.
 
     Args:
-      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are not held, or cannot
+      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are
+      not held, or cannot
         be exported, are left out.
       out: The folder to write.
-      replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
+      replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp
+      and from the
         pregrasp; writes replay.json.
 
     Examples:
@@ -45,7 +49,9 @@ def dexgraspbench(
       python -m tests.benchmarks dexgraspbench grasps/mug/grasp.npz --replay
     """
     if not paths:
-        raise CongraspError("No motion was given.", "Pass a folder or a motion (.npz) of 'congrasp grasp'.")
+        raise CongraspError(
+            "No motion was given.", "Pass a folder or a motion (.npz) of 'congrasp grasp'."
+        )
     if out.exists():
         raise CongraspError(f"{out} exists already.", "Remove it or pass another with --out.")
     with tracked() as track:
@@ -65,19 +71,24 @@ def dexgraspbench(
 def write_grasp(grasp: Grasp, folder: pathlib.Path) -> None:
     """Writes a grasp and its object, which is laid out as by the benchmark's preprocessing.
 
-    The grasp has `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + F,): position (m) and quaternion (w, x, y, z) of
-    the root in the world frame, and the joints (rad) in the order of `joint_names`; `obj_pose` (7,), likewise, of the
-    frame of the object's file; `obj_scale` (), m per unit of that file; and `obj_path`, the object's folder.
+    The grasp has `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + F,): position (m) and
+    quaternion (w, x, y, z) of the root in the world frame, and the joints (rad) in the order of
+    `joint_names`; `obj_pose` (7,), likewise, of the frame of the object's file; `obj_scale` (), m
+    per unit of that file; and `obj_path`, the object's folder.
 
-    The object's files are in the frame and unit of its mesh: `mesh/simplified.obj`, `urdf/meshes/convex_piece_*.obj`
-    and `info/simplified.json`.
+    The object's files are in the frame and unit of its mesh: `mesh/simplified.obj`,
+    `urdf/meshes/convex_piece_*.obj` and `info/simplified.json`.
 
     Raises:
       CongraspError: the folder cannot be written.
     """
-    arrays: dict[str, Any] = {f"{name}_qpos": grasp.match.qpos(*grasp.states[name]) for name in STATES}
+    arrays: dict[str, Any] = {
+        f"{name}_qpos": grasp.match.qpos(*grasp.states[name]) for name in STATES
+    }
     position = grasp.object_position - grasp.object_rotation.apply(grasp.origin)
-    arrays["obj_pose"] = np.concatenate([position, grasp.object_rotation.as_quat(scalar_first=True)])
+    arrays["obj_pose"] = np.concatenate(
+        [position, grasp.object_rotation.as_quat(scalar_first=True)]
+    )
     arrays |= {"obj_scale": np.array(grasp.scale), "obj_path": np.array(f"{OBJECTS}/{grasp.name}")}
     arrays |= {"joint_names": np.array(grasp.match.hand.joints), "hand": np.array(grasp.match.name)}
     buffer = io.BytesIO()

@@ -64,7 +64,9 @@ class Grasp(NamedTuple):
     states: dict[str, State]
     """States of the hand, by `STATES`."""
     clearance: float
-    """Distance of hand and object in the pregrasp, m; less than `CLEARANCE` if the motion begins nearer."""
+    """Distance of hand and object in the pregrasp, m; less than `CLEARANCE` if the motion begins
+    nearer.
+    """
 
 
 def read_grasps(
@@ -93,7 +95,9 @@ def read_grasps(
     if not grasps:
         raise CongraspError(" ".join(["None of the motions can be exported.", *left_out[:1]]))
     if len(hands := sorted({grasp.hand.name for grasp in grasps})) > 1:
-        raise CongraspError(f"The motions are of several hands: {', '.join(hands)}.", "Export each hand separately.")
+        raise CongraspError(
+            f"The motions are of several hands: {', '.join(hands)}.", "Export each hand separately."
+        )
     return grasps, left_out
 
 
@@ -108,14 +112,21 @@ def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
     """Returns the grasp of a motion's file, under a name that is not among `names`.
 
     Raises:
-      CongraspError: it is not a motion, its object is not held or has no volume, or the benchmark does not have its
+      CongraspError: it is not a motion, its object is not held or has no volume, or the benchmark
+      does not have its
         hand.
     """
     motion = pick_motion(file)
     if not motion.metrics.get("held", motion.success):
         raise CongraspError("The object is not held.")
-    name = file.resolve().parent.name if file.name == _MOTION else file_name(motion.object, "the object of a motion")
-    free = next(x for i in itertools.count(1) if (x := name if i == 1 else f"{name}-{i}") not in names)
+    name = (
+        file.resolve().parent.name
+        if file.name == _MOTION
+        else file_name(motion.object, "the object of a motion")
+    )
+    free = next(
+        x for i in itertools.count(1) if (x := name if i == 1 else f"{name}-{i}") not in names
+    )
     return benchmark_grasp(free, motion)
 
 
@@ -146,10 +157,12 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
 
 
 def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
-    """(F,) rad, targets with which servos of `kp` (N.m/rad) apply the policy's torques in frame `t`.
+    """(F,) rad, targets with which servos of `kp` (N.m/rad) apply the policy's torques in frame
+    `t`.
 
-    m_squeeze = m + tau / kp for each motor's position m, with tau = clip(kp' (m_target - m), limit) of the hand's own
-    servos, mean over ten frames up to this one. A motor of several joints turns them by their coefficients.
+    m_squeeze = m + tau / kp for each motor's position m, with tau = clip(kp' (m_target - m), limit)
+    of the hand's own servos, mean over ten frames up to this one. A motor of several joints turns
+    them by their coefficients.
     """
     own = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
     frames = slice(max(t + 1 - _STEADY, 0), t + 1)
@@ -164,7 +177,8 @@ def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
 
 
 def convex_object(motion: GraspMotion) -> GraspObject:
-    """Returns the object in the motion's object frame, made of convex pieces, since a motion only has its mesh.
+    """Returns the object in the motion's object frame, made of convex pieces, since a motion only
+    has its mesh.
 
     Raises:
       CongraspError: the mesh has no volume.
@@ -174,9 +188,13 @@ def convex_object(motion: GraspMotion) -> GraspObject:
     bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
     if len(bodies) > MAX_MESH_PIECES:
         bodies = [trimesh.Trimesh(*shape)]
-    pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
+    pieces = [
+        piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))
+    ]
     if not pieces:
-        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Generate the motion again.")
+        raise CongraspError(
+            f"The mesh of '{motion.object}' has no volume.", "Generate the motion again."
+        )
     return plain_object(motion.object, tuple(pieces), _DENSITY)
 
 
@@ -212,7 +230,8 @@ def _carried(motion: GraspMotion, t: int, last: int) -> State:
 
 
 def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) -> tuple[int, float]:
-    """The last frame up to `last` in which hand and object are `CLEARANCE` apart, else that of the largest distance.
+    """The last frame up to `last` in which hand and object are `CLEARANCE` apart, else that of the
+    largest distance.
 
     Returns:
       The frame, and the distance in m between the hand's shapes and the object's pieces there.
@@ -223,15 +242,24 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) ->
     body = model.body("object").id
     free = model.jnt_qposadr[model.body_jntadr[body]]
     mine = np.flatnonzero(model.geom_bodyid == body)
-    theirs = [g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]]
+    theirs = [
+        g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]
+    ]
     base = model.body("hand_base").id
     best, farthest = 0, -np.inf
     for t in range(last, -1, -1):
-        model.body_pos[base], model.body_quat[base] = motion.wrist_position[t], motion.wrist_quaternion[t]
+        model.body_pos[base], model.body_quat[base] = (
+            motion.wrist_position[t],
+            motion.wrist_quaternion[t],
+        )
         data.qpos[fingers] = motion.joint_position[t]
         data.qpos[free : free + 7] = *motion.object_position[t], *motion.object_quaternion[t]
         mujoco.mj_kinematics(model, data)
-        gap = min(mujoco.mj_geomDistance(model, data, a, b, 2 * CLEARANCE, None) for a in theirs for b in mine)
+        gap = min(
+            mujoco.mj_geomDistance(model, data, a, b, 2 * CLEARANCE, None)
+            for a in theirs
+            for b in mine
+        )
         if gap > farthest:
             best, farthest = t, gap
         if gap >= CLEARANCE:

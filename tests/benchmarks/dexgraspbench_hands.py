@@ -1,8 +1,10 @@
-"""Hands of DexGraspBench, and the correspondence between their joints and those of this project's hands.
+"""Hands of DexGraspBench, and the correspondence between their joints and those of this project's
+hands.
 
-The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot Company, Apache-2.0).
-This module has their names and kinematics, in the frame of the palm's body with every joint at zero. A hand is
-recognised by its kinematics, not by names: it is the benchmark's if its joints are at the same positions.
+The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot
+Company, Apache-2.0). This module has their names and kinematics, in the frame of the palm's body
+with every joint at zero. A hand is recognised by its kinematics, not by names: it is the
+benchmark's if its joints are at the same positions.
 """
 
 import dataclasses
@@ -46,7 +48,9 @@ class BenchmarkHand:
     """A hand of F joints in the benchmark's order."""
 
     fingers: dict[str, tuple[Row, ...]]
-    """Joints of each finger from the palm on, by the finger; its name and a number are the name of a joint."""
+    """Joints of each finger from the palm on, by the finger; its name and a number are the name of
+    a joint.
+    """
     from_tip: bool
     """True if they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
     position: tuple[float, float, float]
@@ -100,8 +104,8 @@ class Match(NamedTuple):
     """Rotation from the wrist frame to the root's."""
 
     def qpos(self, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> np.ndarray:
-        """Position and quaternion (w, x, y, z) of the root in the world and joints (7 + F,), as the benchmark stores
-        them.
+        """Position and quaternion (w, x, y, z) of the root in the world and joints (7 + F,), as the
+        benchmark stores them.
 
         Args:
           position: (3,) m, of the wrist in the world.
@@ -110,10 +114,13 @@ class Match(NamedTuple):
         """
         turn = rotation * self.rotation.inv()
         quaternion = turn.as_quat(scalar_first=True)
-        return np.concatenate([position - turn.apply(self.position), quaternion, self.sign * q[self.order]])
+        return np.concatenate(
+            [position - turn.apply(self.position), quaternion, self.sign * q[self.order]]
+        )
 
     def solids(self, link_of: np.ndarray) -> dict[int, tuple[Solid, ...]]:
-        """The benchmark's collision shapes in the wrist frame at zero, by links; empty if they are meshes.
+        """The benchmark's collision shapes in the wrist frame at zero, by links; empty if they are
+        meshes.
 
         Args:
           link_of: (F,) index of the link that each of this project's joints moves.
@@ -123,9 +130,15 @@ class Match(NamedTuple):
         place = self.rotation.inv().apply(self.hand.position - self.position)
         found: dict[int, tuple[Solid, ...]] = {}
         for shape in self.hand.shapes:
-            link = int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
-            w, x, y, z = (turn * Rotation.from_quat(shape.quaternion, scalar_first=True)).as_quat(scalar_first=True)
-            solid = Solid(shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z))
+            link = (
+                int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
+            )
+            w, x, y, z = (turn * Rotation.from_quat(shape.quaternion, scalar_first=True)).as_quat(
+                scalar_first=True
+            )
+            solid = Solid(
+                shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z)
+            )
             found[link] = (*found.get(link, ()), solid)
         return found
 
@@ -133,7 +146,8 @@ class Match(NamedTuple):
 def match_hand(motion: GraspMotion) -> Match:
     """Returns the benchmark's hand for a motion's hand, independent of the names of its joints.
 
-    Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to `PLACES_MM`.
+    Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to
+    `PLACES_MM`.
 
     Raises:
       CongraspError: the benchmark has no such hand.
@@ -154,13 +168,16 @@ def match_hand(motion: GraspMotion) -> Match:
         near = f"; the nearest, {match.name}, has a joint {error:.2g} mm off" if match else ""
         raise CongraspError(
             f"DexGraspBench has no hand like '{motion.hand}'{near}.",
-            f"It has {' and '.join(BENCHMARK_HANDS)}; of another make of one, import the benchmark's own file.",
+            f"It has {' and '.join(BENCHMARK_HANDS)}; of another make of one, import the "
+            f"benchmark's own file.",
         )
     return match
 
 
 def benchmarked(hand: Hand, match: Match) -> Hand:
-    """Returns the hand with the benchmark's motors, damping, and collision shapes unless those are meshes."""
+    """Returns the hand with the benchmark's motors, damping, and collision shapes unless those are
+    meshes.
+    """
     motor = match.hand
 
     def driven(joint: Joint) -> Joint:
@@ -171,17 +188,22 @@ def benchmarked(hand: Hand, match: Match) -> Hand:
 
     solids = match.solids(hand.joint_links)
     links = tuple(
-        dataclasses.replace(link, joints=tuple(map(driven, link.joints)), solids=solids.get(i, link.solids))
+        dataclasses.replace(
+            link, joints=tuple(map(driven, link.joints)), solids=solids.get(i, link.solids)
+        )
         for i, link in enumerate(hand.links)
     )
     tendons = tuple(
-        dataclasses.replace(tendon, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit) for tendon in hand.tendons
+        dataclasses.replace(tendon, kp=motor.kp, kv=0.0, torque_limit=motor.torque_limit)
+        for tendon in hand.tendons
     )
     return dataclasses.replace(hand, links=links, tendons=tendons)
 
 
 def _chains(motion: GraspMotion) -> list[np.ndarray]:
-    """Joint indices of each finger, from the palm on; empty if the hand is not a palm with chains."""
+    """Joint indices of each finger, from the palm on; empty if the hand is not a palm with
+    chains.
+    """
     parents, links = motion.link_parent, motion.joint_link
     found = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
@@ -196,12 +218,20 @@ def _chains(motion: GraspMotion) -> list[np.ndarray]:
     return found if len(np.unique(joints)) == len(joints) == len(links) and len(found) <= 5 else []
 
 
-def _laid_over(name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion) -> tuple[float, Match | None]:
+def _laid_over(
+    name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion
+) -> tuple[float, Match | None]:
     """Error in mm of the farthest joint for this assignment of joints, and the match."""
-    theirs, anchors, axes = hand.rows, motion.joint_anchor[order].astype(float), motion.joint_axis[order].astype(float)
+    theirs, anchors, axes = (
+        hand.rows,
+        motion.joint_anchor[order].astype(float),
+        motion.joint_axis[order].astype(float),
+    )
     middle, center = theirs[:, 0].mean(0), anchors.mean(0)
     turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]
-    off = 1e3 * np.linalg.norm(turn.apply(anchors - center) - (theirs[:, 0] - middle), axis=-1).max()
+    off = (
+        1e3 * np.linalg.norm(turn.apply(anchors - center) - (theirs[:, 0] - middle), axis=-1).max()
+    )
     along = np.sum(turn.apply(axes) * theirs[:, 1], -1)
     if np.abs(along).min() < np.cos(_FACING):
         return np.inf, None

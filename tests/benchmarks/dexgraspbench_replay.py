@@ -1,10 +1,11 @@
 """Test of exported grasps without a policy in MuJoCo C, after DexGraspBench.
 
-An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
-squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
-object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
-benchmark's gains and no speed feedback except the joints' damping, and contacts have the benchmark's stiffness and
-torsional friction. Collision shapes are the benchmark's boxes for Allegro, and this project's shapes for Shadow.
+An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with
+its targets at the squeeze, or at the pregrasp, from which targets go to the grasp and on to the
+squeeze, 0.4 s each, open loop. Then the object is pushed for two seconds by 1 N along or against an
+axis of the world, each push from the start. Motors have the benchmark's gains and no speed feedback
+except the joints' damping, and contacts have the benchmark's stiffness and torsional friction.
+Collision shapes are the benchmark's boxes for Allegro, and this project's shapes for Shadow.
 """
 
 import itertools
@@ -33,7 +34,12 @@ MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
 _HAND, _OBJECT = ((0.005, 1.0), (0.5, 0.99, 1e-4)), ((0.02, 1.0), (0.9, 0.95, 1e-3))
 """`solref` and the first of `solimp`, of which a contact has the mean."""
 STARTS = ("grasp", "pregrasp")
-_STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and between two measurements of contacts
+# Control steps: of a stage, of a push, and between two measurements of contacts
+_STAGE, _PUSH, _LOOK = (
+    40,
+    200,
+    10,
+)
 _TOGETHER = 32  # grasps in parallel
 _TASK = TaskConfig()
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -44,7 +50,9 @@ class Replayed(NamedTuple):
 
     name: str
     from_grasp: bool
-    """True if the object stayed within 5 cm and 15 degrees of its pose under all six pushes from the grasp."""
+    """True if the object stayed within 5 cm and 15 degrees of its pose under all six pushes from
+    the grasp.
+    """
     from_pregrasp: bool
     """The same from the pregrasp."""
     depth_mm: float
@@ -55,7 +63,9 @@ class Replayed(NamedTuple):
     """Deepest penetration of hand and object while it is pushed in the grasp."""
 
 
-def replayed(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
+def replayed(
+    grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None
+) -> list[Replayed]:
     """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
     found: list[Replayed] = []
@@ -67,18 +77,24 @@ def replayed(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda d
 
 def summary(found: Sequence[Replayed]) -> str:
     """Summary of replayed grasps in one line."""
-    held, closed = (100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS)
+    held, closed = (
+        100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS
+    )
     depth, own, pushed = np.array([(one.depth_mm, one.self_mm, one.pushed_mm) for one in found]).T
     return (
-        f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from the pregrasp; "
-        f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm (most) in the object and "
+        f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from "
+        f"the pregrasp; "
+        f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm "
+        f"(most) in the object and "
         f"{own.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
     )
 
 
 def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
     """Writes the result of each grasp to `replay.json`."""
-    write_atomically(folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode())
+    write_atomically(
+        folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode()
+    )
 
 
 def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
@@ -97,8 +113,12 @@ def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
     ]
 
 
-def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: str) -> tuple[np.ndarray, np.ndarray]:
-    """Survival (N,) of six pushes from a state for each grasp, and the deepest penetration in them, mm."""
+def _pushed(
+    physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Survival (N,) of six pushes from a state for each grasp, and the deepest penetration in them,
+    mm.
+    """
     _begin(physics, grasps, start)
     origin = physics.read(physics)
     kept: np.ndarray = np.ones(6 * len(grasps), bool)
@@ -115,7 +135,10 @@ def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: 
 def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
     """Sets six worlds for each grasp to a state, without gravity."""
     states = [grasp.states[start] for grasp in grasps]
-    objects = [(grasp.object_position, grasp.object_rotation.as_quat(scalar_first=True)) for grasp in grasps]
+    objects = [
+        (grasp.object_position, grasp.object_rotation.as_quat(scalar_first=True))
+        for grasp in grasps
+    ]
 
     def six(rows: Sequence[np.ndarray | float | int]) -> np.ndarray:
         return np.repeat(np.array(rows), 6, 0)
@@ -151,8 +174,12 @@ def _harden(model: mujoco.MjModel) -> None:
         model.geom_solref[geoms], model.geom_solimp[geoms, :3] = solref, solimp
 
 
-def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state, then the pushes."""
+def _script(
+    hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state,
+    then the pushes.
+    """
     pushes = np.tile(PUSH_FORCE * _AXES, (len(grasps), 1))
     # From the grasp the targets are the squeeze at once.
     shares = np.linspace(0.0, 1.0, _STAGE + 1)[1:] if len(stages) > 2 else np.ones(_STAGE)
@@ -166,11 +193,17 @@ def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Itera
         yield rows, pushes
 
 
-def _between(hand: Hand, states: Mapping[str, State], names: tuple[str, str, str], share: float) -> np.ndarray:
-    """(6 + M,) targets at a share between two states, the last of three names; the first is the wrist's base."""
+def _between(
+    hand: Hand, states: Mapping[str, State], names: tuple[str, str, str], share: float
+) -> np.ndarray:
+    """(6 + M,) targets at a share between two states, the last of three names; the first is the
+    wrist's base.
+    """
     base, first, second = (states[name] for name in names)
     position = (1 - share) * first.position + share * second.position
-    turn = first.rotation * Rotation.from_rotvec(share * (first.rotation.inv() * second.rotation).as_rotvec())
+    turn = first.rotation * Rotation.from_rotvec(
+        share * (first.rotation.inv() * second.rotation).as_rotvec()
+    )
     q = (1 - share) * first.q + share * second.q
     slides = base.rotation.inv().apply(position - base.position)
     hinges = (base.rotation.inv() * turn).as_euler("XYZ")
@@ -181,7 +214,11 @@ def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
     """(B,) bool: objects are close to their initial poses."""
     way = np.linalg.norm(np.asarray(state.object_position - origin.object_position), axis=-1)
     cosine = np.abs(np.sum(np.asarray(state.object_quaternion * origin.object_quaternion), -1))
-    return (way < FARTHEST) & (2 * np.arccos(np.minimum(cosine, 1.0)) < MOST_TURNED) & ~np.asarray(state.diverged)
+    return (
+        (way < FARTHEST)
+        & (2 * np.arccos(np.minimum(cosine, 1.0)) < MOST_TURNED)
+        & ~np.asarray(state.diverged)
+    )
 
 
 def _depths(instance: EnvInstance) -> tuple[float, float]:

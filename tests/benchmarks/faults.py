@@ -1,6 +1,8 @@
-"""What a run loses when it is killed, stopped, frozen, out of disk and damaged: every kind of fault, many times.
+"""What a run loses when it is killed, stopped, frozen, out of disk and damaged: every kind of
+fault, many times.
 
-Each kind has a run of its own, which continues after every fault; afterwards `congrasp audit` judges its journals.
+Each kind has a run of its own, which continues after every fault; afterwards `congrasp audit`
+judges its journals.
 """
 
 import contextlib
@@ -33,8 +35,26 @@ from congrasp.services.ops.audit import compare as audit
 
 _RUN = "quickstart"
 _OPTIONS = (
-    *("--updates", "1000000", "--environments", "8", "--rollout-steps", "25", "--checkpoint-every", "2"),
-    *("--objects.count", "2", "--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
+    *(
+        "--updates",
+        "1000000",
+        "--environments",
+        "8",
+        "--rollout-steps",
+        "25",
+        "--checkpoint-every",
+        "2",
+    ),
+    *(
+        "--objects.count",
+        "2",
+        "--objects.families",
+        "box",
+        "--network.hidden",
+        "32",
+        "--network.encoder",
+        "8",
+    ),
     *("--ppo.epochs", "1", "--ppo.minibatches", "2", "--collapse-patience", "0"),
     *("--log-rollout-every", "0", "--episode-every", "1000000", "--metric-writers"),
 )
@@ -48,10 +68,16 @@ _RESTARTS = 4  # deaths of one child after which `congrasp train` is started aga
 
 
 class Run:
-    """A small real run of `congrasp train` in a directory, which can be killed, stopped, resumed and observed."""
+    """A small real run of `congrasp train` in a directory, which can be killed, stopped, resumed
+    and observed.
+    """
 
     def __init__(
-        self, run_dir: pathlib.Path, actors: int, options: Sequence[str] = _OPTIONS, output: int = subprocess.DEVNULL
+        self,
+        run_dir: pathlib.Path,
+        actors: int,
+        options: Sequence[str] = _OPTIONS,
+        output: int = subprocess.DEVNULL,
     ):
         """Starts nothing yet; `output` takes what it prints."""
         self.run_dir, self._count, self._options, self._output = run_dir, actors, options, output
@@ -59,11 +85,23 @@ class Run:
         self.process: psutil.Popen | None = None
 
     def start(self) -> None:
-        """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
-        command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(self.run_dir), *self._options]
+        """Begins the run, or resumes it, and waits until its learner has taken rollouts from all
+        actors.
+        """
+        command = [
+            sys.executable,
+            "-m",
+            "congrasp",
+            "train",
+            "--run-dir",
+            str(self.run_dir),
+            *self._options,
+        ]
         command += ["--actors", str(self._count), "--evaluation", "0"]
         command += ["--resume"] if (self.run_dir / "config.json").exists() else []
-        self.process = psutil.Popen(command, stdout=self._output, stderr=subprocess.STDOUT, text=True)
+        self.process = psutil.Popen(
+            command, stdout=self._output, stderr=subprocess.STDOUT, text=True
+        )
         self._transport = urls.connect(self.until(self._endpoint), "observer", wait=_DEADLINE)
         self.until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
 
@@ -104,7 +142,10 @@ class Run:
         """The run's processes of a role, oldest first."""
         assert self.process is not None
         with contextlib.suppress(psutil.NoSuchProcess):
-            return sorted((c for c in self.process.children() if role in c.cmdline()), key=lambda c: c.create_time())
+            return sorted(
+                (c for c in self.process.children() if role in c.cmdline()),
+                key=lambda c: c.create_time(),
+            )
         return []
 
     def child(self, role: str) -> psutil.Process:
@@ -118,7 +159,9 @@ class Run:
         if not self.alive:
             assert self.process is not None
             output = self.process.communicate()[0] or ""
-            raise CongraspError(f"The run ended by itself. {output}", f"Look at {self.run_dir / 'logs'}.")
+            raise CongraspError(
+                f"The run ended by itself. {output}", f"Look at {self.run_dir / 'logs'}."
+            )
         return seen
 
     def status(self) -> dict[str, Any]:
@@ -130,7 +173,11 @@ class Run:
 
     def _rollouts(self) -> list[int]:
         """Rollouts of each actor that is there."""
-        return [role.get("rollouts", 0) for role in self.status().get("roles", ()) if role["role"] == "actor"]
+        return [
+            role.get("rollouts", 0)
+            for role in self.status().get("roles", ())
+            if role["role"] == "actor"
+        ]
 
     def _endpoint(self) -> str | None:
         """Where the oldest learner listens."""
@@ -143,7 +190,9 @@ def until(look: Callable[[], Any]) -> Any:
     deadline = time.monotonic() + _DEADLINE
     while not (seen := look()):
         if time.monotonic() > deadline:
-            raise CongraspError(f"Nothing happened within {_DEADLINE:g} s.", "Is the machine busy otherwise?")
+            raise CongraspError(
+                f"Nothing happened within {_DEADLINE:g} s.", "Is the machine busy otherwise?"
+            )
         time.sleep(0.02)
     return seen
 
@@ -166,17 +215,19 @@ class Result(NamedTuple):
 
 
 def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed: int = 0) -> int:
-    """What kills, stops, freezes, full disks and damaged files cost a real run of what it had acknowledged: nothing.
+    """What kills, stops, freezes, full disks and damaged files cost a real run of what it had
+    acknowledged: nothing.
 
-    Every kind of fault has a run of its own, whose journals are audited. The exit code is 1 if anything was lost,
-    duplicated, unmatched or corrupted.
+    Every kind of fault has a run of its own, whose journals are audited. The exit code is 1 if
+    anything was lost, duplicated, unmatched or corrupted.
 
     Args:
       actors: Actor processes.
       repeats: Faults of each kind.
-      kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner, freeze-actor,
-        full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts), damage-journal,
-        damage-policy. All of them if none is named.
+      kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner,
+      freeze-actor,
+        full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts),
+        damage-journal, damage-policy. All of them if none is named.
       seed: Seed of the moments, and of the bits that are flipped.
 
     Examples:
@@ -184,18 +235,29 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
       python -m tests.benchmarks faults --repeats 5
     """
     if unknown := set(kinds) - FAULTS.keys():
-        raise CongraspError(f"There is no fault '{min(unknown)}'.", f"Choose from: {', '.join(FAULTS)}.")
+        raise CongraspError(
+            f"There is no fault '{min(unknown)}'.", f"Choose from: {', '.join(FAULTS)}."
+        )
     console = Console(width=None if sys.stdout.isatty() else 140)
     results: list[Result] = []
     for kind in kinds or FAULTS:
         disk = _DISK if kind == "full-disk" else 0
-        with tempfile.TemporaryDirectory(prefix="congrasp-") as folder, small_disk(folder, disk) as there:
+        with (
+            tempfile.TemporaryDirectory(prefix="congrasp-") as folder,
+            small_disk(folder, disk) as there,
+        ):
             if not there:
                 console.print(f"{kind}: left out, for file systems cannot be mounted here.")
                 continue
-            results.append(_measure(kind, Run(pathlib.Path(folder, "run"), actors), repeats, random.Random(seed)))
+            results.append(
+                _measure(
+                    kind, Run(pathlib.Path(folder, "run"), actors), repeats, random.Random(seed)
+                )
+            )
         last = results[-1]
-        console.print(f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}")
+        console.print(
+            f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}"
+        )
     console.print(_table(results, actors))
     return 0 if all(result.fine for result in results) else 1
 
@@ -251,7 +313,9 @@ def _kill_child(role: str) -> Fault:
 
 
 def _freeze_child(role: str) -> Fault:
-    """Freezes the oldest process of a role for some seconds; its connections stay open and silent."""
+    """Freezes the oldest process of a role for some seconds; its connections stay open and
+    silent.
+    """
 
     def freeze(run: Run, rng: random.Random) -> None:
         child = run.child(role)
@@ -263,7 +327,9 @@ def _freeze_child(role: str) -> Fault:
 
 
 def _fill_disk(run: Run, rng: random.Random) -> None:
-    """Lets the disk of the run be full for some seconds, and kills all processes at the end of every second time."""
+    """Lets the disk of the run be full for some seconds, and kills all processes at the end of
+    every second time.
+    """
     filler = fill(run.run_dir.parent)
     time.sleep(_FULL)
     if rng.random() < 0.5:
@@ -272,7 +338,9 @@ def _fill_disk(run: Run, rng: random.Random) -> None:
 
 
 def _damage(pattern: str, newest: int) -> Fault:
-    """Kills all processes, and flips a bit in one of the `newest` files of a pattern, by their names."""
+    """Kills all processes, and flips a bit in one of the `newest` files of a pattern, by their
+    names.
+    """
 
     def damage(run: Run, rng: random.Random) -> None:
         until(lambda: list(run.run_dir.glob(pattern)))
@@ -305,9 +373,14 @@ FAULTS: dict[str, Fault] = {
 
 @contextlib.contextmanager
 def small_disk(folder: str, size: int) -> Iterator[bool]:
-    """Makes a folder a disk of `size` bytes, if that is above 0; yields False if that cannot be mounted."""
+    """Makes a folder a disk of `size` bytes, if that is above 0; yields False if that cannot be
+    mounted.
+    """
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
-    if size and (not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode):
+    if size and (
+        not shutil.which("mount")
+        or subprocess.run(command, capture_output=True, timeout=10).returncode
+    ):
         yield False
         return
     try:
@@ -338,7 +411,15 @@ def _rest(result: Result) -> str:
 
 def _table(results: Sequence[Result], actors: int) -> Table:
     """A row for each kind."""
-    columns = ("repeats", "accepted", "survived", *KINDS, "damaged on disk", "median, s", "longest, s")
+    columns = (
+        "repeats",
+        "accepted",
+        "survived",
+        *KINDS,
+        "damaged on disk",
+        "median, s",
+        "longest, s",
+    )
     table = Table("fault", title=f"{actors} actors")
     for column in columns:
         table.add_column(column, justify="right")

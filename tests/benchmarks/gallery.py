@@ -1,4 +1,6 @@
-"""The gallery of docs/gallery: grasps of scanned and generated objects under each constraint, by three hands."""
+"""The gallery of docs/gallery: grasps of scanned and generated objects under each constraint, by
+three hands.
+"""
 
 import pathlib
 from collections.abc import Iterator
@@ -53,7 +55,13 @@ class Shown(NamedTuple):
 
 
 SHOWN = (
-    Shown("mug", "examples/mug.obj", rest="upright", options={"affordance": "examples/handle.obj"}, film=True),
+    Shown(
+        "mug",
+        "examples/mug.obj",
+        rest="upright",
+        options={"affordance": "examples/handle.obj"},
+        film=True,
+    ),
     Shown("drill", "drill:2", options={"affordance": "grip"}),
     Shown("wine-glass", "wineglass", rest="upright"),
     Shown("water-bottle", "waterbottle", rest="upright"),
@@ -69,11 +77,19 @@ SHOWN = (
     Shown("stapler", "stapler", options={"force": "5"}),
     Shown("coffee-mug", "coffeemug", rest="upright"),
     Shown("hollow-mug", "hollow_mug:7", options={"affordance": "handle"}),
-    Shown("bottle-pose", "waterbottle", options={"pose": "{out}/water-bottle/waterbottle/grasp.npz"}, rest="upright"),
+    Shown(
+        "bottle-pose",
+        "waterbottle",
+        options={"pose": "{out}/water-bottle/waterbottle/grasp.npz"},
+        rest="upright",
+    ),
     Shown(
         "bulb-path",
         "lightbulb",
-        options={"trajectory": "{out}/light-bulb/lightbulb/grasp.npz", "fingers": "thumb index middle"},
+        options={
+            "trajectory": "{out}/light-bulb/lightbulb/grasp.npz",
+            "fingers": "thumb index middle",
+        },
     ),
     Shown("allegro-bottle", "waterbottle", "allegro", rest="upright"),
     Shown("allegro-mug", "coffeemug", "allegro", rest="upright"),
@@ -109,8 +125,12 @@ def gallery(
     return 0 if all(result.held for result in results) else 1
 
 
-def _results(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempts: int) -> Iterator[Result]:
-    """Grasps what is not finished in `work`, and draws pictures, films and the page in `out`; yields each result."""
+def _results(
+    scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempts: int
+) -> Iterator[Result]:
+    """Grasps what is not finished in `work`, and draws pictures, films and the page in `out`;
+    yields each result.
+    """
     graspers: dict[str, Grasper] = {}
     out.mkdir(parents=True, exist_ok=True)
     rows = []
@@ -143,7 +163,9 @@ def _results(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempt
         if shown.film:
             save_film(out / f"{shown.name}.gif", episode)
         held = f"{result.facts['attempts_held']} of {result.facts['attempts']}"
-        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{held} |\n")
+        rows.append(
+            f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{held} |\n"
+        )
     (out / "index.md").write_text(_HEAD + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
@@ -160,7 +182,11 @@ def _command(shown: Shown, scan: pathlib.Path) -> str:
     options = {"hand": shown.hand, "rest": shown.rest, **shown.options}
     for name, value in options.items():
         if value and (name, value) != ("hand", "human"):
-            words.append(f"--{name}" if value is True else f"--{name} {_given(value, pathlib.Path('runs/gallery'))}")
+            words.append(
+                f"--{name}"
+                if value is True
+                else f"--{name} {_given(value, pathlib.Path('runs/gallery'))}"
+            )
     return " ".join([*words, f"--approach {_PHASES.approach:g} --lift {_PHASES.lift:g}"])
 
 
@@ -173,11 +199,16 @@ def save_film(path: pathlib.Path, episode: Message) -> None:
     begin, lift = grasp_steps(episode)
     view = views(episode, [lift, steps[-1]])[0]
     # The hand comes into the picture as it reaches.
-    camera = camera_of(episode, [step for step in steps if step >= begin], _FILM_SIZE[0] / _FILM_SIZE[1], view)
+    camera = camera_of(
+        episode, [step for step in steps if step >= begin], _FILM_SIZE[0] / _FILM_SIZE[1], view
+    )
     frames = [
-        Image.fromarray(frame) for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
+        Image.fromarray(frame)
+        for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
     ]
     several = np.hstack([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 8)]])
     palette = Image.fromarray(several).quantize(_COLOURS, dither=Image.Dither.NONE)
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=round(1000 / _FILM_FPS), loop=0)
+    drawn[0].save(
+        path, save_all=True, append_images=drawn[1:], duration=round(1000 / _FILM_FPS), loop=0
+    )

@@ -26,10 +26,13 @@ from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.plan import protocol, two_seconds
 
 
-def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:
+def measures(
+    engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5
+) -> int:
     """Seconds of an evaluation's episodes with measures of plausibility and without.
 
-    The pretrained human policy grasps held-out procedural objects. Lifts and pushes after the hold are not part of it.
+    The pretrained human policy grasps held-out procedural objects. Lifts and pushes after the hold
+    are not part of it.
 
     Args:
       engine: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
@@ -78,11 +81,17 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
     workers = [worker(lambda scene, index, data: None), worker(plausibility.sample)]
     for one in workers:
         run(one)
-    timed = np.array([[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)])
-    table = Table(title=f"{physics}: {environments} episodes of {steps} control steps, medians of {repeats}")
+    timed = np.array(
+        [[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)]
+    )
+    table = Table(
+        title=f"{physics}: {environments} episodes of {steps} control steps, medians of {repeats}"
+    )
     for column in ("", "without, s", "with, s", "ratio"):
         table.add_column(column, justify="left" if not column else "right")
-    for name, (without, measured) in zip(("wall clock", "processor"), np.median(timed, 0).T, strict=True):
+    for name, (without, measured) in zip(
+        ("wall clock", "processor"), np.median(timed, 0).T, strict=True
+    ):
         table.add_row(name, f"{without:.2f}", f"{measured:.2f}", f"{measured / without:.2f}")
     console.print(table)
     for one in workers:

@@ -1,4 +1,6 @@
-"""What the number of an object's convex pieces and vertices costs a physics step, and what it gains in shape."""
+"""What the number of an object's convex pieces and vertices costs a physics step, and what it gains
+in shape.
+"""
 
 import dataclasses
 import pathlib
@@ -24,18 +26,23 @@ _CLOSING = 100
 _STEPS = 50
 """Control steps that are timed."""
 _DEFINITION = (
-    "mj_step on one thread, in processor time, with the hand closed around each object in turn; ratio to the first "
+    "mj_step on one thread, in processor time, with the hand closed around each object in turn; "
+    "ratio to the first "
     "row. Contacts and error are means over the objects; the error is against the object's mesh."
 )
 
 
 def coarser(obj: GraspObject, max_pieces: int, max_vertices: int) -> GraspObject:
-    """The object with its mesh pieces joined to at most `max_pieces` of at most `max_vertices` vertices."""
+    """The object with its mesh pieces joined to at most `max_pieces` of at most `max_vertices`
+    vertices.
+    """
     vertices = [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces]
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
     volume = None if obj.volume_error is None else enclosed(triangles).volume
     joined = merge(vertices, max_pieces, triangles, volume)
-    pieces = tuple(Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(piece, max_vertices)) for piece in joined)
+    pieces = tuple(
+        Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(piece, max_vertices)) for piece in joined
+    )
     return dataclasses.replace(obj, pieces=pieces)
 
 
@@ -46,7 +53,8 @@ def pieces(
     vertices: tuple[int, ...] = (32, 64),
     repeats: int = 5,
 ) -> int:
-    """What convex pieces and their vertices cost a physics step (MuJoCo C), and what they gain in shape.
+    """What convex pieces and their vertices cost a physics step (MuJoCo C), and what they gain in
+    shape.
 
     Args:
       objects: Folder of objects or meshes; their pieces are joined to fewer for each budget.
@@ -63,25 +71,41 @@ def pieces(
     budgets = [(p, v) for p in counts for v in vertices]
     variants = [[coarser(obj, p, v) for obj in found] for p, v in budgets]
     held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
-    seconds = np.array([[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)])
+    seconds = np.array(
+        [[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)]
+    )
     per_step = np.median(seconds, axis=0).sum(-1) / (len(found) * _STEPS * task.substeps)
     table = Table(title=f"{len(found)} objects, {hand} hand, {repeats} repeats")
-    for column in ("pieces", "vertices", "pieces used", "contacts", "surface error", "physics steps/s", "ratio"):
+    for column in (
+        "pieces",
+        "vertices",
+        "pieces used",
+        "contacts",
+        "surface error",
+        "physics steps/s",
+        "ratio",
+    ):
         table.add_column(column, justify="right")
     for i, (p, v) in enumerate(budgets):
         used = np.mean([len(obj.pieces) for obj in variants[i]])
         contacts = np.mean([data.ncon for _, data in held[i]])
         error = np.mean([_error(obj) for obj in variants[i]])
         cost = [f"{1 / per_step[i]:,.0f}", f"{per_step[0] / per_step[i]:.2f}"]
-        table.add_row(str(p), str(v), f"{used:.1f}", f"{contacts:.1f}", f"{1000 * error:.1f} mm", *cost)
+        table.add_row(
+            str(p), str(v), f"{used:.1f}", f"{contacts:.1f}", f"{1000 * error:.1f} mm", *cost
+        )
     console = Console()
     console.print(table)
     console.print(_DEFINITION)
     return 0
 
 
-def _closed_around(hand: Hand, task: TaskConfig, obj: GraspObject) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """A scene without table in which the fingers have closed around the object, which stays between palm and tips."""
+def _closed_around(
+    hand: Hand, task: TaskConfig, obj: GraspObject
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """A scene without table in which the fingers have closed around the object, which stays between
+    palm and tips.
+    """
     model = compile_scene(hand, task, obj)
     where, data = addresses(model, hand), mujoco.MjData(model)
     model.body_pos[where.base_body] = 0.0
@@ -110,4 +134,6 @@ def _error(obj: GraspObject) -> float:
     """Distance of the pieces' surface from the mesh's, m."""
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
     closed = obj.volume_error is not None
-    return fidelity(triangles, [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces], closed).surface
+    return fidelity(
+        triangles, [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces], closed
+    ).surface

@@ -1,4 +1,6 @@
-"""The ROS 2 node's loop over Zenoh: a simulated hand on a wrist, the node and the policy server as processes."""
+"""The ROS 2 node's loop over Zenoh: a simulated hand on a wrist, the node and the policy server as
+processes.
+"""
 
 import contextlib
 import dataclasses
@@ -43,14 +45,17 @@ _DROP = 0.03
 
 
 class DepthCamera:
-    """The camera of an episode as drawn in training (`common.task.camera`), which takes images throughout.
+    """The camera of an episode as drawn in training (`common.task.camera`), which takes images
+    throughout.
 
     Attributes:
       delay: seconds from an image to its arrival.
     """
 
     def __init__(self, robot: Any, task: TaskConfig, surface: np.ndarray, episode: int):
-        """Draws the camera and takes the first image, of an object with surface points (N, 3) in its frame, m."""
+        """Draws the camera and takes the first image, of an object with surface points (N, 3) in
+        its frame, m.
+        """
         config = dataclasses.replace(task.sensing, single_image=0.0)
         sensors = sensing.draw_sensors(config, task.control_dt, jax.random.key(episode), 1)
         self._surface = Surface(surface[None].astype(np.float32), np.zeros((1, len(surface)), bool))
@@ -63,21 +68,28 @@ class DepthCamera:
         self.delay = task.control_dt * int(sensors.delay[0])
 
     def look(self, state: dict[str, np.ndarray]) -> np.ndarray | None:
-        """Advances by a control step to the robot's state; returns the points (N, 3) of an image that arrives, m."""
+        """Advances by a control step to the robot's state; returns the points (N, 3) of an image
+        that arrives, m.
+        """
         self._steps += 1
-        one = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), state, self._base))
+        one = jax.tree.map(
+            lambda x: np.asarray(x)[None], (np.int32(self._steps), state, self._base)
+        )
         self._camera = _look(self._hand, self._camera, *one, self._surface)
         before, self._shown = self._shown, np.asarray(self._camera.cloud.points[0])
         return None if np.array_equal(before, self._shown) else self._shown
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _look(hand: Any, seen: Any, time: Any, state: dict[str, Any], base: dict[str, Any], surface: Surface) -> Any:
+def _look(
+    hand: Any, seen: Any, time: Any, state: dict[str, Any], base: dict[str, Any], surface: Surface
+) -> Any:
     return camera.look(hand, seen, time, SimpleNamespace(**state), SimpleNamespace(**base), surface)
 
 
 class Rig:
-    """A simulated hand whose joints, wrist and object are topics, and which follows the topics of commands.
+    """A simulated hand whose joints, wrist and object are topics, and which follows the topics of
+    commands.
 
     A policy with a camera gets clouds of the object instead of its pose.
 
@@ -106,10 +118,16 @@ class Rig:
         self._endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._session = bare_session("peer", listen=self._endpoint)
         topics = ("joint_command", "wrist_command")
-        self._heard = {topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics}
+        self._heard = {
+            topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics
+        }
         self._node: subprocess.Popen[bytes] | None = None
         self._ticker, self.commands, self._highest = congrasp.Ticker(100.0), 0, -np.inf
-        self._target, self._begun = (np.array(self.robot.request.q), np.zeros(6)), 0  # ns, of the episode's begin
+        # Ns, of the episode's begin
+        self._target, self._begun = (
+            (np.array(self.robot.request.q), np.zeros(6)),
+            0,
+        )
 
     @property
     def lines(self) -> list[str]:
@@ -128,11 +146,27 @@ class Rig:
             turn = Rotation.from_quat(self.robot.request.object_pose[1], scalar_first=True)
             heading, thing = turn.apply(heading), ["--cloud-topic", "points"]
         direction = " ".join(f"{x:.6f}" for x in heading)
-        command = [sys.executable, str(EXAMPLES / "ros2_node.py"), *thing, "--zenoh", self._endpoint]
-        command += ["--connect", server, "--heading", direction, "--hand", self._task.hand, *options]
+        command = [
+            sys.executable,
+            str(EXAMPLES / "ros2_node.py"),
+            *thing,
+            "--zenoh",
+            self._endpoint,
+        ]
+        command += [
+            "--connect",
+            server,
+            "--heading",
+            direction,
+            "--hand",
+            self._task.hand,
+            *options,
+        ]
         with (self._folder / "node.txt").open("wb") as output:
             environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
-            self._node = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+            self._node = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, env=environment
+            )
 
     def end(self) -> None:
         """Kills the node."""
@@ -171,7 +205,9 @@ class Rig:
         self._send_joints(state["q"])
         self._send_pose("wrist_pose", self._base[0] + self._base[1].apply(state["u"][:3]), turn)
         if self._camera is None:
-            self._send_pose("object_pose", state["object_position"] + thing.apply(self._origin), thing)
+            self._send_pose(
+                "object_pose", state["object_position"] + thing.apply(self._origin), thing
+            )
         elif (points := self._camera.look(state)) is not None:
             self._send_points(points, self._camera.delay)
         joints, wrist = self._newest("joint_command", JOINTS), self._newest("wrist_command", POSE)
@@ -190,10 +226,15 @@ class Rig:
         self._highest = max(self._highest, self.lifted)
 
     def _newest(self, topic: str, kind: str) -> Any:
-        """The newest command since the last call; None if there is none, or it is of the node before."""
+        """The newest command since the last call; None if there is none, or it is of the node
+        before.
+        """
         sample = self._heard[topic].try_recv()
         message = sample and STORE.deserialize_cdr(sample.payload.to_bytes(), kind)
-        if message is None or message.header.stamp.sec * 10**9 + message.header.stamp.nanosec < self._begun:
+        if (
+            message is None
+            or message.header.stamp.sec * 10**9 + message.header.stamp.nanosec < self._begun
+        ):
             return None
         return message
 
@@ -210,13 +251,19 @@ class Rig:
     def _send_pose(self, topic: str, position: np.ndarray, rotation: Rotation) -> None:
         types, (x, y, z, w) = STORE.types, rotation.as_quat().tolist()
         place = types["geometry_msgs/msg/Point"](*np.asarray(position, float).tolist())
-        pose = types["geometry_msgs/msg/Pose"](place, types["geometry_msgs/msg/Quaternion"](x, y, z, w))
-        self._session.put(topic, bytes(STORE.serialize_cdr(types[POSE](self._header(), pose), POSE)))
+        pose = types["geometry_msgs/msg/Pose"](
+            place, types["geometry_msgs/msg/Quaternion"](x, y, z, w)
+        )
+        self._session.put(
+            topic, bytes(STORE.serialize_cdr(types[POSE](self._header(), pose), POSE))
+        )
 
     def _send_points(self, points: np.ndarray, age: float) -> None:
         fields = [STORE.types[FIELD](name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
         data, size = points.astype("<f4").view(np.uint8).ravel(), len(points)
-        message = STORE.types[CLOUD](self._header(age), 1, size, fields, False, 12, 12 * size, data, True)
+        message = STORE.types[CLOUD](
+            self._header(age), 1, size, fields, False, 12, 12 * size, data, True
+        )
         self._session.put("points", bytes(STORE.serialize_cdr(message, CLOUD)))
 
 
@@ -226,7 +273,8 @@ def robot(
     student: str = "allegro-student",
     out: pathlib.Path = pathlib.Path("runs/robot"),
 ) -> int:
-    """The ROS 2 node over Zenoh against a simulated hand that lifts an object, while the policy server is killed.
+    """The ROS 2 node over Zenoh against a simulated hand that lifts an object, while the policy
+    server is killed.
 
     The policy is a student, because the topics have neither contact forces nor velocities.
 
@@ -253,7 +301,9 @@ def robot(
         try:
             while time.monotonic() < end:
                 with congrasp.PolicyClient(server.url, hand=task.hand, wait=180.0) as client:
-                    client.metadata()  # the node itself does not wait for a server that is still compiling
+                    # The node itself does not wait for a server that is still
+                    # compiling
+                    client.metadata()
                 rig.begin(server.url, "--lift", "0.1")
                 counts["episodes"] += 1
                 rig.run(lambda: "follow" in "\n".join(rig.lines), 240.0)
@@ -271,6 +321,12 @@ def robot(
                     server.start()
         finally:
             server.kill()
-    shares = {"beyond": rig.robot.beyond, "fastest": rig.robot.fastest, "strongest": rig.robot.strongest}
-    print(json.dumps({**counts, **{name: round(float(x), 4) for name, x in shares.items()}}, indent=1))
+    shares = {
+        "beyond": rig.robot.beyond,
+        "fastest": rig.robot.fastest,
+        "strongest": rig.robot.strongest,
+    }
+    print(
+        json.dumps({**counts, **{name: round(float(x), 4) for name, x in shares.items()}}, indent=1)
+    )
     return int(counts["dropped after a kill"] > 0 or rig.robot.beyond > 0.0)

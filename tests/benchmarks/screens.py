@@ -1,4 +1,6 @@
-"""The pictures of the studio in docs/images: the page in a browser, with the pretrained policies."""
+"""The pictures of the studio in docs/images: the page in a browser, with the pretrained
+policies.
+"""
 
 import contextlib
 import pathlib
@@ -17,12 +19,14 @@ _SCRUB, _SCRUB_RUN = 0.32, 0.8
 """Shares of a motion, and of an episode of a training, at which they are shown."""
 
 
-def screens(run: pathlib.Path | None = None, out: pathlib.Path = pathlib.Path("docs/images"), rest: int = 2) -> int:
+def screens(
+    run: pathlib.Path | None = None, out: pathlib.Path = pathlib.Path("docs/images"), rest: int = 2
+) -> int:
     """Screenshots of the studio: constraints, a motion, two motions, on a phone, and a training.
 
     Args:
-      run: Folder of a finished training (`make quickstart` leaves one); without it that picture stays.
-      out: Folder for the pictures.
+      run: Folder of a finished training (`make quickstart` leaves one); without it that picture
+      stays. out: Folder for the pictures.
       rest: Resting pose of the mug, counted from 0.
 
     Examples:
@@ -39,7 +43,10 @@ def screens(run: pathlib.Path | None = None, out: pathlib.Path = pathlib.Path("d
             page.wait_for_selector(f"[data-rest='{rest}'][aria-pressed=true]")
             _studio(page, out)
             phone = _opened(browser, url, _PHONE)
-            loaded = "() => [...document.querySelectorAll('#rests img')].every((one) => one.naturalWidth)"
+            loaded = (
+                "() => [...document.querySelectorAll('#rests img')].every((one) => "
+                "one.naturalWidth)"
+            )
             phone.wait_for_function(loaded)
             phone.screenshot(path=out / "studio-phone.png")
     return 0
@@ -52,7 +59,9 @@ def _served(*arguments: str) -> Iterator[str]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout
         try:
-            yield next(found[0] for line in server.stdout if (found := re.search(r"http://\S+", line)))
+            yield next(
+                found[0] for line in server.stdout if (found := re.search(r"http://\S+", line))
+            )
         finally:
             server.terminate()
 
@@ -94,12 +103,18 @@ def _studio(page: Any, out: pathlib.Path) -> None:
 
 
 def _grasped(page: Any) -> str:
-    """Grasps until the object is held, and stops the motion in the grasp; returns the motion's number."""
+    """Grasps until the object is held, and stops the motion in the grasp; returns the motion's
+    number.
+    """
     for _ in range(_HELD):
         before = {item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()}
         page.click("#grasp")
-        page.wait_for_function("(n) => document.querySelectorAll('[data-motion]').length > n", arg=len(before))
-        (made,) = {item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()} - before
+        page.wait_for_function(
+            "(n) => document.querySelectorAll('[data-motion]').length > n", arg=len(before)
+        )
+        (made,) = {
+            item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()
+        } - before
         page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
         if "not held" not in page.inner_text("#result") and "held" in page.inner_text("#result"):
             break

@@ -1,4 +1,6 @@
-"""Grasps of a policy with all measurements of the simulation, without some of them, and with late servos."""
+"""Grasps of a policy with all measurements of the simulation, without some of them, and with late
+servos.
+"""
 
 import collections
 from typing import Any, NamedTuple
@@ -36,7 +38,8 @@ CONDITIONS = {
 
 
 def sensors(policies: tuple[str, ...] = ("allegro", "allegro-student"), episodes: int = 24) -> int:
-    """Grasps with all measurements, without contact forces, and without velocities either, in simulated time.
+    """Grasps with all measurements, without contact forces, and without velocities either, in
+    simulated time.
 
     Counts the objects that are held for two seconds without the table.
 
@@ -65,7 +68,9 @@ def sensors(policies: tuple[str, ...] = ("allegro", "allegro-student"), episodes
     return 0
 
 
-def _held(robot: Any, policy: congrasp.Policy, condition: Condition, task: TaskConfig, hold: int) -> bool:
+def _held(
+    robot: Any, policy: congrasp.Policy, condition: Condition, task: TaskConfig, hold: int
+) -> bool:
     """Runs an episode in simulated time; returns whether the object is held at its end.
 
     The table is removed later than in training by half, because late targets slow the wrist down.
@@ -79,10 +84,16 @@ def _held(robot: Any, policy: congrasp.Policy, condition: Condition, task: TaskC
         if step == approach:
             height = robot.height
             robot.remove_table()
-        state = {name: value for name, value in robot.state().items() if name not in condition.lacking}
+        state = {
+            name: value for name, value in robot.state().items() if name not in condition.lacking
+        }
         clock = np.asarray(step / 1.5 if step < approach else step - approach + task.approach_steps)
         answer = policy.act({**state, **targets, "time": clock})
         targets = {"q_target": answer.q_target, "u_target": answer.u_target}
         waiting.append(targets)
-        robot.move(congrasp.Command(*(followed := waiting.popleft()).values(), *followed.values(), "follow", answer))
+        robot.move(
+            congrasp.Command(
+                *(followed := waiting.popleft()).values(), *followed.values(), "follow", answer
+            )
+        )
     return bool(robot.height > height - task.drop_height)

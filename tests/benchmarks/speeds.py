@@ -1,4 +1,6 @@
-"""Wrist speed over time of grasps with a reach, and the range of human reaches: one sheet and its figures."""
+"""Wrist speed over time of grasps with a reach, and the range of human reaches: one sheet and its
+figures.
+"""
 
 import pathlib
 from typing import Any, NamedTuple
@@ -59,7 +61,9 @@ def profile(motion: GraspMotion) -> Profile:
     slow = np.flatnonzero(speed[speed.argmax() :] < _STILL)
     arrival = int(speed.argmax() + slow[0]) if len(slow) else len(speed)
     peaks, _ = find_peaks(np.append(0.0, speed[:arrival]), prominence=_PROMINENT)
-    return Profile(speed, dt, phases["grasp"], arrival * dt, float(steps[:arrival].sum()), len(peaks))
+    return Profile(
+        speed, dt, phases["grasp"], arrival * dt, float(steps[:arrival].sum()), len(peaks)
+    )
 
 
 def speeds(
@@ -80,19 +84,27 @@ def speeds(
     """
     files = sorted(grasps.glob(f"*/*/{MOTION}"))[:count]
     if not files:
-        raise CongraspError(f"There is no {MOTION} in the folders of {grasps}.", "Run the gallery first.")
+        raise CongraspError(
+            f"There is no {MOTION} in the folders of {grasps}.", "Run the gallery first."
+        )
     found = {file.parent.parent.name: profile(load_motion(file)) for file in files}
     rows = -(-len(found) // _COLUMNS)
     figure = new_figure(
-        12, 2.3 * rows + 0.6, "Wrist speed from the start of the reach to the lift; human reaches green"
+        12,
+        2.3 * rows + 0.6,
+        "Wrist speed from the start of the reach to the lift; human reaches green",
     )
     for i, (name, one) in enumerate(found.items(), 1):
         _draw(figure.add_subplot(rows, _COLUMNS, i), name, one)
     save(figure, out.with_suffix(""), [out.suffix[1:]])
-    print("| grasp | way | peak | at | peaks | after the handover | arrival |\n|---|---|---|---|---|---|---|")
+    print(
+        "| grasp | way | peak | at | peaks | after the handover | arrival "
+        "|\n|---|---|---|---|---|---|---|"
+    )
     for name, one in found.items():
         print(
-            f"| {name} | {one.way:.2f} m | {one.peak:.2f} m/s | {100 * one.at:.0f} % | {one.peaks} | "
+            f"| {name} | {one.way:.2f} m | {one.peak:.2f} m/s | {100 * one.at:.0f} % | {one.peaks} "
+            f"| "
             f"{one.after:.2f} m/s | {one.arrival:.2f} s |"
         )
     return 0

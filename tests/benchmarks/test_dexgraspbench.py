@@ -1,4 +1,6 @@
-"""Exported grasps are where DexGraspBench's own kinematics has them, press as the policy did, and are examined."""
+"""Exported grasps are where DexGraspBench's own kinematics has them, press as the policy did, and
+are examined.
+"""
 
 import dataclasses
 import json
@@ -19,9 +21,21 @@ from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses
 from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import trials
-from congrasp.services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
+from congrasp.services.export.motion_file import (
+    GraspMotion,
+    hand_arrays,
+    motion_of_episode,
+    save_motion,
+)
 from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
-from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State, benchmark_grasp, read_grasps, squeezed
+from tests.benchmarks.dexgraspbench_grasps import (
+    STATES,
+    Grasp,
+    State,
+    benchmark_grasp,
+    read_grasps,
+    squeezed,
+)
 from tests.benchmarks.dexgraspbench_hands import BENCHMARK_HANDS, benchmarked, match_hand
 from tests.benchmarks.dexgraspbench_replay import replayed
 from tests.docs.test_docs import ROOT
@@ -31,8 +45,9 @@ from tests.services.export.test_motion import posed
 T = 6
 HAND = get_hand("allegro")
 PLAIN = (1, 0, 0, 0)
-# The bodies of MuJoCo Menagerie's wonik_allegro/right_hand.xml and shadow_hand/right_hand.xml without the forearm, as
-# the benchmark has them: name, place and quaternion in the parent's frame, and axis of the joint.
+# The bodies of MuJoCo Menagerie's wonik_allegro/right_hand.xml and shadow_hand/right_hand.xml
+# without the forearm, as the benchmark has them: name, place and quaternion in the parent's frame,
+# and axis of the joint.
 LEAN = 0.0436194
 ALLEGRO = [
     [
@@ -48,15 +63,30 @@ ALLEGRO = [
     )
 ] + [
     [
-        ("thj0", (-0.0182, 0.019333, -0.045987), (0.477714, -0.521334, -0.521334, -0.477714), (-1, 0, 0)),
+        (
+            "thj0",
+            (-0.0182, 0.019333, -0.045987),
+            (0.477714, -0.521334, -0.521334, -0.477714),
+            (-1, 0, 0),
+        ),
         ("thj1", (-0.027, 0.005, 0.0399), PLAIN, (0, 0, 1)),
         ("thj2", (0, 0, 0.0177), PLAIN, (0, 1, 0)),
         ("thj3", (0, 0, 0.0514), PLAIN, (0, 1, 0)),
     ]
 ]
-# Its collision geoms in the bodies' frames: boxes (half extents, place), at the tips capsules (radius, half length).
-PHALANX = [(0.0098, 0.01375, 0.0082), (0.0098, 0.01375, 0.027), (0.0098, 0.01375, 0.0192), (0.0098, 0.01375, 0.008)]
-BOXES = {f"{name}j{i}": (size, (0, 0, size[2])) for name in ("ff", "mf", "rf") for i, size in enumerate(PHALANX)} | {
+# Its collision geoms in the bodies' frames: boxes (half extents, place), at the tips capsules
+# (radius, half length).
+PHALANX = [
+    (0.0098, 0.01375, 0.0082),
+    (0.0098, 0.01375, 0.027),
+    (0.0098, 0.01375, 0.0192),
+    (0.0098, 0.01375, 0.008),
+]
+BOXES = {
+    f"{name}j{i}": (size, (0, 0, size[2]))
+    for name in ("ff", "mf", "rf")
+    for i, size in enumerate(PHALANX)
+} | {
     "thj0": ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
     "thj1": ((0.0098, 0.01375, 0.00885), (0, 0, 0.00885)),
     "thj2": ((0.0098, 0.01375, 0.0257), (0, 0, 0.0257)),
@@ -80,7 +110,10 @@ SHADOW = [
     shadow_finger("FF", (0.033, 0, 0.095), -1),
     shadow_finger("MF", (0.011, 0, 0.099), -1),
     shadow_finger("RF", (-0.011, 0, 0.095), 1),
-    [("rh_LFJ5", (-0.033, 0, 0.02071), PLAIN, (0.573576, 0, 0.819152)), *shadow_finger("LF", (0, 0, 0.06579), 1)],
+    [
+        ("rh_LFJ5", (-0.033, 0, 0.02071), PLAIN, (0.573576, 0, 0.819152)),
+        *shadow_finger("LF", (0, 0, 0.06579), 1),
+    ],
     [
         ("rh_THJ5", (0.034, -0.00858, 0.029), (0.92388, 0, 0.382683, 0), (0, 0, -1)),
         ("rh_THJ4", (0, 0, 0), PLAIN, (1, 0, 0)),
@@ -149,7 +182,9 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_pat
     data.qpos[:] = arrays["grasp_qpos"]
     mujoco.mj_kinematics(model, data)
     wrist = Rotation.from_quat(motion.wrist_quaternion[-1], scalar_first=True)
-    tips = np.asarray(jax.jit(lambda q: keypoints(HAND, link_transforms(HAND, q)))(motion.joint_position[-1]))
+    tips = np.asarray(
+        jax.jit(lambda q: keypoints(HAND, link_transforms(HAND, q)))(motion.joint_position[-1])
+    )
     tips = tips[len(HAND.links) :]
     ours = wrist.apply(tips) + motion.wrist_position[-1]
     theirs = [
@@ -158,23 +193,36 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_pat
     ]
     assert [HAND.fingers[i] for i in range(4)] == ["thumb", "index", "middle", "ring"]
     assert np.linalg.norm(ours - theirs, axis=-1).max() < 1e-4
-    assert np.linalg.norm(ours - np.roll(theirs, 1, 0), axis=-1).min() > 1e-2  # another order would be seen
+    # Another order would be seen
+    assert np.linalg.norm(ours - np.roll(theirs, 1, 0), axis=-1).min() > 1e-2
     # The object's file frame: a point of the file is where the motion has it.
-    turn, place = Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True), arrays["obj_pose"][:3]
+    turn, place = (
+        Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True),
+        arrays["obj_pose"][:3],
+    )
     point = np.array([0.1, -0.2, 0.3])
     own = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
     expected = own.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
-    np.testing.assert_allclose(turn.apply(float(arrays["obj_scale"]) * point) + place, expected, atol=1e-6)
+    np.testing.assert_allclose(
+        turn.apply(float(arrays["obj_scale"]) * point) + place, expected, atol=1e-6
+    )
 
 
 def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
     match = match_hand(motion)
-    for link, theirs in match.solids(HAND.joint_links).items():  # the hand that grasps has them, too
+    for link, theirs in match.solids(
+        HAND.joint_links
+    ).items():  # the hand that grasps has them, too
         for mine, solid in zip(HAND.links[link].solids, theirs, strict=True):
             assert (mine.kind, mine.size) == (solid.kind, pytest.approx(solid.size))
             np.testing.assert_allclose(mine.position, solid.position, atol=2e-6)
-            turns = [Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix() for x in (mine, solid)]
-            np.testing.assert_allclose(*(turn @ np.diag(mine.size) ** 2 @ turn.T for turn in turns), atol=1e-8)
+            turns = [
+                Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix()
+                for x in (mine, solid)
+            ]
+            np.testing.assert_allclose(
+                *(turn @ np.diag(mine.size) ** 2 @ turn.T for turn in turns), atol=1e-8
+            )
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     add_hand(spec, benchmarked(HAND, match))
@@ -189,10 +237,18 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
     mujoco.mj_kinematics(theirs, there)
 
     def outlines(model, data, palm):
-        """Middles of geoms, and what of their sizes and directions does not depend on how their axes are called."""
-        drawn = [g for g in range(model.ngeom) if g not in palm and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_SPHERE]
+        """Middles of geoms, and what of their sizes and directions does not depend on how their
+        axes are called.
+        """
+        drawn = [
+            g
+            for g in range(model.ngeom)
+            if g not in palm and model.geom_type[g] != mujoco.mjtGeom.mjGEOM_SPHERE
+        ]
         turns = data.geom_xmat[drawn].reshape(-1, 3, 3)
-        spread = np.einsum("gij,gj,gkj->gik", turns, model.geom_size[drawn] ** 2, turns).reshape(-1, 9)
+        spread = np.einsum("gij,gj,gkj->gik", turns, model.geom_size[drawn] ** 2, turns).reshape(
+            -1, 9
+        )
         rows = np.concatenate([data.geom_xpos[drawn], 1e3 * spread], 1)
         return rows[np.lexsort(np.round(rows[:, :3], 5).T)]
 
@@ -205,9 +261,16 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
 
 
 def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called(motion):
-    """A file that has its palm elsewhere, fingers in another order under other names, and joints that turn back."""
-    turned = [[(f"x{n}", p, q, tuple(-x for x in axis)) for n, p, q, axis in finger] for finger in SHADOW[::-1]]
-    own = mujoco.MjModel.from_xml_string(benchmark_model(turned, "pos='0.01 0.02 0.03' quat='1 1 0 0'", root=False))
+    """A file that has its palm elsewhere, fingers in another order under other names, and joints
+    that turn back.
+    """
+    turned = [
+        [(f"x{n}", p, q, tuple(-x for x in axis)) for n, p, q, axis in finger]
+        for finger in SHADOW[::-1]
+    ]
+    own = mujoco.MjModel.from_xml_string(
+        benchmark_model(turned, "pos='0.01 0.02 0.03' quat='1 1 0 0'", root=False)
+    )
     data = mujoco.MjData(own)
     mujoco.mj_kinematics(own, data)
     motion = dataclasses.replace(
@@ -259,19 +322,27 @@ def test_squeezing_applies_the_policys_torque_within_the_motors_limit(motion):
 
 
 def test_a_motor_of_two_joints_squeezes_at_the_sum_of_its_joints(motion):
-    """The benchmark's motor is at the sum of c q, which goes on by tau / kp: c = (1, 2), tau = 0.5, kp = 5."""
-    pulled = dataclasses.replace(HAND, tendons=(Motor("t", {"index_2": 1.0, "index_3": 2.0}, 2.0, 0.1, 0.5),))
+    """The benchmark's motor is at the sum of c q, which goes on by tau / kp: c = (1, 2), tau = 0.5,
+    kp = 5.
+    """
+    pulled = dataclasses.replace(
+        HAND, tendons=(Motor("t", {"index_2": 1.0, "index_3": 2.0}, 2.0, 0.1, 0.5),)
+    )
     first = motion.joint_names.tolist().index("index_2")
     target = motion.joint_position.copy()
     target[:, first + 1] += 1.0  # the tendon is 2 rad ahead: 4 N.m, of which it has 0.5
-    way = squeezed(pulled, dataclasses.replace(motion, joint_target=target), T - 1, 5.0)[first : first + 2]
+    way = squeezed(pulled, dataclasses.replace(motion, joint_target=target), T - 1, 5.0)[
+        first : first + 2
+    ]
     way -= motion.joint_position[-1, first : first + 2]
     assert way @ [1.0, 2.0] == pytest.approx(0.1)
     assert way[1] == pytest.approx(2 * way[0])
 
 
 def test_the_pregrasp_is_the_last_clear_state_beside_the_object_as_it_lies_in_the_grasp(motion):
-    """A ball of 2 cm comes along the hand's x axis by 4 mm a frame, and ends somewhere else, turned."""
+    """A ball of 2 cm comes along the hand's x axis by 4 mm a frame, and ends somewhere else,
+    turned.
+    """
     palm = 0.0204 - 0.0093  # the surface of its capsules on that side
     gaps = np.array([0.015, 0.011, 0.007, 0.003, -0.001, -0.001])
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
@@ -296,7 +367,9 @@ def test_the_pregrasp_is_the_last_clear_state_beside_the_object_as_it_lies_in_th
 
 def test_the_grasp_is_that_at_the_end_of_the_approach(motion):
     removed = dataclasses.replace(motion, table=np.arange(T) < 4)
-    lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.0, "lift": 0.03, "hold": 0.05}}, control_dt=0.01)
+    lifted = dataclasses.replace(
+        motion, about={"phases": {"grasp": 0.0, "lift": 0.03, "hold": 0.05}}, control_dt=0.01
+    )
     for case, frame in ((removed, 3), (lifted, 2)):
         grasp = benchmark_grasp("ball", case)
         np.testing.assert_allclose(grasp.states["grasp"].q, motion.joint_position[frame])
@@ -304,7 +377,9 @@ def test_the_grasp_is_that_at_the_end_of_the_approach(motion):
 
 
 def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeypatch):
-    """A box that a scripted grip holds: squeezed it stays through the pushes, from afar nothing holds it."""
+    """A box that a scripted grip holds: squeezed it stays through the pushes, from afar nothing
+    holds it.
+    """
     for name, value in (("SIZES", (0.4,)), ("_PLACES", (0.5,)), ("_FIRMNESS", (0.8,))):
         monkeypatch.setattr(trials, name, value)
     grip = next(grip for grip in trials.grips(HAND, TaskConfig(), 1) if grip.obj.name == "box")
@@ -336,12 +411,20 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
 def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path, capsys):
     for name, held in (("ball", 1.0), ("lost", 0.0)):
         (tmp_path / "grasps" / name).mkdir(parents=True)
-        save_motion(tmp_path / "grasps" / name / "grasp.npz", dataclasses.replace(motion, metrics={"held": held}))
+        save_motion(
+            tmp_path / "grasps" / name / "grasp.npz",
+            dataclasses.replace(motion, metrics={"held": held}),
+        )
     out = tmp_path / "bench"
     assert dexgraspbench((tmp_path / "grasps",), out) == 0
     said = capsys.readouterr().out
     assert "lost/grasp.npz: The object is not held." in said and "1 grasps" in said
-    script = [sys.executable, str(ROOT / "examples" / "dexgraspbench.py"), str(out), str(tmp_path / "graspdata")]
+    script = [
+        sys.executable,
+        str(ROOT / "examples" / "dexgraspbench.py"),
+        str(out),
+        str(tmp_path / "graspdata"),
+    ]
     subprocess.run(script, check=True, timeout=60, capture_output=True)
     # What the benchmark does: this file is ours, made a moment ago.
     data = np.load(tmp_path / "graspdata/ball/congrasp/0.npy", allow_pickle=True).item()
@@ -351,11 +434,16 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         "squeeze_qpos": (23,),
         "obj_pose": (7,),
     }
-    assert data["obj_scale"] == 0.5 and data["joint_names"] == list(BENCHMARK_HANDS["allegro"].joints)
+    assert data["obj_scale"] == 0.5 and data["joint_names"] == list(
+        BENCHMARK_HANDS["allegro"].joints
+    )
     # Mass by the benchmark's formula, and the pieces where it looks for them, in the file's unit.
     info = json.loads((out / "object/ball/info/simplified.json").read_text())
     coefficient = info["mass"] / (info["density"] * info["scale"] ** 3)
-    pieces = [trimesh.load(path) for path in sorted((out / data["obj_path"] / "urdf/meshes").glob("*.obj"))]
+    pieces = [
+        trimesh.load(path)
+        for path in sorted((out / data["obj_path"] / "urdf/meshes").glob("*.obj"))
+    ]
     volume = 4 / 3 * np.pi * 0.02**3
     assert coefficient * data["obj_scale"] ** 3 == pytest.approx(volume, rel=0.1)
     assert sum(piece.volume for piece in pieces) == pytest.approx(coefficient, rel=1e-5)
@@ -377,8 +465,12 @@ def test_every_motion_has_a_name_of_its_own(motion, tmp_path):
 
 
 def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
-    flat = dataclasses.replace(motion, object_vertices=motion.object_vertices * np.float32([1, 1, 0]))
-    moved = dataclasses.replace(motion, joint_anchor=motion.joint_anchor + 0.001 * np.arange(16)[:, None])
+    flat = dataclasses.replace(
+        motion, object_vertices=motion.object_vertices * np.float32([1, 1, 0])
+    )
+    moved = dataclasses.replace(
+        motion, joint_anchor=motion.joint_anchor + 0.001 * np.arange(16)[:, None]
+    )
     save_motions(tmp_path / "in", flat=flat, good=motion, moved=moved)
     (tmp_path / "in" / "torn").mkdir()
     (tmp_path / "in" / "torn" / "grasp.npz").write_bytes(b"PK")

@@ -1,7 +1,8 @@
-"""Throughput of the wire: rollouts into one learner beside bare Zenoh and bare PUSH/PULL sockets, weights out of it.
+"""Throughput of the wire: rollouts into one learner beside bare Zenoh and bare PUSH/PULL sockets,
+weights out of it.
 
-Everything but the policy and the physics is the real thing: the hub with its checks, admission and journals, and links
-with theirs, in processes of their own over the loopback interface.
+Everything but the policy and the physics is the real thing: the hub with its checks, admission and
+journals, and links with theirs, in processes of their own over the loopback interface.
 """
 
 import contextlib
@@ -46,8 +47,11 @@ _INTERVAL = 0.25  # seconds between two versions of the weights
 _WEIGHTS_MB = 4.0
 
 
-def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: int = 4, versions: int = 100) -> int:
-    """Rollouts of 8 MB into one learner, bare Zenoh and bare PUSH/PULL (pyzmq); 4 MB of weights to its actors.
+def transport(
+    senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: int = 4, versions: int = 100
+) -> int:
+    """Rollouts of 8 MB into one learner, bare Zenoh and bare PUSH/PULL (pyzmq); 4 MB of weights to
+    its actors.
 
     Args:
       senders: Actor processes that send rollouts.
@@ -61,7 +65,11 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
       python -m tests.benchmarks transport --senders 4
     """
     ours, on_disk, queries, bare = measure_ingest(senders, seconds, repeats)
-    sockets = "pyzmq is not installed" if math.isnan(bare) else f"{bare:.0f} MB/s, ratio {ours / bare:.2f}"
+    sockets = (
+        "pyzmq is not installed"
+        if math.isnan(bare)
+        else f"{bare:.0f} MB/s, ratio {ours / bare:.2f}"
+    )
     print(
         f"rollouts of 8 MB: {ours:.0f} MB/s into the learner\n"
         f"bare Zenoh queries: {queries:.0f} MB/s, ratio {ours / queries:.2f}\n"
@@ -80,34 +88,52 @@ def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: 
 
 
 def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
-    """MB/s into a learner, into one that writes all rollouts to its disk first, by bare Zenoh queries and by bare
-    sockets (NaN where pyzmq is not installed): medians of `repeats` alternating measurements."""
-    ways = _through_the_hub, functools.partial(_through_the_hub, write_ahead=True), _through_queries, _through_sockets
+    """MB/s into a learner, into one that writes all rollouts to its disk first, by bare Zenoh
+    queries and by bare sockets (NaN where pyzmq is not installed): medians of `repeats` alternating
+    measurements."""
+    ways = (
+        _through_the_hub,
+        functools.partial(_through_the_hub, write_ahead=True),
+        _through_queries,
+        _through_sockets,
+    )
     rates = [[way(senders, seconds) for way in ways] for _ in range(repeats)]
     return [statistics.median(each) for each in zip(*rates, strict=True)]
 
 
 def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]:
-    """Seconds from the publication of weights until each actor holds them, for every actor and version, sorted.
+    """Seconds from the publication of weights until each actor holds them, for every actor and
+    version, sorted.
 
-    Versions that an actor never held, since a newer one was there, count from their own publication as well.
+    Versions that an actor never held, since a newer one was there, count from their own publication
+    as well.
     """
     parameters = int(megabytes * 250_000)
-    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as ((hub, _), endpoint):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        _learner(folder := pathlib.Path(name)) as ((hub, _), endpoint),
+    ):
         published: list[float] = []
 
         def publish() -> None:
             published.append(time.monotonic())
-            hub.publish_weights(bundle(len(published) - 1, form=_FORM, parameters=parameters), len(published) - 1)
+            hub.publish_weights(
+                bundle(len(published) - 1, form=_FORM, parameters=parameters), len(published) - 1
+            )
 
         publish()
         with _processes(actors, _pull, endpoint, folder):
-            _until(lambda: all(_held(folder, i) for i in range(actors)), "The actors got no weights.")
+            _until(
+                lambda: all(_held(folder, i) for i in range(actors)), "The actors got no weights."
+            )
             for _ in range(versions):
                 time.sleep(_INTERVAL)
                 publish()
             last = len(published) - 1
-            _until(lambda: all(_held(folder, i)[-1][0] == last for i in range(actors)), "The last weights never came.")
+            _until(
+                lambda: all(_held(folder, i)[-1][0] == last for i in range(actors)),
+                "The last weights never came.",
+            )
             hub.finish()
         delays = []
         for i in range(actors):
@@ -142,16 +168,24 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
 def _rollout() -> Message:
     """A rollout that passes the checks."""
     rng = np.random.default_rng(0)
-    arrays = {name: rng.normal(size=zeros.shape).astype(zeros.dtype) for name, zeros in _FORM.zeros().items()}
+    arrays = {
+        name: rng.normal(size=zeros.shape).astype(zeros.dtype)
+        for name, zeros in _FORM.zeros().items()
+    }
     return Message(arrays, {"version": 0, "schema": SCHEMA, "steps": _FORM.steps * _FORM.worlds})
 
 
 def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False) -> float:
-    """MB/s through the learner's hub; with `write_ahead` there is a checkpoint (of nothing) after each update."""
+    """MB/s through the learner's hub; with `write_ahead` there is a checkpoint (of nothing) after
+    each update.
+    """
     size = len(encode(_rollout()))
     with (
         tempfile.TemporaryDirectory() as name,
-        _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as ((hub, rollouts), endpoint),
+        _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as (
+            (hub, rollouts),
+            endpoint,
+        ),
     ):
         hub.publish_weights(bundle(0, form=_FORM), 0)
         version = 0
@@ -229,15 +263,23 @@ def _until(condition: Callable[[], bool], message: str) -> None:
     deadline = time.monotonic() + _START
     while not condition():
         if time.monotonic() > deadline:
-            raise CongraspError(f"{message[:-1]} within {_START:g} s.", "Is the machine busy otherwise?")
+            raise CongraspError(
+                f"{message[:-1]} within {_START:g} s.", "Is the machine busy otherwise?"
+            )
         time.sleep(0.01)
 
 
 @contextlib.contextmanager
-def _processes(count: int, role: Callable[[str, pathlib.Path, int], None], *arguments: Any) -> Iterator[None]:
-    """Runs a function of this module in processes of their own, which are killed at the end of the block."""
+def _processes(
+    count: int, role: Callable[[str, pathlib.Path, int], None], *arguments: Any
+) -> Iterator[None]:
+    """Runs a function of this module in processes of their own, which are killed at the end of the
+    block.
+    """
     spawn = multiprocessing.get_context("spawn")
-    processes = [spawn.Process(target=role, args=(*arguments, i), daemon=True) for i in range(count)]
+    processes = [
+        spawn.Process(target=role, args=(*arguments, i), daemon=True) for i in range(count)
+    ]
     try:
         for process in processes:
             process.start()
@@ -267,7 +309,9 @@ def _upload(endpoint: str, folder: pathlib.Path, number: int) -> None:
     with _link(endpoint, folder, number) as link:
         while True:
             if ticket := link.acquire_ticket(1.0):
-                link.upload(Message(message.arrays, {**message.meta, "version": ticket.version}), ticket)
+                link.upload(
+                    Message(message.arrays, {**message.meta, "version": ticket.version}), ticket
+                )
 
 
 def _ask(endpoint: str, _: pathlib.Path, number: int) -> None:
@@ -276,7 +320,9 @@ def _ask(endpoint: str, _: pathlib.Path, number: int) -> None:
 
     def send() -> None:
         while True:
-            for _reply in session.get(_RUN, FifoChannel(4), payload=data, congestion_control=CongestionControl.BLOCK):
+            for _reply in session.get(
+                _RUN, FifoChannel(4), payload=data, congestion_control=CongestionControl.BLOCK
+            ):
                 pass
 
     with bare_session("client", connect=endpoint) as session, ThreadPoolExecutor(2) as pool:
@@ -299,7 +345,10 @@ def _push(address: str, _: pathlib.Path, number: int) -> None:
 def _pull(endpoint: str, folder: pathlib.Path, number: int) -> None:
     """An actor that takes new weights at once, and writes down when it held them."""
     version = -1
-    with _link(endpoint, folder, number) as link, _file(folder, number).open("w", buffering=1) as log:
+    with (
+        _link(endpoint, folder, number) as link,
+        _file(folder, number).open("w", buffering=1) as log,
+    ):
         while True:
             message = link.weights(version)
             if message is not None:

@@ -1,4 +1,6 @@
-"""Writes the binary inputs of the cases next to their descriptions: `python -m tests.cases.make`."""
+"""Writes the binary inputs of the cases next to their descriptions: `python -m
+tests.cases.make`.
+"""
 
 import json
 import pathlib
@@ -22,19 +24,36 @@ def stl(mesh: trimesh.Trimesh) -> bytes:
 
 def glb(tree: dict, binary: bytes) -> bytes:
     """A GLB file of this tree and binary chunk."""
-    text = json.dumps({"asset": {"version": "2.0"}, **tree, "buffers": [{"byteLength": len(binary)}]}).encode()
+    text = json.dumps(
+        {"asset": {"version": "2.0"}, **tree, "buffers": [{"byteLength": len(binary)}]}
+    ).encode()
     text, binary = text + b" " * (-len(text) % 4), binary + bytes(-len(binary) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-    return head + struct.pack("<I", len(text)) + b"JSON" + text + struct.pack("<I", len(binary)) + b"BIN\0" + binary
+    return (
+        head
+        + struct.pack("<I", len(text))
+        + b"JSON"
+        + text
+        + struct.pack("<I", len(binary))
+        + b"BIN\0"
+        + binary
+    )
 
 
 def scene(positions: np.ndarray, faces: np.ndarray, primitives=(), node=None, **extra) -> bytes:
-    """A GLB file of one mesh; positions may be rows of integers with padding, of which three columns count."""
+    """A GLB file of one mesh; positions may be rows of integers with padding, of which three
+    columns count.
+    """
     points, corners = np.ascontiguousarray(positions), np.ascontiguousarray(faces, np.uint16)
     kinds = {"f": 5126, "H": 5123, "h": 5122, "B": 5121}
     kind = kinds[points.dtype.char]
     views = [
-        {"buffer": 0, "byteOffset": 0, "byteLength": points.nbytes, "byteStride": points.strides[0]},
+        {
+            "buffer": 0,
+            "byteOffset": 0,
+            "byteLength": points.nbytes,
+            "byteStride": points.strides[0],
+        },
         {"buffer": 0, "byteOffset": points.nbytes, "byteLength": corners.nbytes},
     ]
     accessors = [
@@ -57,19 +76,26 @@ def scene(positions: np.ndarray, faces: np.ndarray, primitives=(), node=None, **
 
 
 def quantised() -> bytes:
-    """A box of 4 x 6 x 10 cm (10 cm along y) by normalised unsigned shorts with a stride of 8 bytes."""
+    """A box of 4 x 6 x 10 cm (10 cm along y) by normalised unsigned shorts with a stride of 8
+    bytes.
+    """
     unit = BOX.vertices / BOX.extents + 0.5
     rows = np.zeros((len(unit), 4), np.uint16)
     rows[:, :3] = np.round(65535 * unit[:, [0, 2, 1]])
     faces = np.asarray(BOX.faces)[:, ::-1]
     node = {"scale": [0.04, 0.1, 0.06]}
-    required = {"extensionsRequired": ["KHR_mesh_quantization"], "extensionsUsed": ["KHR_mesh_quantization"]}
+    required = {
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "extensionsUsed": ["KHR_mesh_quantization"],
+    }
     return scene(rows, faces, node=node, **required)
 
 
 def compressed(name: str) -> bytes:
     """A GLB file that needs an extension."""
-    return scene(BOX.vertices.astype(np.float32), BOX.faces, extensionsRequired=[name], extensionsUsed=[name])
+    return scene(
+        BOX.vertices.astype(np.float32), BOX.faces, extensionsRequired=[name], extensionsUsed=[name]
+    )
 
 
 def archive(*names: str) -> bytes:
@@ -96,7 +122,9 @@ def collada(mesh: trimesh.Trimesh) -> bytes:
     text = trimesh.exchange.dae.export_collada(mesh).decode()
     unit = '<unit name="millimeter" meter="0.001"/>'
     return (
-        re.sub(r"<unit[^>]*/>", unit, text) if "<unit" in text else text.replace("</asset>", f"{unit}</asset>")
+        re.sub(r"<unit[^>]*/>", unit, text)
+        if "<unit" in text
+        else text.replace("</asset>", f"{unit}</asset>")
     ).encode()
 
 
@@ -132,17 +160,21 @@ def main() -> None:
         "not_finite/ball.ply": spoilt.export(file_type="ply"),
         "not_finite_many/ball.ply": worse.export(file_type="ply"),
         "parts/tool/graspable.stl": stl(moved(trimesh.creation.box((0.02, 0.02, 0.1)), 0, 0, 0.05)),
-        "parts/tool/non_graspable.stl": stl(moved(trimesh.creation.box((0.06, 0.02, 0.03)), 0, 0, 0.115)),
+        "parts/tool/non_graspable.stl": stl(
+            moved(trimesh.creation.box((0.06, 0.02, 0.03)), 0, 0, 0.115)
+        ),
         "parts_tiny/ball/top.stl": box,
-        "parts_tiny/ball/bottom.stl": stl(moved(trimesh.creation.box((0.01,) * 3), *(0.346408,) * 3)),
+        "parts_tiny/ball/bottom.stl": stl(
+            moved(trimesh.creation.box((0.01,) * 3), *(0.346408,) * 3)
+        ),
         "stl_count/part.stl": box[:80] + struct.pack("<I", 5) + box[84:],
         "stl_tail/part.stl": box + b"colour table",
         "stl_cut/part.stl": box[:-30],
         "stl_solid/part.stl": b"solid part of facet".ljust(80) + box[80:],
         "glb_quantised/part.glb": quantised(),
-        "gltf_embedded/part.gltf": trimesh.exchange.gltf.export_gltf(trimesh.Scene(BOX), embed_buffers=True)[
-            "model.gltf"
-        ],
+        "gltf_embedded/part.gltf": trimesh.exchange.gltf.export_gltf(
+            trimesh.Scene(BOX), embed_buffers=True
+        )["model.gltf"],
         "glb_draco/part.glb": compressed("KHR_draco_mesh_compression"),
         "glb_meshopt/part.glb": compressed("EXT_meshopt_compression"),
         "glb_unknown/part.glb": compressed("ACME_folded_surfaces"),
@@ -151,15 +183,23 @@ def main() -> None:
             float_box, BOX.faces, ({"attributes": {"POSITION": 0}, "mode": 1}, {"attributes": {}})
         ),
         "doubled/part.stl": stl(both),
-        "two_sided/part.stl": stl(trimesh.Trimesh(BOX.vertices, np.concatenate([BOX.faces, BOX.faces[:, ::-1]]))),
-        "overlapping/cross.stl": stl(trimesh.util.concatenate([long, trimesh.creation.box((0.03, 0.12, 0.03))])),
+        "two_sided/part.stl": stl(
+            trimesh.Trimesh(BOX.vertices, np.concatenate([BOX.faces, BOX.faces[:, ::-1]]))
+        ),
+        "overlapping/cross.stl": stl(
+            trimesh.util.concatenate([long, trimesh.creation.box((0.03, 0.12, 0.03))])
+        ),
         "touching/pair.stl": stl(other),
         "points_ply/scan.ply": ply("x y z", random.random((9, 3))),
         "points_splat/scene.ply": ply("x y z f_dc_0 f_dc_1 f_dc_2", random.random((9, 6))),
         "archive_3mf/part.3mf": archive("3D/3dmodel.model", "[Content_Types].xml"),
         "archive_usdz/part.usdz": archive("part.usdc"),
         "archive_zip/part.stl": archive("models/mug.obj", "licence.txt"),
-        **{f"{case}/{folder}/mug.stl": box for case in ("sets_of_one_name", "equal_names") for folder in "ab"},
+        **{
+            f"{case}/{folder}/mug.stl": box
+            for case in ("sets_of_one_name", "equal_names")
+            for folder in "ab"
+        },
         "names/碗.stl": box,
         "names/कटोरी.stl": box,
         "names/mug.stl": box,
@@ -169,7 +209,9 @@ def main() -> None:
         "hand_mm/link.stl": stl(trimesh.creation.box((20, 14, 50))),
         "hand_called_xml/parts/link.stl": stl(trimesh.creation.box((0.02, 0.014, 0.05))),
         "hand_attached/a/palm.stl": stl(trimesh.creation.box((0.06, 0.1, 0.03))),
-        "hand_attached/b/tip.stl": stl(moved(trimesh.creation.box((0.02, 0.014, 0.04)), 0, 0, 0.02)),
+        "hand_attached/b/tip.stl": stl(
+            moved(trimesh.creation.box((0.02, 0.014, 0.04)), 0, 0, 0.02)
+        ),
     }
     for name, data in files.items():
         (HERE / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,6 @@
-"""Clouds of a depth camera: what is visible, and a policy that depends on neither their order nor the object's pose."""
+"""Clouds of a depth camera: what is visible, and a policy that depends on neither their order nor
+the object's pose.
+"""
 
 import dataclasses
 import functools
@@ -40,7 +42,9 @@ def cube():
     """Six faces of 8 x 8 points of a cube of 6 cm: those at -x, +x, -y, +y, -z and +z."""
     grid = np.linspace(-0.029, 0.029, 8)
     a, b = (axis.ravel() for axis in np.meshgrid(grid, grid))
-    faces = [np.insert(np.stack([a, b], 1), axis, side, 1) for axis in range(3) for side in (-0.03, 0.03)]
+    faces = [
+        np.insert(np.stack([a, b], 1), axis, side, 1) for axis in range(3) for side in (-0.03, 0.03)
+    ]
     return jnp.asarray(np.concatenate(faces)[None], jnp.float32)
 
 
@@ -50,7 +54,9 @@ FRONTS = [((0.5, 0.0, 0.0), [1]), ((0.0, -0.5, 0.0), [2]), ((0.3, 0.3, 0.3), [1,
 
 @pytest.mark.parametrize(("eye", "front"), FRONTS)
 def test_the_faces_towards_the_camera_are_visible(eye, front):
-    """Hidden faces show at most their rim, within two rows of 8.3 mm: the grid's cells are 11 mm."""
+    """Hidden faces show at most their rim, within two rows of 8.3 mm: the grid's cells are 11
+    mm.
+    """
     seen = np.asarray(_facing(jnp.array([eye]), cube()))[0]
     assert seen.reshape(6, 64).mean(1)[front].min() > 0.9
     points = np.asarray(cube())[0][seen]
@@ -59,10 +65,16 @@ def test_the_faces_towards_the_camera_are_visible(eye, front):
 
 
 def test_a_capsule_hides_what_is_behind_it():
-    """From 1 m: the ray to a point 0.05 m off the axis passes a capsule half-way at 0.025 m, beyond its 0.02 m."""
-    points = jnp.array([[[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.05, 0.0], [0.7, 0.0, 0.0], [0.0, 0.0, 0.05]]])
+    """From 1 m: the ray to a point 0.05 m off the axis passes a capsule half-way at 0.025 m, beyond
+    its 0.02 m.
+    """
+    points = jnp.array(
+        [[[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.05, 0.0], [0.7, 0.0, 0.0], [0.0, 0.0, 0.05]]]
+    )
     ends = jnp.array([[[[0.5, 0.0, -0.1], [0.5, 0.0, 0.1]]]])
-    hidden = camera.behind(jnp.array([[1.0, 0.0, 0.0]]), points, camera.Capsules(ends, jnp.array([0.02])))
+    hidden = camera.behind(
+        jnp.array([[1.0, 0.0, 0.0]]), points, camera.Capsules(ends, jnp.array([0.02]))
+    )
     assert hidden.tolist() == [[True, True, False, False, True]]
 
 
@@ -83,20 +95,31 @@ def test_a_calibration_error_is_one_rigid_motion_of_cloud_and_goal():
     """The error of each image of an episode is the same, and that of the stated goal too."""
     pose = jnp.array([[0.1, 0.2, 0.05, 1.0, 0.0, 0.0, 0.0]])
     exact, off = (
-        cameras(SensingConfig(position_bias=(x, x), rotation_bias=(7 * x, 7 * x)), pose, cube(), heading_goal(1))
+        cameras(
+            SensingConfig(position_bias=(x, x), rotation_bias=(7 * x, 7 * x)),
+            pose,
+            cube(),
+            heading_goal(1),
+        )
         for x in (0.0, 0.005)
     )
     sensors = off.sensors
     turn = rotations.from_rotation_vector(sensors.rotation_bias)
-    moved = rotations.transform(pose[:, :3] + sensors.position_bias, turn, exact.cloud.points - pose[:, None, :3])
+    moved = rotations.transform(
+        pose[:, :3] + sensors.position_bias, turn, exact.cloud.points - pose[:, None, :3]
+    )
     np.testing.assert_allclose(off.cloud.points, moved, atol=1e-6)
     np.testing.assert_array_equal(off.cloud.avoid, exact.cloud.points[..., 2] - 0.05 > 0.02)
     np.testing.assert_allclose(exact.goal["heading"].position, pose[:, :3], atol=1e-7)
-    np.testing.assert_allclose(off.goal["heading"].position, pose[:, :3] + sensors.position_bias, atol=1e-6)
+    np.testing.assert_allclose(
+        off.goal["heading"].position, pose[:, :3] + sensors.position_bias, atol=1e-6
+    )
     down = rotations.rotate(turn, exact.goal["heading"].direction)
     np.testing.assert_allclose(off.goal["heading"].direction, down, atol=1e-6)
     path = exact.goal["trajectory"]
-    turned = rotations.multiply(jnp.broadcast_to(turn[:, None], path.quaternion.shape), path.quaternion)
+    turned = rotations.multiply(
+        jnp.broadcast_to(turn[:, None], path.quaternion.shape), path.quaternion
+    )
     np.testing.assert_allclose(off.goal["trajectory"].quaternion, turned, atol=1e-6)
     np.testing.assert_array_equal(off.goal["force"].limit, exact.goal["force"].limit)
 
@@ -113,7 +136,9 @@ class Shown(NamedTuple):
 
 
 def test_images_come_at_their_rate_or_once(monkeypatch):
-    """At 10 Hz in steps of 10 ms: two or three in 25 steps. Half of the points are dropped. Three at most together."""
+    """At 10 Hz in steps of 10 ms: two or three in 25 steps. Half of the points are dropped. Three
+    at most together.
+    """
     monkeypatch.setattr(camera, "_TOGETHER", 3)
     pose = jnp.tile(jnp.array([[0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]]), (4, 1))
     points = jnp.repeat(cube(), 4, 0)
@@ -125,7 +150,9 @@ def test_images_come_at_their_rate_or_once(monkeypatch):
         images = np.zeros(4, int)
         for step in range(1, 26):
             shown = Shown(pose[:, :3], pose[:, 3:], jnp.zeros((4, len(HAND.joints))), *still)
-            after = look(state, jnp.full(4, step), shown, shown, Surface(points, points[..., 2] > 0.02))
+            after = look(
+                state, jnp.full(4, step), shown, shown, Surface(points, points[..., 2] > 0.02)
+            )
             images += np.any(after.cloud.points != state.cloud.points, (1, 2))
             state = after
         assert set(images.tolist()) <= expected
@@ -135,22 +162,32 @@ def test_images_come_at_their_rate_or_once(monkeypatch):
 
 
 def test_images_that_are_taken_in_parts_are_those_of_their_environments(monkeypatch):
-    """Other objects, poses and hands in each of seven, every second one due; arrays of NumPy outside of a program."""
+    """Other objects, poses and hands in each of seven, every second one due; arrays of NumPy
+    outside of a program.
+    """
     rng = np.random.default_rng(0)
     pose = np.tile(np.float32([0, 0, 0.05, 1, 0, 0, 0]), (7, 1))
     pose[:, :3] += rng.normal(size=(7, 3))
     points = rng.uniform(-0.04, 0.04, (7, POINTS, 3)).astype(np.float32)
     surface = Surface(points, points[..., 2] > 0.02, points / 0.07)
     task = dataclasses.replace(TASK, surface_normals=True)
-    sensors = jax.tree.map(np.asarray, draw_sensors(SensingConfig(dropout=(0.2, 0.5)), 0.01, jax.random.key(0), 7))
+    sensors = jax.tree.map(
+        np.asarray, draw_sensors(SensingConfig(dropout=(0.2, 0.5)), 0.01, jax.random.key(0), 7)
+    )
     state = camera.begin(task, sensors, 3, pose, surface, heading_goal(7))
-    ends = pose[:, None, None, :3] + 0.5 * sensors.eye[:, None, None] + rng.normal(size=(7, 1, 2, 3)) * (0, 0, 0.03)
+    ends = (
+        pose[:, None, None, :3]
+        + 0.5 * sensors.eye[:, None, None]
+        + rng.normal(size=(7, 1, 2, 3)) * (0, 0, 0.03)
+    )
     ends = ends.astype(np.float32)
     given = state, np.arange(7), np.arange(7) % 2 == 0, pose, surface
 
     @jax.jit
     def image(given, ends):
-        return camera._image(*given, lambda rows: camera.Capsules(ends[rows], jnp.array([0.02]))).cloud
+        return camera._image(
+            *given, lambda rows: camera.Capsules(ends[rows], jnp.array([0.02]))
+        ).cloud
 
     def alone(i):
         return image(*jax.tree.map(lambda x: x[i : i + 1], (given, ends)))
@@ -205,13 +242,21 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
 
 
 def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
-    """A teacher of the full state acts by where the object is; the student's one informative input is the cloud."""
+    """A teacher of the full state acts by where the object is; the student's one informative input
+    is the cloud.
+    """
     full = dataclasses.replace(TASK, observation="full")
-    teacher, path = random_bundle(full, NETWORK, 30.0, seed=2, std=0.2), tmp_path / "teacher.safetensors"
+    teacher, path = (
+        random_bundle(full, NETWORK, 30.0, seed=2, std=0.2),
+        tmp_path / "teacher.safetensors",
+    )
     bundles.save(teacher, path)
     run = RunConfig(task=TASK, network=NETWORK, algorithm="distill", updates=1000)
     run = dataclasses.replace(
-        run, distill=dataclasses.replace(run.distill, teacher=str(path), minibatches=4, learning_rate=3e-3)
+        run,
+        distill=dataclasses.replace(
+            run.distill, teacher=str(path), minibatches=4, learning_rate=3e-3
+        ),
     )
     student, block = Distillation(policy_spec(TASK, NETWORK), run), cloud_block()
     size = sum(width for _, width in full_layout(TASK))

@@ -36,7 +36,9 @@ def test_normal_numbers_are_finite_at_the_edges_and_follow_the_inverse_distribut
 
 
 def test_indices_are_equally_likely_and_below_the_count():
-    assert np.bincount(chance.index(UNIFORM, 7)) / MANY == pytest.approx(np.full(7, 1 / 7), abs=0.01)
+    assert np.bincount(chance.index(UNIFORM, 7)) / MANY == pytest.approx(
+        np.full(7, 1 / 7), abs=0.01
+    )
     assert chance.index(np.float32([0.0, LAST]), 300).tolist() == [0, 299]
 
 
@@ -49,5 +51,7 @@ def test_weighted_indices_have_their_shares_and_skip_zeros():
 
 def test_one_of_the_allowed_is_chosen():
     allowed = np.tile([False, True, False, True, True], (MANY, 1))
-    assert np.bincount(chance.among(UNIFORM, allowed)) / MANY == pytest.approx([0, 1 / 3, 0, 1 / 3, 1 / 3], abs=0.01)
+    assert np.bincount(chance.among(UNIFORM, allowed)) / MANY == pytest.approx(
+        [0, 1 / 3, 0, 1 / 3, 1 / 3], abs=0.01
+    )
     assert chance.among(np.float32([0.7]), np.zeros((1, 4), bool)).tolist() == [0]

@@ -44,7 +44,9 @@ def test_the_shipped_wide_pose_is_the_one_that_is_found(name):
     hand = get_hand(name)
     found = hand.posed(widest_pose(hand))
     np.testing.assert_allclose(wide_angles(hand), found, atol=0.03)
-    assert (wide_angles(hand) >= hand.lower - 1e-6).all() and (wide_angles(hand) <= hand.upper + 1e-6).all()
+    assert (wide_angles(hand) >= hand.lower - 1e-6).all() and (
+        wide_angles(hand) <= hand.upper + 1e-6
+    ).all()
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -86,7 +88,9 @@ _preshape = jax.jit(functools.partial(preshape, get_hand("human")))
 
 @settings(deadline=None, max_examples=20)
 @given(width=st.floats(0.0, 0.12), margin=st.floats(0.015, 0.06))
-def test_a_preshaped_hand_is_wider_than_the_object_by_the_margin_or_as_wide_as_it_opens(width, margin):
+def test_a_preshaped_hand_is_wider_than_the_object_by_the_margin_or_as_wide_as_it_opens(
+    width, margin
+):
     hand = get_hand("human")
     q = np.asarray(_preshape(np.float32([width]), np.float32(margin)))[0]
     tips, radii = _tips(hand, q), hand.keypoint_radii[len(hand.links) :]

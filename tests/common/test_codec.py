@@ -18,12 +18,18 @@ DTYPES = ["f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "?"]
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8).filter(lambda name: name != "__metadata__"),
     st.sampled_from(DTYPES).flatmap(
-        lambda dtype: hnp.arrays(np.dtype(dtype), hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4))
+        lambda dtype: hnp.arrays(
+            np.dtype(dtype), hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4)
+        )
     ),
     max_size=5,
 )
 json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=6,
 )
@@ -66,12 +72,18 @@ def test_safetensors_reads_what_encode_writes(arrays, meta):
 
 
 def test_decode_reads_what_safetensors_writes():
-    written = {"w": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array([True, False]), "n": np.float64(3)}
+    written = {
+        "w": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "b": np.array([True, False]),
+        "n": np.float64(3),
+    }
     written = {name: np.asarray(array) for name, array in written.items()}
     plain = safetensors.numpy.save(written)
     length = int.from_bytes(plain[:8], "little")
     header = json.loads(plain[8 : 8 + length])
-    assert_equal(Message(written, {"a": 1}), decode(packed(header, plain[8 + length :], meta='{"a": 1}')))
+    assert_equal(
+        Message(written, {"a": 1}), decode(packed(header, plain[8 + length :], meta='{"a": 1}'))
+    )
     with pytest.raises(CongraspError, match="does not begin with its checksum"):
         decode(plain)
 
@@ -85,9 +97,23 @@ def test_arrays_are_read_only_views_of_the_message():
 
 def test_any_memory_layout_is_written_in_order():
     x = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
-    message = Message({"t": x.T, "s": x[:, ::2, 1], "big": x.astype(">f4"), "device": jnp.asarray(x), "zero": x[:0]})
+    message = Message(
+        {
+            "t": x.T,
+            "s": x[:, ::2, 1],
+            "big": x.astype(">f4"),
+            "device": jnp.asarray(x),
+            "zero": x[:0],
+        }
+    )
     read = decode(encode(message)).arrays
-    for name, array in (("t", x.T), ("s", x[:, ::2, 1]), ("big", x), ("device", x), ("zero", x[:0])):
+    for name, array in (
+        ("t", x.T),
+        ("s", x[:, ::2, 1]),
+        ("big", x),
+        ("device", x),
+        ("zero", x[:0]),
+    ):
         np.testing.assert_array_equal(read[name], array)
         assert read[name].dtype == np.dtype("<f4")
 
@@ -126,7 +152,9 @@ TWO = np.array([1, 2], np.float32).tobytes()
 
 
 def signed(rest):
-    """A message without arrays whose header ends with `rest` instead of a brace; the checksum is right."""
+    """A message without arrays whose header ends with `rest` instead of a brace; the checksum is
+    right.
+    """
     text = b'{"__metadata__":{"checksum":"00000000","meta":"{}"}' + rest
     text = text.replace(b"00000000", b"%08x" % zlib.crc32(text), 1)
     return len(text).to_bytes(8, "little") + text
@@ -170,7 +198,13 @@ def signed(rest):
         (packed({"x": {**entry(), "more": 1}}, TWO), "not described by"),
         (packed({"x": 7}), "not described by"),
         (packed({"x": entry(), "y": entry()}, TWO), "gap or an overlap"),
-        (packed({"x": entry(shape=(1,), offsets=(0, 4)), "y": entry(shape=(1,), offsets=(3, 7))}, TWO), "overlap"),
+        (
+            packed(
+                {"x": entry(shape=(1,), offsets=(0, 4)), "y": entry(shape=(1,), offsets=(3, 7))},
+                TWO,
+            ),
+            "overlap",
+        ),
         (packed({"x": entry(shape=(1,), offsets=(4, 8))}, TWO), "starts at byte 4, not at 0"),
         (packed({"x": entry("BOOL", (2,), (0, 2))}, b"\x01\x02"), "booleans other than 0 and 1"),
     ],
@@ -188,7 +222,9 @@ def test_length_is_limited():
     assert decode(data, max_bytes=len(data)).arrays["x"].shape == (100,)
 
 
-WHOLE = encode(Message({"x": np.arange(6, dtype=np.float32), "b": np.array([True])}, {"actor": "a", "n": 3}))
+WHOLE = encode(
+    Message({"x": np.arange(6, dtype=np.float32), "b": np.array([True])}, {"actor": "a", "n": 3})
+)
 
 
 def test_every_flipped_bit_is_found():
@@ -202,11 +238,22 @@ def test_every_flipped_bit_is_found():
 
 
 @settings(deadline=None, max_examples=100)
-@given(st.dictionaries(st.sampled_from("xyz"), st.fixed_dictionaries({
-    "dtype": st.sampled_from(["F32", "BOOL", "U8", "F64", ""]) | json_values,
-    "shape": st.lists(st.integers(-1, 2**70) | st.integers(0, 4), max_size=10) | json_values,
-    "data_offsets": st.lists(st.integers(0, 40), min_size=2, max_size=2) | json_values,
-}) | json_values, max_size=3), st.binary(max_size=40))  # fmt: skip
+@given(
+    st.dictionaries(
+        st.sampled_from("xyz"),
+        st.fixed_dictionaries(
+            {
+                "dtype": st.sampled_from(["F32", "BOOL", "U8", "F64", ""]) | json_values,
+                "shape": st.lists(st.integers(-1, 2**70) | st.integers(0, 4), max_size=10)
+                | json_values,
+                "data_offsets": st.lists(st.integers(0, 40), min_size=2, max_size=2) | json_values,
+            }
+        )
+        | json_values,
+        max_size=3,
+    ),
+    st.binary(max_size=40),
+)
 def test_invented_headers_raise_nothing_else(header, section):
     _decode_or_refuse(packed(header, section))
 

@@ -17,7 +17,9 @@ def test_configurations_survive_the_wire(name):
     assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
 
 
-@pytest.mark.parametrize("file", sorted(ROOT.glob("checkpoints/*/config.json")), ids=lambda file: file.parent.name)
+@pytest.mark.parametrize(
+    "file", sorted(ROOT.glob("checkpoints/*/config.json")), ids=lambda file: file.parent.name
+)
 def test_runs_of_earlier_versions_keep_their_batch_and_staleness(file):
     written = json.loads(file.read_text())
     earlier = {**written, **written["ppo"]}  # where they were until they belonged to the run

@@ -1,4 +1,6 @@
-"""What every constraint must keep to, so that all that is derived from its one file fits together."""
+"""What every constraint must keep to, so that all that is derived from its one file fits
+together.
+"""
 
 import dataclasses
 import functools
@@ -43,9 +45,13 @@ NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
 OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
 DRAWN = 256
 CHANGES = {"fingers": {"heading", "distance", "heading_position"}, "force": {"force_excess"}}
-"""Blocks and reward terms of others that a constraint changes: hand centre and distance of the set, and f_max."""
+"""Blocks and reward terms of others that a constraint changes: hand centre and distance of the set,
+and f_max.
+"""
 each = pytest.mark.parametrize("constraint", CONSTRAINTS, ids=NAMES)
-each_optional = pytest.mark.parametrize("constraint", OPTIONAL, ids=lambda constraint: constraint.name)
+each_optional = pytest.mark.parametrize(
+    "constraint", OPTIONAL, ids=lambda constraint: constraint.name
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +79,9 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
 
 
 def test_names_are_unique_over_all_constraints():
-    arrays = [f"{constraint.name}_{name}" for constraint in CONSTRAINTS for name in constraint.arrays]
+    arrays = [
+        f"{constraint.name}_{name}" for constraint in CONSTRAINTS for name in constraint.arrays
+    ]
     errors = [error for constraint in CONSTRAINTS for error in constraint.errors]
     groups = {
         "constraints": NAMES,
@@ -84,7 +92,11 @@ def test_names_are_unique_over_all_constraints():
             *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
             *(term.name for term in GRASP),
         ],
-        "blocks": ["state", *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)), "mask"],
+        "blocks": [
+            "state",
+            *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)),
+            "mask",
+        ],
         "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
     }
     for group, names in groups.items():
@@ -98,7 +110,8 @@ def test_what_it_declares_is_what_it_computes(constraint, whole):
     assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
     assert sorted(measured) == sorted(error.name for error in constraint.errors)
     for error in constraint.errors:
-        assert isinstance(measured[error.name], tuple) == (error.unit == ""), error.name  # ratios have no unit
+        # Ratios have no unit
+        assert isinstance(measured[error.name], tuple) == (error.unit == ""), error.name
         assert error.tolerance >= 0 and error.scale > 0 and error.unit in ("rad", "m", "")
     for value in jax.tree.leaves((paid, measured)):
         assert value.shape == (4,) and np.isfinite(value).all()
@@ -119,14 +132,21 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
             assert on_observation[:, block].any() and not off_observation[:, block].any(), name
         elif name == "mask":
             silent = [mask[block] for block in constraint.blocks]
-            np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(6), silent), (4, 1)))
+            np.testing.assert_array_equal(
+                off_observation[:, block] == 0, np.tile(np.isin(range(6), silent), (4, 1))
+            )
         elif name not in CHANGES.get(constraint.name, ()):
-            np.testing.assert_array_equal(on_observation[:, block], off_observation[:, block], err_msg=name)
+            np.testing.assert_array_equal(
+                on_observation[:, block], off_observation[:, block], err_msg=name
+            )
     assert not any(np.any(value) for value in evaluated(constraint.reward, off).values())
     touching, force = whole.features.touching, whole.features.force
-    for before, after in zip((touching, force), constraint.earning(off, touching, force), strict=True):
+    for before, after in zip(
+        (touching, force), constraint.earning(off, touching, force), strict=True
+    ):
         np.testing.assert_array_equal(before, after)
-    # Nor does it change what the others are paid, but for contacts that it forbids and what it declares.
+    # Nor does it change what the others are paid, but for contacts that it forbids and what it
+    # declares.
     others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (whole, off))
     own = {weight.name for weight in constraint.weights}
     for name in set(terms(TASK)) - own - {"contact", "force"} - CHANGES.get(constraint.name, set()):
@@ -134,7 +154,8 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
 
 
 @pytest.mark.parametrize(
-    ("hand", "sizes"), [("human", {"F": 20, "G": 5, "K": 15}), ("allegro", {"F": 16, "G": 4, "K": 15})]
+    ("hand", "sizes"),
+    [("human", {"F": 20, "G": 5, "K": 15}), ("allegro", {"F": 16, "G": 4, "K": 15})],
 )
 @each
 def test_neutral_arrays_have_their_declared_shapes_and_are_unit(constraint, hand, sizes):
@@ -154,16 +175,22 @@ def test_neutral_arrays_have_their_declared_shapes_and_are_unit(constraint, hand
     }
     labels = constraint.labels(get_hand(hand))
     assert {name: len(words) for name, words in labels.items()} == {
-        name: getattr(neutral, name).shape[0] for name, array in constraint.arrays.items() if array.kind == "flag"
+        name: getattr(neutral, name).shape[0]
+        for name, array in constraint.arrays.items()
+        if array.kind == "flag"
     }
 
 
 @each
 def test_names_that_it_gives_are_there(constraint):
     weaker = CONSTRAINTS[: NAMES.index(constraint.name)]
-    assert set(constraint.overrides) <= {name for other in weaker for name in (other.name, *other.blocks)}
+    assert set(constraint.overrides) <= {
+        name for other in weaker for name in (other.name, *other.blocks)
+    }
     assert set(constraint.overridden_by) <= {*NAMES} - {constraint.name}
-    assert {relation.weaker for relation in constraint.relations} <= {other.name for other in weaker}
+    assert {relation.weaker for relation in constraint.relations} <= {
+        other.name for other in weaker
+    }
     assert constraint.guides in ("", constraint.name, *constraint.blocks)
     assert constraint.title and constraint.options and constraint.name.isidentifier()
 
@@ -171,16 +198,22 @@ def test_names_that_it_gives_are_there(constraint):
 def test_the_papers_constraints_come_first():
     assert PAPER == NAMES[:4] == ("heading", "affordance", "pose", "trajectory")
     assert OURS == NAMES == TaskConfig().constraints
-    assert [c.name for c in known(TaskConfig(constraints=("trajectory", "heading")))] == ["heading", "trajectory"]
+    assert [c.name for c in known(TaskConfig(constraints=("trajectory", "heading")))] == [
+        "heading",
+        "trajectory",
+    ]
 
 
 def test_what_is_not_known_is_named():
-    with pytest.raises(CongraspError, match=r"no constraint 'glove'.*Choose from: heading, affordance"):
+    with pytest.raises(
+        CongraspError, match=r"no constraint 'glove'.*Choose from: heading, affordance"
+    ):
         get_constraint("glove")
     with pytest.raises(CongraspError, match="heading is always active"):
         known(TaskConfig(constraints=("pose",)))
     with pytest.raises(
-        CongraspError, match=r"The policy does not support the constraint 'fingers'.*constraints … fingers"
+        CongraspError,
+        match=r"The policy does not support the constraint 'fingers'.*constraints … fingers",
     ):
         require_known(["heading", "fingers"], TaskConfig(constraints=PAPER))
 
@@ -188,15 +221,25 @@ def test_what_is_not_known_is_named():
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000))
 def test_nothing_depends_on_where_the_scene_is(seed):
-    """With every constraint active; as heights decide on `drop`, rewards allow only level motions."""
+    """With every constraint active; as heights decide on `drop`, rewards allow only level
+    motions.
+    """
     state, surface, goal = scene(seed)
     rng = np.random.default_rng(seed)
     action = rng.normal(size=(4, F + 6)).astype(np.float32)
-    level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
+    level = moved(
+        state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3))
+    )
     free = moved(state, rng.normal(size=3), Rotation.random(rng=rng))
     here, turned, anywhere = (_judged(each, surface, goal, action) for each in (state, level, free))
-    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, rtol=2e-3, atol=5e-3), turned[0], here[0])
-    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, atol=2e-3), anywhere[1], here[1])
+    jax.tree.map(
+        lambda *values: np.testing.assert_allclose(*values, rtol=2e-3, atol=5e-3),
+        turned[0],
+        here[0],
+    )
+    jax.tree.map(
+        lambda *values: np.testing.assert_allclose(*values, atol=2e-3), anywhere[1], here[1]
+    )
 
 
 @jax.jit
@@ -216,18 +259,25 @@ def test_a_task_ignores_what_it_does_not_know():
     flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
     known_alone = Goal({name: goal[name] for name in PAPER}, flags)
     some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
-    np.testing.assert_array_equal(some.features.center, kinematics.hand_center(HAND, some.features.keypoints))
+    np.testing.assert_array_equal(
+        some.features.center, kinematics.hand_center(HAND, some.features.keypoints)
+    )
     np.testing.assert_array_equal(evaluated(observe, some), evaluated(observe, more))
     paid = evaluated(reward_terms, some, task.reward)
     assert not {"force_over", "fingers_contact"} & {*paid}
     jax.tree.map(np.testing.assert_array_equal, paid, evaluated(reward_terms, more, task.reward))
     total = np.linalg.norm(more.features.force, axis=-1)
-    np.testing.assert_allclose(paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5)
+    np.testing.assert_allclose(
+        paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5
+    )
 
 
 def test_requests_fill_the_arrays_that_they_give():
     request = GraspRequest(
-        {"heading": {"direction": np.array([0.0, 1.0, 0.0])}, "fingers": {"allowed": [1, 0, 1, 0, 0]}}
+        {
+            "heading": {"direction": np.array([0.0, 1.0, 0.0])},
+            "fingers": {"allowed": [1, 0, 1, 0, 0]},
+        }
     )
     goal = goal_of(HAND, TASK, request)
     np.testing.assert_array_equal(goal["heading"].direction, np.array([0, 1, 0], np.float32))
@@ -238,10 +288,14 @@ def test_requests_fill_the_arrays_that_they_give():
 
 
 def test_active_blocks():
-    """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
+    """The paper's figure of priorities; the choice of fingers yields to a reference pose as the
+    affordance does.
+    """
     for flags in itertools.product([False, True], repeat=5):
         affordance, pose, trajectory, fingers, force = flags
-        found = active_blocks({c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)})
+        found = active_blocks(
+            {c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)}
+        )
         expected = {
             "affordance": affordance and not pose,
             "pose_finger": pose,
@@ -250,25 +304,39 @@ def test_active_blocks():
             "fingers": fingers and not pose,
             "force_limit": force,
         }
-        assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
+        assert {name: flags.tolist() for name, flags in found.items()} == {
+            n: [x, x] for n, x in expected.items()
+        }
 
 
 def _drawn(names: tuple[str, ...], never: str = "") -> InitialConditions:
-    """Episodes under these constraints, each of which half of them request, but one that none requests.
+    """Episodes under these constraints, each of which half of them request, but one that none
+    requests.
 
-    Not compiled as one program, in which the order of operations, and so the last bit, depends on the constraints.
+    Not compiled as one program, in which the order of operations, and so the last bit, depends on
+    the constraints.
     """
     shares = {f"p_{c.name}": 0.5 * (c.name != never) for c in OPTIONAL if c.name in names}
     task = dataclasses.replace(TASK, constraints=names, **shares)
     return jax.device_get(sample(HAND, task, suite.bank(), jax.random.key(3), DRAWN))
 
 
-def _same(some: InitialConditions, more: InitialConditions, but: str, check: Callable = np.testing.assert_array_equal):
-    """Everything that does not belong to one constraint is the same, but for places of hands whose fingers it chose."""
+def _same(
+    some: InitialConditions,
+    more: InitialConditions,
+    but: str,
+    check: Callable = np.testing.assert_array_equal,
+):
+    """Everything that does not belong to one constraint is the same, but for places of hands whose
+    fingers it chose.
+    """
     moved = more.goal.active["fingers"] if but == "fingers" else np.zeros(1, bool)
-    position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
+    position = np.where(
+        moved[:, None], some.goal["heading"].position, more.goal["heading"].position
+    )
     base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
-    q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)  # opened to the width at the heading
+    # Opened to the width at the heading
+    q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)
     more = more._replace(
         goal=more.goal.replace("heading", position=position),
         reset_state=more.reset_state._replace(base_position=base, q=q),
@@ -277,7 +345,9 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, check: Cal
     actives = [part.goal.active for part in (some, more)]
     own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
     assert (
-        goals[0] and set(goals[1]) - set(goals[0]) <= own and set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
+        goals[0]
+        and set(goals[1]) - set(goals[0]) <= own
+        and set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
     )
     for one, other in (goals, actives):
         for name in one:
@@ -289,7 +359,9 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, check: Cal
 @pytest.mark.slow
 @each_optional
 def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint):
-    """A policy that knows a constraint, of which no episode has it, learns from the same episodes."""
+    """A policy that knows a constraint, of which no episode has it, learns from the same
+    episodes.
+    """
     others = tuple(name for name in NAMES if name != constraint.name)
     some, all_of_them = _drawn(others), _drawn(NAMES, never=constraint.name)
     assert not any(np.any(all_of_them.goal.active[block]) for block in constraint.blocks)
@@ -298,9 +370,13 @@ def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint
 
 def test_episodes_with_fingers_are_those_without_in_all_else():
     """By compiled programs, whose last bits depend on the constraints."""
-    without = dataclasses.replace(TASK, constraints=tuple(name for name in NAMES if name != "fingers"))
+    without = dataclasses.replace(
+        TASK, constraints=tuple(name for name in NAMES if name != "fingers")
+    )
     some, more = suite.episodes(DRAWN, task=without), suite.episodes(DRAWN)
-    _same(some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6))
+    _same(
+        some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
+    )
     chosen, pose = (np.asarray(more.goal.active[name]) for name in ("fingers", "pose_finger"))
     assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15
 

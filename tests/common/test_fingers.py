@@ -32,13 +32,15 @@ HEADING = get_constraint("heading")
 TASK = TaskConfig(constraints=("heading", "fingers"))
 BOX = procedural.generate(0, "box")
 PINCH = np.array([[True, True, False, False, False]])
-# Links and tips in the order of the human hand: palm, then three links of thumb, index, middle, ring and little finger.
+# Links and tips in the order of the human hand: palm, then three links of thumb, index, middle,
+# ring and little finger.
 PALM, THUMB, INDEX, MIDDLE, RING = 0, 3, 6, 9, 12
 THUMB_TIP, MIDDLE_TIP, RING_TIP = 16, 18, 19
 
 
 def pinch(on: bool = True):
-    """The object is 2 cm from the middle finger's skin, 4 mm from the ring finger's, and far from the rest.
+    """The object is 2 cm from the middle finger's skin, 4 mm from the ring finger's, and far from
+    the rest.
 
     Palm, thumb, index, middle and ring finger touch it; index and middle with 3 and 5 N.
     """
@@ -51,7 +53,9 @@ def pinch(on: bool = True):
     touching = np.isin(np.arange(L), (PALM, THUMB, INDEX, MIDDLE, RING))[None]
     force = np.zeros((1, L, 3), np.float32)
     force[0, INDEX, 0], force[0, MIDDLE, 2] = 3.0, 5.0
-    return made._replace(features=made.features._replace(nearest=nearest, touching=touching, force=force))
+    return made._replace(
+        features=made.features._replace(nearest=nearest, touching=touching, force=force)
+    )
 
 
 def test_the_hand_knows_which_finger_a_link_belongs_to():
@@ -75,7 +79,8 @@ def test_observation_by_hand():
 
 def test_reward_by_hand():
     paid = evaluated(FINGERS.reward, pinch())
-    # softplus((10 - 20 mm) / 3 mm) = 0.03505, softplus((10 - 4 mm) / 3 mm) = 2.12693, and nothing 19 cm away.
+    # softplus((10 - 20 mm) / 3 mm) = 0.03505, softplus((10 - 4 mm) / 3 mm) = 2.12693, and nothing
+    # 19 cm away.
     np.testing.assert_allclose(paid["fingers_distance"], [-2.16198], rtol=1e-5)
     np.testing.assert_allclose(paid["fingers_contact"], [-2.0])
     assert not any(np.any(value) for value in evaluated(FINGERS.reward, pinch(on=False)).values())
@@ -85,11 +90,19 @@ def test_reward_by_hand():
 
 
 def test_only_the_named_fingers_and_the_palm_earn():
-    weights, unit = HAND.contact_weights, RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0)
-    paid, free = evaluated(reward_terms, pinch(), unit), evaluated(reward_terms, pinch(on=False), unit)
+    weights, unit = (
+        HAND.contact_weights,
+        RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0),
+    )
+    paid, free = (
+        evaluated(reward_terms, pinch(), unit),
+        evaluated(reward_terms, pinch(on=False), unit),
+    )
     np.testing.assert_allclose(paid["contact"], [weights[[PALM, THUMB, INDEX]].sum()], rtol=1e-6)
     np.testing.assert_allclose(paid["force"], [weights[INDEX] * 3 / 5], rtol=1e-6)
-    np.testing.assert_allclose(free["contact"], [weights[[PALM, THUMB, INDEX, MIDDLE, RING]].sum()], rtol=1e-6)
+    np.testing.assert_allclose(
+        free["contact"], [weights[[PALM, THUMB, INDEX, MIDDLE, RING]].sum()], rtol=1e-6
+    )
     np.testing.assert_allclose(free["force"], [weights[INDEX] * 3 / 5 + weights[MIDDLE]], rtol=1e-6)
 
 
@@ -108,7 +121,9 @@ def test_error_is_the_share_of_other_fingers_links():
 
 
 def test_draws_are_the_thumb_with_any_of_the_others():
-    """By hand: 15 sets of the human hand; half of the draws are pinch, tripod or all, the other half any of the 15."""
+    """By hand: 15 sets of the human hand; half of the draws are pinch, tripod or all, the other
+    half any of the 15.
+    """
     zero = np.zeros(6000, int)
     uniform = np.random.default_rng(0).uniform(size=(6000, 1)).astype(np.float32)
     allowed = np.asarray(FINGERS.sample(HAND, Draw(None, zero, zero, zero, {}), uniform).allowed)
@@ -125,7 +140,9 @@ def test_draws_are_the_thumb_with_any_of_the_others():
 @pytest.mark.parametrize(("hand", "count"), [("human", 15), ("allegro", 7)])
 def test_sets_are_all_with_a_thumb_and_another_finger(hand, count):
     sets, shares = finger_sets(get_hand(hand))
-    assert len(sets) == count == len({row.tobytes() for row in sets}) and shares.sum() == pytest.approx(1.0)
+    assert len(sets) == count == len(
+        {row.tobytes() for row in sets}
+    ) and shares.sum() == pytest.approx(1.0)
     assert sets[:, 0].all() and sets[:, 1:].any(-1).all()
     likely = {tuple(row.nonzero()[0].tolist()) for row in sets[shares > 2 * shares.min()]}
     assert likely == {(0, 1), (0, 1, 2), tuple(range(sets.shape[1]))}
@@ -134,11 +151,15 @@ def test_sets_are_all_with_a_thumb_and_another_finger(hand, count):
 def test_a_set_needs_the_thumb_and_another_finger():
     surface = Surface(np.zeros((4, 4, 3)), np.zeros((4, 4), bool))
     allowed = np.array([[1, 0, 0, 0, 0], [0, 1, 1, 0, 0], [1, 0, 0, 1, 0], [1, 1, 1, 1, 1]], bool)
-    np.testing.assert_array_equal(FINGERS.valid(surface, FingersGoal(allowed)), [False, False, True, True])
+    np.testing.assert_array_equal(
+        FINGERS.valid(surface, FingersGoal(allowed)), [False, False, True, True]
+    )
 
 
 def test_the_hand_centre_is_that_of_the_set():
-    """By hand, of tips on a line: a pinch is midway between thumb and index, thumb and two others at their mean."""
+    """By hand, of tips on a line: a pinch is midway between thumb and index, thumb and two others
+    at their mean.
+    """
     points = np.zeros((3, len(HAND.keypoints), 3), np.float32)
     points[:, len(HAND.links) :, 0] = [0.0, 0.2, 0.4, 0.6, 1.2]
     fingers = np.array([[1, 1, 0, 0, 0], [1, 0, 1, 0, 1], [1, 1, 1, 1, 1]], bool)
@@ -147,16 +168,25 @@ def test_the_hand_centre_is_that_of_the_set():
     with_pinch, without = pinch(), pinch(on=False)
     tips = np.asarray(with_pinch.features.keypoints)[:, len(HAND.links) :]
     np.testing.assert_allclose(with_pinch.features.center, (tips[:, 0] + tips[:, 1]) / 2, atol=1e-6)
-    np.testing.assert_allclose(without.features.center, (tips[:, 0] + tips[:, 1:].mean(1)) / 2, atol=1e-6)
+    np.testing.assert_allclose(
+        without.features.center, (tips[:, 0] + tips[:, 1:].mean(1)) / 2, atol=1e-6
+    )
 
 
 def test_the_distance_reward_is_that_of_the_set():
-    """By hand: 21 keypoints, of which 5 tips count four times, are 36 units; of a pinch 1 + 6 + 2 x 4 = 15 count."""
+    """By hand: 21 keypoints, of which 5 tips count four times, are 36 units; of a pinch 1 + 6 + 2 x
+    4 = 15 count.
+    """
     assert len(HAND.keypoints) == 21
-    made = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))["distance"]
-    # 6 link origins and the palm at 0.2 m, the thumb's tip at 1 mm, the index finger's at 0.2 m; all weigh 21 together.
+    made = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))[
+        "distance"
+    ]
+    # 6 link origins and the palm at 0.2 m, the thumb's tip at 1 mm, the index finger's at 0.2 m;
+    # all weigh 21 together.
     np.testing.assert_allclose(made, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
-    free = evaluated(reward_terms, pinch(on=False), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))["distance"]
+    free = evaluated(
+        reward_terms, pinch(on=False), RewardWeights(**dict.fromkeys(terms(TASK), 1.0))
+    )["distance"]
     far = 16 * 0.2 + 4 * (0.001 + 0.2 + 0.027 + 0.0108 + 0.2)
     np.testing.assert_allclose(free, [-21 / 36 * far], rtol=1e-5)
 
@@ -170,7 +200,9 @@ def test_fingers_that_may_not_touch_move_neither_centre_nor_distance(seed, which
     owner = HAND.link_fingers[HAND.keypoint_links]
     other = (owner >= 0) & ~chosen[0][owner]
     moved = points + other[:, None] * rng.normal(size=points.shape).astype(np.float32)
-    np.testing.assert_allclose(hand_center(HAND, points, chosen), hand_center(HAND, moved, chosen), atol=1e-6)
+    np.testing.assert_allclose(
+        hand_center(HAND, points, chosen), hand_center(HAND, moved, chosen), atol=1e-6
+    )
     weights = np.asarray(keypoint_weights(HAND, chosen))
     assert (weights[:, other] == 0).all() and (weights[:, ~other] > 0).all()
     np.testing.assert_allclose(weights.sum(-1), HAND.keypoint_weights.sum(), rtol=1e-5)
@@ -179,7 +211,9 @@ def test_fingers_that_may_not_touch_move_neither_centre_nor_distance(seed, which
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_a_pinch_begins_and_ends_at_the_heading(seed):
-    """The wrist is placed by the set's centre, so that a hand that only moves forward arrives with no error."""
+    """The wrist is placed by the set's centre, so that a hand that only moves forward arrives with
+    no error.
+    """
     goal = dataclasses.replace(scene(seed)[2], active=active("fingers"))
     np.testing.assert_allclose(_arrived(goal), goal["heading"].position, atol=1e-5)
 
@@ -191,7 +225,9 @@ def _arrived(goal):
     position, quaternion = HEADING.initial_wrist(HAND, jnp.full(4, TASK.back_off), goal, q)[1:]
     points = kinematics.keypoints(HAND, kinematics.link_transforms(HAND, q))
     center = hand_center(HAND, points, goal["fingers"].allowed)
-    return position + TASK.back_off * goal["heading"].direction + rotations.rotate(quaternion, center)
+    return (
+        position + TASK.back_off * goal["heading"].direction + rotations.rotate(quaternion, center)
+    )
 
 
 @pytest.mark.parametrize("hand", pretrained_hands())
@@ -204,17 +240,30 @@ def test_words():
     parsed = FINGERS.parse({"fingers": ("index", "thumb")}, HAND, BOX)
     np.testing.assert_array_equal(parsed["allowed"], PINCH[0])
     assert parsed["allowed"].dtype == bool
-    for written in (("thumb", "index"), "thumb index", "thumb, index", "thumb,index", ["thumb", "index"]):
+    for written in (
+        ("thumb", "index"),
+        "thumb index",
+        "thumb, index",
+        "thumb,index",
+        ["thumb", "index"],
+    ):
         np.testing.assert_array_equal(
             read_request(BOX, HAND, 15, fingers=written).given("fingers", "allowed"), PINCH[0]
         )
     assert read_request(BOX, HAND, 15).given("fingers", "allowed") is None
-    assert FINGERS.parse({"fingers": ()}, HAND, BOX) is None and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
-    with pytest.raises(CongraspError, match=r"has no finger 'pinky'.*Known: thumb, index, middle, ring, little"):
+    assert (
+        FINGERS.parse({"fingers": ()}, HAND, BOX) is None
+        and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
+    )
+    with pytest.raises(
+        CongraspError, match=r"has no finger 'pinky'.*Known: thumb, index, middle, ring, little"
+    ):
         FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND, BOX)
     with pytest.raises(CongraspError, match="no finger 'little'"):
         FINGERS.parse({"fingers": ("thumb", "little")}, get_hand("allegro"), BOX)
-    with pytest.raises(CongraspError, match=r"^--fingers lacks the thumb, which every grasp needs\. Add thumb\.$"):
+    with pytest.raises(
+        CongraspError, match=r"^--fingers lacks the thumb, which every grasp needs\. Add thumb\.$"
+    ):
         FINGERS.parse({"fingers": ("index", "middle")}, HAND, BOX)
     for one in (("thumb",), ("thumb", "thumb")):
         with pytest.raises(CongraspError, match="names only one finger"):
@@ -222,13 +271,21 @@ def test_words():
 
 
 def test_features_of_a_whole_step_reach_it():
-    """Against NumPy, on a random scene: the finger's room is that of its nearest keypoint's skin."""
+    """Against NumPy, on a random scene: the finger's room is that of its nearest keypoint's
+    skin.
+    """
     state, surface, goal = scene(4)
     made = scene_of(TASK, state, surface, goal)
     ((_, room, _),) = evaluated(FINGERS.observe, made)
     skin = np.linalg.norm(made.features.nearest, axis=-1) - HAND.keypoint_radii
     for finger in range(5):
-        own = [i for i, link in enumerate(HAND.keypoint_links) if (link - 1) // 3 == finger and link > 0]
+        own = [
+            i
+            for i, link in enumerate(HAND.keypoint_links)
+            if (link - 1) // 3 == finger and link > 0
+        ]
         assert len(own) == 4  # three joints and a tip
-        expected = np.where(goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, own].min(-1), 0.1))
+        expected = np.where(
+            goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, own].min(-1), 0.1)
+        )
         np.testing.assert_allclose(room[:, finger], expected, atol=1e-6)

@@ -38,21 +38,34 @@ def test_observation_by_hand():
     ((limit, over),) = evaluated(FORCE.observe, pressing())
     np.testing.assert_allclose(limit, [[0.15]])
     expected = np.zeros((1, L))
-    expected[0, THUMB], expected[0, MIDDLE] = 2 / 7, 17 / 22  # 2 and 17 N too much, over as much and 5 N
+    # 2 and 17 N too much, over as much and 5 N
+    expected[0, THUMB], expected[0, MIDDLE] = (
+        2 / 7,
+        17 / 22,
+    )
     np.testing.assert_allclose(over, expected, rtol=1e-6)
-    assert [(field.size, field.privileged) for field in fields(HAND, TASK)["force_limit"]] == [(1, False), (L, True)]
+    assert [(field.size, field.privileged) for field in fields(HAND, TASK)["force_limit"]] == [
+        (1, False),
+        (L, True),
+    ]
 
 
 def test_reward_by_hand():
-    np.testing.assert_allclose(evaluated(FORCE.reward, pressing())["force_over"], [-12.0])  # 2 N, and 10 of the 17
+    # 2 N, and 10 of the 17
+    np.testing.assert_allclose(evaluated(FORCE.reward, pressing())["force_over"], [-12.0])
     assert not np.any(evaluated(FORCE.reward, pressing(on=False))["force_over"])
-    np.testing.assert_allclose(evaluated(reward_terms, pressing(), RewardWeights())["force_over"], [-0.6])
+    np.testing.assert_allclose(
+        evaluated(reward_terms, pressing(), RewardWeights())["force_over"], [-0.6]
+    )
 
 
 @pytest.mark.parametrize(("limit", "most"), [(3.0, 3.0), (12.0, 5.0)])
 def test_force_beyond_the_limit_earns_nothing(limit, most):
     """f_max is the smaller one of 5 N and the limit."""
-    unit, weights = RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0), HAND.contact_weights
+    unit, weights = (
+        RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0),
+        HAND.contact_weights,
+    )
     paid, free = (
         evaluated(reward_terms, pressing(limit=limit), unit),
         evaluated(reward_terms, pressing(on=False, limit=limit), unit),
@@ -60,12 +73,17 @@ def test_force_beyond_the_limit_earns_nothing(limit, most):
     expected = weights[THUMB] + weights[INDEX] * 2 / most + weights[MIDDLE]
     np.testing.assert_allclose(paid["force"], [expected], rtol=1e-6)
     np.testing.assert_allclose(paid["force_excess"], [-(5 - most) - (20 - most)], rtol=1e-6)
-    np.testing.assert_allclose(free["force"], [weights[THUMB] + weights[INDEX] * 2 / 5 + weights[MIDDLE]], rtol=1e-6)
+    np.testing.assert_allclose(
+        free["force"], [weights[THUMB] + weights[INDEX] * 2 / 5 + weights[MIDDLE]], rtol=1e-6
+    )
     np.testing.assert_allclose(free["force_excess"], [-15.0], rtol=1e-6)
 
 
 def test_error_is_the_share_of_steps_in_which_a_link_presses_too_hard():
-    hard, soft = evaluated(metrics.errors, pressing()), evaluated(metrics.errors, pressing(limit=20.5))
+    hard, soft = (
+        evaluated(metrics.errors, pressing()),
+        evaluated(metrics.errors, pressing(limit=20.5)),
+    )
     assert (hard["force_ratio"][0], soft["force_ratio"][0]) == (1.0, 0.0)
     sums, yes, no = metrics.empty_sums(TASK, 1), np.ones(1, bool), np.zeros(1, bool)
     for step, hold in ((hard, no), (hard, yes), (soft, yes), (soft, yes), (soft, yes)):
@@ -74,7 +92,9 @@ def test_error_is_the_share_of_steps_in_which_a_link_presses_too_hard():
 
 
 def test_the_least_limit_carries_half_of_the_weight():
-    """By hand: 1 kg under friction 1 and 0.5, 100 g, and 10 kg: 9.81 / 2, 9.81, 1 (not 0.49) and 20 (not 49) N."""
+    """By hand: 1 kg under friction 1 and 0.5, 100 g, and 10 kg: 9.81 / 2, 9.81, 1 (not 0.49) and 20
+    (not 49) N.
+    """
     found = least_force(np.array([1.0, 1.0, 0.1, 10.0]), np.array([1.0, 0.5, 1.0, 1.0]))
     np.testing.assert_allclose(found, [4.905, 9.81, 1.0, 20.0], rtol=1e-6)
 
@@ -86,7 +106,11 @@ def _uniform(batch, seed):
 def test_draws_are_log_uniform_above_what_the_weight_needs():
     count = 4000
     zero, low = np.zeros(count, int), np.where(np.arange(count) % 2, 1.0, 5.0)
-    limit = np.asarray(FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, 2 * low / 9.81), _uniform(count, 0)).limit)
+    limit = np.asarray(
+        FORCE.sample(
+            HAND, Draw(None, zero, zero, zero, {}, 2 * low / 9.81), _uniform(count, 0)
+        ).limit
+    )
     for least in (1.0, 5.0):
         own = limit[low == least]
         assert own.min() >= least * 0.999 and own.max() <= 20.001
@@ -109,7 +133,9 @@ def test_a_drawn_limit_is_valid_and_enough(mass, friction, seed):
 @settings(max_examples=25, deadline=None)
 @given(st.floats(0.5, 30.0), st.floats(1.0, 3.0))
 def test_a_lower_limit_never_pays_more(limit, factor):
-    lower, higher = (evaluated(reward_terms, pressing(limit=x), RewardWeights()) for x in (limit, factor * limit))
+    lower, higher = (
+        evaluated(reward_terms, pressing(limit=x), RewardWeights()) for x in (limit, factor * limit)
+    )
     assert lower["force_over"] <= higher["force_over"] + 1e-6
     assert lower["force_excess"] <= higher["force_excess"] + 1e-6
 
@@ -117,7 +143,8 @@ def test_a_lower_limit_never_pays_more(limit, factor):
 def test_limits_that_no_hand_keeps_are_not_valid():
     surface = Surface(np.zeros((4, 1, 3)), np.zeros((4, 1), bool))
     np.testing.assert_array_equal(
-        FORCE.valid(surface, ForceGoal(np.array([0.0, -3.0, 0.5, 80.0]))), [False, False, True, False]
+        FORCE.valid(surface, ForceGoal(np.array([0.0, -3.0, 0.5, 80.0]))),
+        [False, False, True, False],
     )
 
 
@@ -127,11 +154,20 @@ def test_words():
     assert given.shape == () and given.dtype == np.float32 and given == 3.0
     assert read_request(mug, HAND, 15, force=2.5).given("force", "limit") == 2.5
     heavy = dataclasses.replace(mug, mass=1.0)
-    assert read_request(heavy, HAND, 15, gentle=True).given("force", "limit") == pytest.approx(4.905)
-    assert read_request(dataclasses.replace(mug, mass=0.05), HAND, 15, gentle=True).given("force", "limit") == 1.0
+    assert read_request(heavy, HAND, 15, gentle=True).given("force", "limit") == pytest.approx(
+        4.905
+    )
+    assert (
+        read_request(dataclasses.replace(mug, mass=0.05), HAND, 15, gentle=True).given(
+            "force", "limit"
+        )
+        == 1.0
+    )
     assert set(read_request(mug, HAND, 15, gentle=False).constraints) == {"heading"}
     for text in ("soft", "0", "-1", "1000", "nan"):
-        with pytest.raises(CongraspError, match=rf"--force is '{text}', not a number between 0\.5 and 50"):
+        with pytest.raises(
+            CongraspError, match=rf"--force is '{text}', not a number between 0\.5 and 50"
+        ):
             read_request(mug, HAND, 15, force=text)
     with pytest.raises(CongraspError, match="--force and --gentle both set the force limit"):
         read_request(mug, HAND, 15, force="3", gentle=True)

@@ -24,7 +24,12 @@ from tests.task import start_of
 ROBOTS = ("allegro", "sharpa")
 # Fingertips at zero, m, in the frame of the makers' models, thumb first.
 TIPS = {
-    "allegro": [(-0.0132, 0.1677, -0.0861), (0.0, 0.0553, 0.1334), (0.0, 0.0, 0.1362), (0.0, -0.0553, 0.1334)],
+    "allegro": [
+        (-0.0132, 0.1677, -0.0861),
+        (0.0, 0.0553, 0.1334),
+        (0.0, 0.0, 0.1362),
+        (0.0, -0.0553, 0.1334),
+    ],
     "sharpa": [
         (0.0154, 0.1233, 0.1102),
         (0.0010, 0.0303, 0.2004),
@@ -33,7 +38,11 @@ TIPS = {
         (0.0030, -0.0311, 0.1914),
     ],
 }
-ORIGIN = {"allegro": (0.0, 0.0, 0.095), "sharpa": (0.0, 0.0, 0.0)}  # of the makers' frame in the wrist frame
+# Of the makers' frame in the wrist frame
+ORIGIN = {
+    "allegro": (0.0, 0.0, 0.095),
+    "sharpa": (0.0, 0.0, 0.0),
+}
 
 
 @pytest.fixture(params=["human", "mano", *ROBOTS])
@@ -49,7 +58,9 @@ def _tips(hand, q):
     position, quaternion = mujoco_link_poses(hand, q)
     carriers = list(hand.tip_links)
     reach = np.array([np.subtract(hand.links[i].tip, link_origin(hand.links[i])) for i in carriers])
-    return position[carriers] + Rotation.from_quat(quaternion[carriers], scalar_first=True).apply(reach)
+    return position[carriers] + Rotation.from_quat(quaternion[carriers], scalar_first=True).apply(
+        reach
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -84,7 +95,11 @@ def test_joint_limits_torques_and_masses_are_the_makers():
     }
     for name, figures in expected.items():
         assert (joints[name].lower, joints[name].upper, joints[name].torque_limit) == figures, name
-    assert (allegro.object_scale, sharpa.object_scale, get_hand("human").object_scale) == (1.4, 1.1, 1.0)
+    assert (allegro.object_scale, sharpa.object_scale, get_hand("human").object_scale) == (
+        1.4,
+        1.1,
+        1.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,13 +171,21 @@ def test_opening_and_palm_side(hand):
     assert frame.cross @ (opened[1:].mean(0) - opened[0]) > 0  # from the thumb to the fingers
     np.testing.assert_allclose(gap[0], frame.opening, rtol=1e-5)
     np.testing.assert_allclose(frame.center, 0.5 * (opened[0] + opened[1:].mean(0)), atol=1e-6)
-    knuckles = np.mean([link_origin(link) for link in hand.links if link.name.endswith("_proximal")], 0)
+    knuckles = np.mean(
+        [link_origin(link) for link in hand.links if link.name.endswith("_proximal")], 0
+    )
     assert frame.heading @ (frame.center - knuckles) > 0.03
 
 
 def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
-    """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle carry 400 g."""
-    found = next(obj for i in range(99) if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03)
+    """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle
+    carry 400 g.
+    """
+    found = next(
+        obj
+        for i in range(99)
+        if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03
+    )
     task = TaskConfig(hand=hand.name)
     (cylinder,) = scale_objects(hand, task, [found])
     frame = grasp_frame(hand)
@@ -170,7 +193,9 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     center = 0.5 * (tips[0] + tips[1:].mean(0)) - 0.01 * frame.heading
     along = np.cross(frame.heading, frame.cross)
     axes = np.stack([frame.heading, frame.cross, along], -1)
-    down = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T)
+    down = Rotation.from_matrix(
+        np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T
+    )
     quaternion = (down * Rotation.from_matrix(axes)).as_quat(scalar_first=True)
     reset_state = start_of(
         mass_scale=np.full(1, 0.4 / cylinder.mass),
@@ -199,12 +224,15 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     fingers = {hand.links[i].name.partition("_")[0] for i in np.flatnonzero(touched)}
     assert "thumb" in fingers and len(fingers - {"palm"}) >= 3, fingers
     moved = np.asarray(after.object_position[0]) - reset_state.object_position[0]
-    assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"  # fingers may pull it into the palm
+    # Fingers may pull it into the palm
+    assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"
     assert max(speeds) < 0.05, "the object shakes"
 
 
 def test_scaled_objects_keep_their_density():
-    obj = dataclasses.replace(procedural.generate(3, "mug"), origin=(0.1, 0.0, -0.2), file_scale=0.01)
+    obj = dataclasses.replace(
+        procedural.generate(3, "mug"), origin=(0.1, 0.0, -0.2), file_scale=0.01
+    )
     larger = obj.scaled(1.4)
     assert larger.mass == pytest.approx(1.4**3 * obj.mass)
     np.testing.assert_allclose(larger.inertia, 1.4**5 * obj.inertia)
@@ -233,8 +261,11 @@ def test_a_hand_that_does_not_exist_is_one_line_with_those_that_do():
 
 
 def test_links_that_nest_do_not_collide_and_all_others_do(hand):
-    """With self-collision an open hand touches nothing of its own, and a fist comes to rest on itself."""
-    assert get_hand("allegro") is not hand or overlapping(hand) == (("palm", "thumb_proximal"),)  # as the makers say
+    """With self-collision an open hand touches nothing of its own, and a fist comes to rest on
+    itself.
+    """
+    # As the makers say
+    assert get_hand("allegro") is not hand or overlapping(hand) == (("palm", "thumb_proximal"),)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = 0.0025

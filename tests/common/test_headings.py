@@ -1,4 +1,6 @@
-"""Heading sets against the paper's rules, checked from their definitions, and table geometry worked out by hand."""
+"""Heading sets against the paper's rules, checked from their definitions, and table geometry worked
+out by hand.
+"""
 
 import dataclasses
 from types import SimpleNamespace
@@ -49,7 +51,9 @@ def defined_width(points, position, direction, cross):
 
 
 def defined_opposition(obj, touchable, position, direction, cross, rounding):
-    """The definition, one heading at a time: on both sides a normal within 45 degrees of the cross-finger axis."""
+    """The definition, one heading at a time: on both sides a normal within 45 degrees of the
+    cross-finger axis.
+    """
     offset = (obj.points - position)[:256]
     breadth, depth = np.abs(offset @ np.cross(direction, cross)), offset @ direction
     slab = (breadth < 0.03 + rounding) & (depth < 0.01 + rounding) & touchable[:256]
@@ -70,22 +74,29 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(cross, axis=-1), 1, atol=1e-5)
     np.testing.assert_allclose((direction * cross).sum(-1), 0, atol=1e-5)
-    # Two centimetres back lies a surface point, and the direction is within 30 degrees of its inward normal.
+    # Two centimetres back lies a surface point, and the direction is within 30 degrees of its
+    # inward normal.
     back = position - INWARD * direction
     distance = np.linalg.norm(back[:, None] - obj.points, axis=-1)
     source = distance.argmin(-1)
     assert distance.min(-1).max() < 1e-5
     assert -(direction * obj.normals[source]).sum(-1).min() > np.cos(np.radians(30)) - 1e-5
-    widths = [defined_width(obj.points[:256], *heading) for heading in zip(position, direction, cross, strict=True)]
+    widths = [
+        defined_width(obj.points[:256], *heading)
+        for heading in zip(position, direction, cross, strict=True)
+    ]
     np.testing.assert_allclose(local_width(headings, obj.points), widths, atol=1e-5)
     assert max(widths) <= MAX_WIDTH + 1e-5
     avoid = obj.non_graspable_points
     touchable = ~avoid | (not affordance)
     for heading in zip(position, direction, cross, strict=True):
-        assert any(defined_opposition(obj, touchable, *heading, rounding) for rounding in (0, 1e-6, -1e-6))
+        assert any(
+            defined_opposition(obj, touchable, *heading, rounding) for rounding in (0, 1e-6, -1e-6)
+        )
     if affordance:
         assert not avoid[source].any()
-        # No point of the avoid region within 1 cm of the approach, and the end nearer to the graspable one.
+        # No point of the avoid region within 1 cm of the approach, and the end nearer to the
+        # graspable one.
         along = np.linspace(0, 0.15, 60)
         for p, v in zip(position[::16], direction[::16], strict=True):
             way = p - along[:, None] * v
@@ -106,7 +117,8 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
 def test_headings_repeat_with_the_random_state_and_differ_without():
     obj = generate(0, "hammer")
     first, again, other = (
-        sample_headings(obj, np.random.default_rng(seed), use_affordance=True).position for seed in (1, 1, 2)
+        sample_headings(obj, np.random.default_rng(seed), use_affordance=True).position
+        for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(np.concatenate([first, other]), axis=0)) > 400
@@ -114,7 +126,9 @@ def test_headings_repeat_with_the_random_state_and_differ_without():
 
 def test_directions_fill_the_cone_evenly():
     obj = generate(0, "box")
-    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=False, count=4000, attempts=20)
+    headings = sample_headings(
+        obj, np.random.default_rng(0), use_affordance=False, count=4000, attempts=20
+    )
     back = headings.position - INWARD * headings.direction
     source = np.linalg.norm(back[:, None] - obj.points, axis=-1).argmin(-1)
     cosine = -(headings.direction * obj.normals[source]).sum(-1)
@@ -125,7 +139,10 @@ def test_directions_fill_the_cone_evenly():
 def test_narrow_rolls_are_preferred():
     obj = generate(5, "screwdriver")
     headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
-    assert np.median([defined_width(obj.points, *heading) for heading in zip(*headings, strict=True)]) < 0.05
+    assert (
+        np.median([defined_width(obj.points, *heading) for heading in zip(*headings, strict=True)])
+        < 0.05
+    )
 
 
 def test_the_first_surface_that_the_hand_meets_is_the_headings():
@@ -140,16 +157,24 @@ def test_the_first_surface_that_the_hand_meets_is_the_headings():
 
 def test_few_headings_are_repeated():
     obj = generate(0, "ball")
-    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.073, attempts=1)
+    tight = sample_headings(
+        obj, np.random.default_rng(0), use_affordance=False, max_width=0.073, attempts=1
+    )
     assert tight.position.shape == (256, 3)
     different = len(np.unique(tight.position, axis=0))
     assert 0 < different < 256
-    np.testing.assert_array_equal(tight.position[different : 2 * different], tight.position[:different])
+    np.testing.assert_array_equal(
+        tight.position[different : 2 * different], tight.position[:different]
+    )
 
 
 def test_what_is_wider_than_the_hand_opens_has_no_heading():
-    with pytest.raises(TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* but the hand opens to 5\.0 cm"):
-        sample_headings(generate(0, "ball"), np.random.default_rng(0), use_affordance=False, max_width=0.05)
+    with pytest.raises(
+        TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* but the hand opens to 5\.0 cm"
+    ):
+        sample_headings(
+            generate(0, "ball"), np.random.default_rng(0), use_affordance=False, max_width=0.05
+        )
 
 
 def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
@@ -159,12 +184,15 @@ def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
     for cut, held in ((0.3, False), (0.9, True)):
         labels = (height < np.quantile(height, 1 - cut)).astype(np.int32)
         capped = dataclasses.replace(ball, labels=labels, graspable=np.array([True, False]))
-        assert (sample_headings(capped, np.random.default_rng(0), use_affordance=True) is not None) is held
+        assert (
+            sample_headings(capped, np.random.default_rng(0), use_affordance=True) is not None
+        ) is held
 
 
 def test_a_part_that_cannot_be_held_alone_is_approached_if_that_is_wished():
     block = generate(0, "box")
-    outer = np.flatnonzero(block.points[:, 2] > block.points[:, 2].max() - 0.004)  # one face: fingers meet the sides
+    # One face: fingers meet the sides
+    outer = np.flatnonzero(block.points[:, 2] > block.points[:, 2].max() - 0.004)
     labels = np.ones(len(block.points), np.int32)
     labels[outer] = 0
     spot = dataclasses.replace(block, labels=labels, graspable=np.array([True, False]))
@@ -178,7 +206,9 @@ def test_a_part_that_cannot_be_held_alone_is_approached_if_that_is_wished():
 def test_an_object_without_o_plus_still_gets_headings():
     obj = generate(0, "box")
     barren = dataclasses.replace(obj, graspable=np.zeros(2, bool))
-    assert np.isfinite(sample_headings(barren, np.random.default_rng(0), use_affordance=False).position).all()
+    assert np.isfinite(
+        sample_headings(barren, np.random.default_rng(0), use_affordance=False).position
+    ).all()
     assert sample_headings(barren, np.random.default_rng(0), use_affordance=True) is None
 
 
@@ -195,7 +225,8 @@ def test_feasible_keeps_what_stays_above_the_table():
     )
     np.testing.assert_array_equal(feasible(headings, FLAT), [1, 0, 1, 0, 1, 0, 0])
     np.testing.assert_array_equal(
-        feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]), ANY)), [1, 1, 1, 0, 1, 1, 0]
+        feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]), ANY)),
+        [1, 1, 1, 0, 1, 1, 0],
     )
     upside_down = np.array([0, 0, 0.05, 0, 1.0, 0, 0])
     np.testing.assert_array_equal(feasible(headings, upside_down)[[0, 3]], [0, 1])
@@ -232,7 +263,8 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(
-    "family", [pytest.param(name, marks=[pytest.mark.slow] * (i % 4 > 0)) for i, name in enumerate(FAMILIES)]
+    "family",
+    [pytest.param(name, marks=[pytest.mark.slow] * (i % 4 > 0)) for i, name in enumerate(FAMILIES)],
 )
 def test_every_family_can_be_reached_in_its_likeliest_pose(family, seed):
     obj = generate(seed, family)
@@ -240,7 +272,9 @@ def test_every_family_can_be_reached_in_its_likeliest_pose(family, seed):
     assert feasible(clear_table(headings, obj.rest_poses[0]), obj.rest_poses[0]).mean() > 0.1
 
 
-@pytest.mark.parametrize("family", ["bottle", "mug", "teapot", "hammer", "pan", "flashlight", "camera", "cup", "ring"])
+@pytest.mark.parametrize(
+    "family", ["bottle", "mug", "teapot", "hammer", "pan", "flashlight", "camera", "cup", "ring"]
+)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_parts_that_are_made_to_be_held_can_be(family, seed):
     obj = generate(seed, family)
@@ -258,13 +292,16 @@ def test_a_hand_needs_room_below_its_centre():
     assert feasible(higher, FLAT, bar)[0]  # 4.1 cm high
     down = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.06], DOWN, LEVEL)))
     cleared = clear_table(down, FLAT, bar)
-    np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)  # 1 cm high: as thick as the bar is
+    # 1 cm high: as thick as the bar is
+    np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)
     assert feasible(cleared, FLAT, bar)[0]
 
 
 def test_a_hand_may_close_on_its_way_to_the_table_as_far_as_the_object_lets_it():
     """Open it reaches 5 cm down, closed 1 cm; its centre is 3 cm high."""
-    hand = Outline(np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]), np.array([0.1, 0.05]))
+    hand = Outline(
+        np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]), np.array([0.1, 0.05])
+    )
     cross = np.array([[0, 1, 0]], np.float32)  # v x w is up
     low = Headings(np.array([[0, 0, -0.02]], np.float32), np.array([LEVEL], np.float32), cross)
     assert feasible(low, FLAT, hand)[0]
@@ -277,20 +314,25 @@ def test_the_width_is_that_of_the_slab_where_fingers_close():
     """A cross of two bars, 4 x 10 cm and 10 x 2 cm, whose centre the hand comes to from above."""
     one, other = np.meshgrid(np.linspace(-0.05, 0.05, 11), [0.0])
     along_x = np.stack([one, other, 0 * one], -1).reshape(-1, 3)
-    points = np.concatenate([along_x, 0.4 * along_x[:, [1, 0, 2]], [[0.09, 0, -0.05], [0.09, 0.04, 0]]])
+    points = np.concatenate(
+        [along_x, 0.4 * along_x[:, [1, 0, 2]], [[0.09, 0, -0.05], [0.09, 0.04, 0]]]
+    )
     headings = Headings(
         np.zeros((3, 3), np.float32),
         np.array([DOWN, DOWN, LEVEL], np.float32),
         np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32),
     )
-    # 9 cm out is a point 5 cm below, past the fingers' end, and one 4 cm aside; both lie beyond a level hand's reach.
+    # 9 cm out is a point 5 cm below, past the fingers' end, and one 4 cm aside; both lie beyond a
+    # level hand's reach.
     np.testing.assert_allclose(local_width(headings, points), [0.1, 0.04, 0.0], atol=1e-6)
     far = headings._replace(position=np.float32([[0, 1, 0]] * 3))
     np.testing.assert_array_equal(local_width(far, points)[:1], 0)
 
 
 def test_a_heading_moves_back_no_further_than_its_grasp_can_bear():
-    """At heights of 0 and -10 mm a centre that needs 1 cm moves 1 and 2 cm: the latter only where there is no other."""
+    """At heights of 0 and -10 mm a centre that needs 1 cm moves 1 and 2 cm: the latter only where
+    there is no other.
+    """
     both = made(([0, 0, -0.05], DOWN), ([0, 0, -0.06], DOWN))
     point = SimpleNamespace(points=np.zeros((1, 3)))
     (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER, opposed=False)
@@ -321,7 +363,8 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
 
 def test_a_card_is_approached_as_well_as_it_goes():
     card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
-    tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]), ANY)  # fingers reach 6 cm beyond the centre
+    # Fingers reach 6 cm beyond the centre
+    tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]), ANY)
     assert not feasible(clear_table(card, FLAT, tall), FLAT, tall).any()
     point = SimpleNamespace(points=np.zeros((1, 3)))
     (cleared,), (reachable,) = within_reach(card, point, FLAT[None], tall, opposed=False)
@@ -330,8 +373,8 @@ def test_a_card_is_approached_as_well_as_it_goes():
 
 
 def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
-    """Two edges from the origin along x and y, and a strip 4 cm wide a metre away; along the diagonal, turned by 5
-    degrees, one edge's normal is at 50 degrees to the cross-finger axis."""
+    """Two edges from the origin along x and y, and a strip 4 cm wide a metre away; along the
+    diagonal, turned by 5 degrees, one edge's normal is at 50 degrees to the cross-finger axis."""
     t = np.linspace(0.002, 0.06, 30)[:, None]
     x, y = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     points = np.concatenate([t * x, t * y, 0.98 * y + t * x, 1.02 * y + t * x])
@@ -341,27 +384,36 @@ def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
     cross = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], -1)
     both = Headings(0.02 * direction + [[0, 0, 0], [0, 1, 0]], direction, cross)
     for opposed, expected in ((True, [False, True]), (False, [True, True])):
-        np.testing.assert_array_equal(within_reach(both, part, FLAT[None], CENTER, opposed=opposed)[1], [expected])
+        np.testing.assert_array_equal(
+            within_reach(both, part, FLAT[None], CENTER, opposed=opposed)[1], [expected]
+        )
 
 
 @pytest.mark.parametrize(("thick", "over"), [(0.03, True), (0.05, False)])
 def test_where_a_hand_has_no_room_its_fingers_still_close_over_the_table(thick, over):
-    """3 cm over the table: fingers 12 mm thick that close vertically on 3 cm reach 27 mm down, on 5 cm 37 mm.
+    """3 cm over the table: fingers 12 mm thick that close vertically on 3 cm reach 27 mm down, on 5
+    cm 37 mm.
 
     A second heading, half a metre aside, closes level on a plate 1 cm thick.
     """
-    reaching = Outline(0.05 * np.array([[[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]]), np.array([0.01]), ANY)
+    reaching = Outline(
+        0.05 * np.array([[[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]]), np.array([0.01]), ANY
+    )
     position = np.array([[0, 0, -0.02], [-0.5, 0.5, -0.02]])
     headings = Headings(position, np.array([LEVEL] * 2), np.array([UP, [0, 1, 0]], float))
     half = np.array([0, 0, thick / 2]), np.array([0, 0.005, 0])
     points = np.concatenate([[p + h, p - h] for p, h in zip(position, half, strict=True)])
     part = SimpleNamespace(points=points, normals=np.array([UP, DOWN, [0, 1, 0], [0, -1, 0]]))
     assert not feasible(headings, FLAT, reaching).any()
-    np.testing.assert_array_equal(within_reach(headings, part, FLAT[None], reaching)[1], [[over, True]])
+    np.testing.assert_array_equal(
+        within_reach(headings, part, FLAT[None], reaching)[1], [[over, True]]
+    )
 
 
 def bar_headings(*depths):
-    """Headings along x, at depths in a bar (x from 0 to 8 cm, 3 cm wide) whose first 4 cm are graspable."""
+    """Headings along x, at depths in a bar (x from 0 to 8 cm, 3 cm wide) whose first 4 cm are
+    graspable.
+    """
     x, y = np.meshgrid(np.linspace(0, 0.08, 33), [-0.015, 0.015])
     points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1)
     count = len(depths)
@@ -371,9 +423,12 @@ def bar_headings(*depths):
 
 
 def test_fingers_close_on_the_region_where_they_end():
-    """By hand: they reach 1 cm beyond the position, and keep 1 cm off the avoid region, which begins at 4.25 cm."""
+    """By hand: they reach 1 cm beyond the position, and keep 1 cm off the avoid region, which
+    begins at 4.25 cm.
+    """
     assert closes_on(*bar_headings(0.02, 0.01)).all()
-    # Behind the bar's end nothing is between them; further in they meet the avoid region at the same width.
+    # Behind the bar's end nothing is between them; further in they meet the avoid region at the
+    # same width.
     assert not closes_on(*bar_headings(-0.015, 0.03, 0.05)).any()
     headings, points, avoid = bar_headings(0.03)
     points[avoid, 1] *= 0.6  # the avoid region is thinner: the graspable one is met first
@@ -381,7 +436,9 @@ def test_fingers_close_on_the_region_where_they_end():
 
 
 def covered(obj, hand):
-    """Headings (H) cleared in each resting pose, and (R, H) bool whether they are allowed, on the graspable region."""
+    """Headings (H) cleared in each resting pose, and (R, H) bool whether they are allowed, on the
+    graspable region.
+    """
     widest = max_width(hand, 1.0)
     found = sample_headings(obj, np.random.default_rng(0), use_affordance=True, max_width=widest)
     if found is None:
@@ -399,9 +456,13 @@ def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
     for obj in objects:
         points, avoid = obj.points[:256].astype(float), obj.non_graspable_points[:256]
         for moved, allowed, rest in zip(*covered(obj, hand), obj.rest_poses, strict=False):
-            assert not allowed.any() or local_width(moved, obj.points)[allowed].max() <= max_width(hand, 1.0)
+            assert not allowed.any() or local_width(moved, obj.points)[allowed].max() <= max_width(
+                hand, 1.0
+            )
             assert feasible(moved, rest, hand, local_width(moved, obj.points))[allowed].all()
-            for position, direction, cross in zip(*(part[allowed][:8].astype(float) for part in moved), strict=True):
+            for position, direction, cross in zip(
+                *(part[allowed][:8].astype(float) for part in moved), strict=True
+            ):
                 away = np.linalg.norm(points - position, axis=-1)
                 assert away[~avoid].min() < away[avoid].min()
                 offset = points - position
@@ -410,6 +471,9 @@ def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
                 other = offset[slab & avoid & (offset @ direction < 0.02)] @ cross
                 assert len(held) >= 2
                 if len(other):
-                    assert held.min() + 0.005 <= other.min() + 1e-6 and other.max() - 1e-6 <= held.max() - 0.005
+                    assert (
+                        held.min() + 0.005 <= other.min() + 1e-6
+                        and other.max() - 1e-6 <= held.max() - 0.005
+                    )
         uncovered += not covered(obj, hand)[1].any()
     assert uncovered <= 0.1 * len(objects)

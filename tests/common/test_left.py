@@ -67,7 +67,9 @@ def test_a_mirrored_object_is_its_mirror_image_and_twice_itself():
     expected, _ = mesh_of(obj.pieces)
     np.testing.assert_allclose(vertices.min(0), (expected @ SIDES).min(0), atol=1e-6)
     np.testing.assert_allclose(vertices.max(0), (expected @ SIDES).max(0), atol=1e-6)
-    np.testing.assert_allclose(np.linalg.eigvalsh(image.inertia), np.linalg.eigvalsh(obj.inertia), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(image.inertia), np.linalg.eigvalsh(obj.inertia), rtol=1e-9
+    )
     again = image.mirrored()
     for name in ("points", "normals", "rest_poses", "visual_vertices", "visual_faces", "inertia"):
         np.testing.assert_array_equal(getattr(again, name), getattr(obj, name))
@@ -75,14 +77,19 @@ def test_a_mirrored_object_is_its_mirror_image_and_twice_itself():
 
 
 class Lopsided:
-    """In place of a policy of the right hand: answers what no symmetry makes of all that it is given."""
+    """In place of a policy of the right hand: answers what no symmetry makes of all that it is
+    given.
+    """
 
     def reset(self, request):
         self.begun = request
 
     def act(self, state):
         goal = self.begun.constraints["heading"]["direction"]
-        target = np.concatenate([state["object_position"] + 2 * goal, state["object_quaternion"][1:]]) + state["u"]
+        target = (
+            np.concatenate([state["object_position"] + 2 * goal, state["object_quaternion"][1:]])
+            + state["u"]
+        )
         return Answer(state["q"] + 1, target, np.arange(22.0), 1, (), 0.0, 0.0)
 
 
@@ -94,8 +101,14 @@ def test_mirrored_inputs_give_mirrored_actions():
     wrist = np.concatenate([flip, -flip])
     answers = []
     for policy, m, t, w in ((right, np.ones(3), np.ones(4), np.ones(6)), (left, flip, turn, wrist)):
-        policy.reset(GraspRequest({"heading": {"direction": m * v}}, surface=m * x[None], q=q, wrist=(m * x, t * r)))
-        answers.append(policy.act({"q": q, "u": w * u, "object_position": m * x, "object_quaternion": t * r}))
+        policy.reset(
+            GraspRequest(
+                {"heading": {"direction": m * v}}, surface=m * x[None], q=q, wrist=(m * x, t * r)
+            )
+        )
+        answers.append(
+            policy.act({"q": q, "u": w * u, "object_position": m * x, "object_quaternion": t * r})
+        )
     np.testing.assert_allclose(answers[1].u_target, wrist * answers[0].u_target, atol=1e-12)
     np.testing.assert_array_equal(answers[1].q_target, answers[0].q_target)
     np.testing.assert_array_equal(answers[1].action[-6:], wrist * answers[0].action[-6:])
@@ -104,19 +117,25 @@ def test_mirrored_inputs_give_mirrored_actions():
 
 def test_angular_velocities_are_mirrored_as_rotations():
     """A wheel that rolls forwards does so in the mirror too, where x is the axle."""
-    found = mirror.fields({"object_angular_velocity": [1.0, 2.0, 3.0], "object_velocity": [1.0, 2.0, 3.0]})
+    found = mirror.fields(
+        {"object_angular_velocity": [1.0, 2.0, 3.0], "object_velocity": [1.0, 2.0, 3.0]}
+    )
     np.testing.assert_array_equal(found["object_angular_velocity"], [1, -2, -3])
     np.testing.assert_array_equal(found["object_velocity"], [-1, 2, 3])
 
 
 def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
-    """By hand: slides along x and hinges about y and z change their sign, so that their bounds change places."""
+    """By hand: slides along x and hinges about y and z change their sign, so that their bounds
+    change places.
+    """
     lower, upper = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3], [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
     limits = {"lower": lower, "upper": upper, "palm": [[0.01, 0.02, 0.03, 0.04]]}
     right = mock.Mock(metadata=lambda: {"hand": "human", "limits": limits, "period": 0.01})
     found = LeftPolicy(right).metadata()
     assert found["hand"] == "human:left" and found["period"] == 0.01
-    np.testing.assert_array_equal(found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6])
+    np.testing.assert_array_equal(
+        found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
+    )
     np.testing.assert_array_equal(found["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
     assert found["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
 
@@ -127,5 +146,7 @@ def test_everything_that_a_camera_sees_is_mirrored():
     mirrored = mirrored_request(request)
     for found in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
         np.testing.assert_array_equal(found, [-1.0, 2.0, 3.0])
-    state = mirror.fields({"cloud": points, "surface_normals": points, "camera_position": points[0]})
+    state = mirror.fields(
+        {"cloud": points, "surface_normals": points, "camera_position": points[0]}
+    )
     assert all(np.array_equal(np.ravel(array), [-1.0, 2.0, 3.0]) for array in state.values())

@@ -22,8 +22,12 @@ def hand(mano):
 def _points(hand, **angles):
     """Keypoints by name: link origins and "<finger> tip"."""
     q = np.array([angles.get(joint.name, 0.0) for joint in hand.joints], np.float32)
-    names = [link.name for link in hand.links] + [hand.links[i].name.partition("_")[0] + " tip" for i in hand.tip_links]
-    return dict(zip(names, np.asarray(keypoints(hand, link_transforms(hand, jnp.array(q)))), strict=True))
+    names = [link.name for link in hand.links] + [
+        hand.links[i].name.partition("_")[0] + " tip" for i in hand.tip_links
+    ]
+    return dict(
+        zip(names, np.asarray(keypoints(hand, link_transforms(hand, jnp.array(q)))), strict=True)
+    )
 
 
 def test_a_files_arrays_are_read_exactly(mano):
@@ -36,9 +40,14 @@ def test_a_files_arrays_are_read_exactly(mano):
 
 
 _VARIANTS = {
-    **{form: {"J_regressor": getattr(scipy.sparse, form)} for form in ("csr_matrix", "coo_matrix", "csc_array")},
+    **{
+        form: {"J_regressor": getattr(scipy.sparse, form)}
+        for form in ("csr_matrix", "coo_matrix", "csc_array")
+    },
     **{form: {"J_regressor": getattr(scipy.sparse, form)} for form in ("csr_array", "coo_array")},
-    "lists": dict.fromkeys(("v_template", "shapedirs", "J_regressor", "hands_mean"), np.ndarray.tolist),
+    "lists": dict.fromkeys(
+        ("v_template", "shapedirs", "J_regressor", "hands_mean"), np.ndarray.tolist
+    ),
 }
 
 
@@ -63,7 +72,9 @@ def test_other_kinds_of_its_arrays_are_read_as_well(variant, tmp_path):
 def test_a_variant_that_cannot_be_read_is_named_with_its_conversion(tmp_path):
     values = content() | {"J_regressor": scipy.sparse.lil_matrix(content()["J_regressor"])}
     (tmp_path / "hand.pkl").write_bytes(pickle.dumps(values))
-    with pytest.raises(CongraspError, match=r"names 'scipy\.sparse\._lil\.lil_matrix'.*python -c .*hand\.npz"):
+    with pytest.raises(
+        CongraspError, match=r"names 'scipy\.sparse\._lil\.lil_matrix'.*python -c .*hand\.npz"
+    ):
         read_mano(tmp_path / "hand.pkl")
 
 
@@ -72,11 +83,19 @@ def test_the_skeleton_is_that_of_the_file_about_the_wrist(hand):
     assert len(hand.joints) == 20 and len(hand.tip_links) == 5
     points = _points(hand)
     for i, finger in enumerate(MANO_FINGERS):
-        names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+        names = (
+            ("metacarpal", "proximal", "distal")
+            if finger == "thumb"
+            else ("proximal", "middle", "distal")
+        )
         for k, name in enumerate(names):
-            np.testing.assert_allclose(points[f"{finger}_{name}"], joints[1 + 3 * i + k] - joints[0], atol=1e-6)
+            np.testing.assert_allclose(
+                points[f"{finger}_{name}"], joints[1 + 3 * i + k] - joints[0], atol=1e-6
+            )
         # The fingertip is skin: one radius beyond the end of the capsule's axis.
-        radius = next(link.capsules[0].radius for link in hand.links if link.name == f"{finger}_distal")
+        radius = next(
+            link.capsules[0].radius for link in hand.links if link.name == f"{finger}_distal"
+        )
         gap = np.linalg.norm(points[f"{finger} tip"] - (tips[i] - joints[0]))
         assert gap == pytest.approx(radius, abs=1e-6)
 
@@ -92,7 +111,9 @@ def test_shape_parameters_move_the_skeleton(mano):
 def test_axes_are_anatomical():
     joints, tips = skeleton()
     axes = mano_axes(joints, tips)
-    np.testing.assert_allclose(axes @ axes.swapaxes(-1, -2), np.broadcast_to(np.eye(3), (15, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(
+        axes @ axes.swapaxes(-1, -2), np.broadcast_to(np.eye(3), (15, 3, 3)), atol=1e-12
+    )
     assert (np.linalg.det(axes) > 0).all()
     child = np.concatenate([joints[1:].reshape(5, 3, 3)[:, 1:], tips[:, None]], 1).reshape(15, 3)
     bones = child - joints[1:]

@@ -31,9 +31,17 @@ def rollout(arrays=None, **meta):
         "episode/success": np.zeros(E, np.float32),
         "term/distance": np.zeros(E, np.float32),
     } | (arrays or {})
-    header = {"actor": "a", "incarnation": "0f", "sequence": 0, "version": 2, "run_id": "e", "schema": "s"}
+    header = {
+        "actor": "a",
+        "incarnation": "0f",
+        "sequence": 0,
+        "version": 2,
+        "run_id": "e",
+        "schema": "s",
+    }
     return Message(
-        {name: array for name, array in all_arrays.items() if array is not None}, {**header, "steps": T * B, **meta}
+        {name: array for name, array in all_arrays.items() if array is not None},
+        {**header, "steps": T * B, **meta},
     )
 
 
@@ -48,7 +56,11 @@ def test_valid_rollout_gives_its_header():
 
 
 def test_no_episode_need_have_ended_and_none_need_be_measured():
-    check(rollout({"episode/success": np.zeros(0, np.float32), "term/distance": np.zeros(0, np.float32)}))
+    check(
+        rollout(
+            {"episode/success": np.zeros(0, np.float32), "term/distance": np.zeros(0, np.float32)}
+        )
+    )
     check(rollout({"episode/success": None, "term/distance": None}))
 
 
@@ -66,16 +78,37 @@ def full(shape, value, dtype=np.float32):
         ({"episode": np.zeros(1, np.float32)}, "unknown array 'episode'"),
         ({"action": np.zeros((T, B, A))}, "'action' has dtype float64, not float32"),
         ({"terminal": np.zeros((T, B), np.uint8)}, "'terminal' has dtype uint8, not bool"),
-        ({"observation": np.zeros((T, B, D + 1), np.float16)}, r"'observation' has shape \(3, 2, 6\), not .*D=5"),
-        ({"action": np.zeros((T, B, A + 1), np.float32)}, r"'action' has shape \(3, 2, 5\), not .*A=4"),
-        ({"reward": np.zeros((T + 1, B), np.float32)}, r"'reward' has shape \(4, 2\), not \(T=3, B=2\)"),
+        (
+            {"observation": np.zeros((T, B, D + 1), np.float16)},
+            r"'observation' has shape \(3, 2, 6\), not .*D=5",
+        ),
+        (
+            {"action": np.zeros((T, B, A + 1), np.float32)},
+            r"'action' has shape \(3, 2, 5\), not .*A=4",
+        ),
+        (
+            {"reward": np.zeros((T + 1, B), np.float32)},
+            r"'reward' has shape \(4, 2\), not \(T=3, B=2\)",
+        ),
         ({"reward": np.zeros((T, B, 1), np.float32)}, "'reward' has shape"),
         ({"last_observation": np.zeros((B + 1, D), np.float16)}, "'last_observation' has shape"),
-        ({"observation": np.zeros((T, B, D), np.float32)}, "'observation' has dtype float32, not float16"),
-        ({"last_observation": np.zeros((B, D), np.float32)}, "'last_observation' has dtype float32, not float16"),
+        (
+            {"observation": np.zeros((T, B, D), np.float32)},
+            "'observation' has dtype float32, not float16",
+        ),
+        (
+            {"last_observation": np.zeros((B, D), np.float32)},
+            "'last_observation' has dtype float32, not float16",
+        ),
         ({"term/distance": np.zeros(E + 1, np.float32)}, "'term/distance' has shape"),
-        ({"observation": full((T, B, D), np.nan, np.float16)}, "'observation' has values that are not finite"),
-        ({"observation": full((T, B, D), -np.inf, np.float16)}, "'observation' has values that are not finite"),
+        (
+            {"observation": full((T, B, D), np.nan, np.float16)},
+            "'observation' has values that are not finite",
+        ),
+        (
+            {"observation": full((T, B, D), -np.inf, np.float16)},
+            "'observation' has values that are not finite",
+        ),
         ({"reward": full((T, B), np.inf)}, "'reward' has values that are not finite"),
         ({"episode/success": full(E, np.nan)}, "'episode/success' has values that are not finite"),
     ],
@@ -125,7 +158,9 @@ def test_zeros_have_the_forms_sizes_and_dtypes():
 
 
 def test_an_algorithm_that_learns_from_less_is_sent_less():
-    form = dataclasses.replace(FORM, arrays={name: RECORDED[name] for name in ("observation", "reward")})
+    form = dataclasses.replace(
+        FORM, arrays={name: RECORDED[name] for name in ("observation", "reward")}
+    )
     check(Message(form.zeros(), rollout().meta), form)
     with pytest.raises(CongraspError, match="unknown array 'action'"):
         check(rollout(), form)
@@ -134,7 +169,11 @@ def test_an_algorithm_that_learns_from_less_is_sent_less():
 
 
 def test_device_arrays_pass_unread():
-    check(Message({name: jnp.asarray(array) for name, array in rollout().arrays.items()}, rollout().meta))
+    check(
+        Message(
+            {name: jnp.asarray(array) for name, array in rollout().arrays.items()}, rollout().meta
+        )
+    )
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
@@ -147,13 +186,29 @@ def test_every_half_is_looked_at(value, at):
 
 
 def bundle(**arrays):
-    statistics = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", 5), ("value", ()))
-                  for name in ("mean", "m2")}  # fmt: skip
+    statistics = {
+        f"{kind}/{name}": np.zeros(shape)
+        for kind, shape in (("observation", 5), ("value", ()))
+        for name in ("mean", "m2")
+    }
     counts = {"observation/count": np.zeros(()), "value/count": np.zeros(())}
-    weights = {"actor/trunk/0/kernel": np.zeros((5, 3), np.float32), "critic/head/bias": np.zeros(1, np.float32)}
-    meta = {"version": 1, "run_id": "e", "schema": "s", "hand": "human", "layout": [["state", 5]], "action_size": 4}
+    weights = {
+        "actor/trunk/0/kernel": np.zeros((5, 3), np.float32),
+        "critic/head/bias": np.zeros(1, np.float32),
+    }
+    meta = {
+        "version": 1,
+        "run_id": "e",
+        "schema": "s",
+        "hand": "human",
+        "layout": [["state", 5]],
+        "action_size": 4,
+    }
     all_arrays = {**statistics, **counts, **weights, **arrays}
-    return Message({name: array for name, array in all_arrays.items() if array is not None}, {**meta, "format": 1})
+    return Message(
+        {name: array for name, array in all_arrays.items() if array is not None},
+        {**meta, "format": 1},
+    )
 
 
 def test_bundle():
@@ -173,10 +228,15 @@ def test_bundle():
 
 
 def test_symbols_bind_across_arrays_and_literals_hold():
-    with pytest.raises(CongraspError, match=r"'link_quaternion' has shape \(7, 2, 3\), not \(T=7, L=2, 4\)"):
+    with pytest.raises(
+        CongraspError, match=r"'link_quaternion' has shape \(7, 2, 3\), not \(T=7, L=2, 4\)"
+    ):
         validate(
             Message({"link_position": np.zeros((7, 2, 3)), "link_quaternion": np.zeros((7, 2, 3))}),
-            MessageSpec("episode", {name: EPISODE.arrays[name] for name in ("link_position", "link_quaternion")}),
+            MessageSpec(
+                "episode",
+                {name: EPISODE.arrays[name] for name in ("link_position", "link_quaternion")},
+            ),
         )
 
 

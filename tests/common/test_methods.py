@@ -24,7 +24,11 @@ from tests.scenes import HAND, F, N, evaluated, scene
 from tests.scenes import scene_of as compiled_scene
 
 FIRST, LAST = RewardWeights(drop=2.0), RewardWeights(drop=9.0, heading_position=30.0)
-RUN = RunConfig(updates=100, task=TaskConfig(reward=FIRST), curriculum=CurriculumConfig(ramp=(20, 40), reward=LAST))
+RUN = RunConfig(
+    updates=100,
+    task=TaskConfig(reward=FIRST),
+    curriculum=CurriculumConfig(ramp=(20, 40), reward=LAST),
+)
 
 
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.learns])
@@ -39,7 +43,9 @@ def test_a_run_of_a_method_says_so_and_survives_the_wire(name):
 
 def test_single_settings_of_the_ablations():
     assert not with_method(RUN, "no-dynamic-center").task.dynamic_center
-    assert with_method(RUN, "no-feedforward").task.control == dataclasses.replace(RUN.task.control, lookahead=0)
+    assert with_method(RUN, "no-feedforward").task.control == dataclasses.replace(
+        RUN.task.control, lookahead=0
+    )
 
 
 def test_two_phases_by_hand():
@@ -47,7 +53,9 @@ def test_two_phases_by_hand():
     curriculum = with_method(RUN, "two-phase").curriculum
     assert [curriculum.stationary(version) for version in (0, 59, 60)] == [True, True, False]
     assert [curriculum.weights(FIRST, version) for version in (0, 59, 60)] == [FIRST, FIRST, LAST]
-    constant = with_method(dataclasses.replace(RUN, curriculum=CurriculumConfig()), "two-phase").curriculum
+    constant = with_method(
+        dataclasses.replace(RUN, curriculum=CurriculumConfig()), "two-phase"
+    ).curriculum
     assert constant.weights(FIRST, 99) == FIRST
 
 
@@ -66,7 +74,13 @@ def test_graspxl_knows_heading_and_affordance_alone():
 
 def test_dgrasp_has_a_pose_in_every_episode_and_no_reward_for_the_heading():
     run = with_method(RUN, "dgrasp")
-    assert [name for name, _ in layout(HAND, run.task)] == ["state", "heading", "pose_finger", "pose_wrist", "mask"]
+    assert [name for name, _ in layout(HAND, run.task)] == [
+        "state",
+        "heading",
+        "pose_finger",
+        "pose_wrist",
+        "mask",
+    ]
     assert run.task.p_pose == 1.0
     terms = jax.jit(lambda weights, *step: reward_terms(scene_of(HAND, run.task, *step), weights))
     for version in (0, 99):
@@ -86,7 +100,9 @@ def test_without_learning_actions_count_for_nothing_and_fingers_close_after_half
     for time, moved in ((half - 1.0, 0.0 * closing), (half, closing)):
         step = state._replace(time=np.full(4, time, np.float32)), surface, goal
         still = act(np.zeros((4, F + 6), np.float32), *step)
-        np.testing.assert_allclose(still.q_target - state.q_target, np.tile(moved, (4, 1)), atol=1e-6)
+        np.testing.assert_allclose(
+            still.q_target - state.q_target, np.tile(moved, (4, 1)), atol=1e-6
+        )
         pushed = act(rng.normal(size=(4, F + 6)).astype(np.float32), *step)
         np.testing.assert_array_equal(pushed.q_target, still.q_target)
         np.testing.assert_array_equal(pushed.u_target, still.u_target)
@@ -96,7 +112,9 @@ def test_a_policy_keeps_its_method(tmp_path):
     """One from before there were methods is ours; another one's name is refused in one line."""
     ours = bundles.load(pretrained_file("human"))
     assert ours.task.method == "ours"
-    with pytest.raises(CongraspError, match=r"human\.safetensors has the method 'ours', not 'no-feedforward'"):
+    with pytest.raises(
+        CongraspError, match=r"human\.safetensors has the method 'ours', not 'no-feedforward'"
+    ):
         evaluated_as(ours.task, "no-feedforward", "human.safetensors")
     task = with_method(RunConfig(task=ours.task), "no-feedforward").task
     bundles.save(dataclasses.replace(ours, task=task), tmp_path / "other.safetensors")
@@ -131,7 +149,8 @@ def label(teacher, ahead, limit, velocity, table, own):
     def along(x):
         return [x, 0, 0, 0, 0, 0]
 
-    lag = np.append(-0.05, np.zeros(15))  # the first finger joint's servo follows a target of before
+    # The first finger joint's servo follows a target of before
+    lag = np.append(-0.05, np.zeros(15))
     rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own), *lag], np.float32)
     assert len(rows) == extra(ALLEGRO)
     action = np.append(np.full(16, 0.3), along(teacher)).astype(np.float32)
@@ -145,38 +164,54 @@ def test_a_label_is_the_way_from_the_student_s_guidance_to_the_teacher_s_target(
     """alpha_w = 0.02 m; 15 m/s^2 allow a lead of 15 / 1800 m = 8.33 mm beyond v / 20."""
     assert label(0.2, 0.001, 0.04, 0.0, 1.0, 0.0) == pytest.approx((0.001 + 0.004) / 0.02, abs=1e-5)
     # The tracker is 3 mm off: the student's guidance is 4 mm ahead, and the target is where it was.
-    assert label(0.2, 0.001, 0.04, 0.0, 1.0, 0.004) == pytest.approx((0.005 - 0.004) / 0.02, abs=1e-5)
-    assert label(0.0, 0.03, 0.04, 0.0, 1.0, 0.03) == pytest.approx((15 / 1800 - 0.03) / 0.02, abs=1e-4)
-    # At 0.1 m/s the target is 5 mm ahead at least to keep the speed: 5 mm and a third of 8.33 mm without the table.
-    assert label(0.0, 0.03, 0.04, 0.1, 0.0, 0.01) == pytest.approx((0.005 + 5 / 1800 - 0.01) / 0.02, abs=1e-4)
+    assert label(0.2, 0.001, 0.04, 0.0, 1.0, 0.004) == pytest.approx(
+        (0.005 - 0.004) / 0.02, abs=1e-5
+    )
+    assert label(0.0, 0.03, 0.04, 0.0, 1.0, 0.03) == pytest.approx(
+        (15 / 1800 - 0.03) / 0.02, abs=1e-4
+    )
+    # At 0.1 m/s the target is 5 mm ahead at least to keep the speed: 5 mm and a third of 8.33 mm
+    # without the table.
+    assert label(0.0, 0.03, 0.04, 0.1, 0.0, 0.01) == pytest.approx(
+        (0.005 + 5 / 1800 - 0.01) / 0.02, abs=1e-4
+    )
     np.testing.assert_allclose(ALLEGRO.wrist_servos[:, 0], [1800.0, 90.0], rtol=1e-4)
 
 
 def test_with_its_label_a_student_gives_the_wrist_the_teacher_s_target():
     """Whatever its tracker shows, as long as both know the wrist's velocity, which they do here."""
     task = TaskConfig(surface_points=N, constraints=("heading", "affordance", "fingers"))
-    tracked = dataclasses.replace(task, sensing=dataclasses.replace(task.sensing, position_noise=(0.0, 0.01)))
+    tracked = dataclasses.replace(
+        task, sensing=dataclasses.replace(task.sensing, position_noise=(0.0, 0.01))
+    )
     state, surface, goal = scene(5)
     state = state._replace(u_velocity=0.1 * state.u_velocity)  # as slow as its limits allow
     ahead = evaluated(guided, compiled_scene(task, state, surface, goal), task.control).ahead
     state = state._replace(u=state.u + ahead - 0.004)  # and near its guidance
     off = np.array([[0.004, -0.003, 0.002]], np.float32)
     seen = state._replace(
-        object_position=state.object_position + off, object_position_initial=state.object_position_initial - off
+        object_position=state.object_position + off,
+        object_position_initial=state.object_position_initial - off,
     )
     motors = len(HAND.motors)
     action = jnp.asarray(np.random.default_rng(0).normal(0.0, 0.5, (4, motors + 6)), jnp.float32)
 
     @jax.jit
     def targets(action):
-        true, shown = scene_of(HAND, task, state, surface, goal), scene_of(HAND, tracked, seen, surface, goal)
+        true, shown = (
+            scene_of(HAND, task, state, surface, goal),
+            scene_of(HAND, tracked, seen, surface, goal),
+        )
         rows = observe_for_teacher(true, shown, task.control)
         own = student_action(HAND, task.control, rows, action)
-        one, two, copied = (decode(s, task.control, a) for s, a in ((true, action), (shown, own), (shown, action)))
+        one, two, copied = (
+            decode(s, task.control, a) for s, a in ((true, action), (shown, own), (shown, action))
+        )
         return rows, observe(true), one, two, copied
 
     rows, whole, teacher, student, copied = targets(action)
     np.testing.assert_array_equal(rows[:, : -extra(HAND)], whole)
     np.testing.assert_allclose(student.u_target, teacher.u_target, atol=1e-5)
     np.testing.assert_array_equal(student.q_target, teacher.q_target)
-    assert np.abs(copied.u_target - teacher.u_target).max() > 1e-3  # what the teacher's residual would have given
+    # What the teacher's residual would have given
+    assert np.abs(copied.u_target - teacher.u_target).max() > 1e-3

@@ -1,4 +1,6 @@
-"""Hands with fewer motors than joints: coupled and tendon-driven joints, from the formulas to all three engines."""
+"""Hands with fewer motors than joints: coupled and tendon-driven joints, from the formulas to all
+three engines.
+"""
 
 import dataclasses
 import json
@@ -26,8 +28,12 @@ COUPLINGS = (Coupling("index_3", "index_2", 0.9), Coupling("ring_1", "index_1", 
 
 @pytest.fixture(scope="module")
 def hand():
-    """Allegro with a coupled fingertip, a finger that follows another's, and a tendon over two joints."""
-    allegro = dataclasses.replace(get_hand("allegro"), name="coupled", couplings=COUPLINGS, tendons=(TENDON,))
+    """Allegro with a coupled fingertip, a finger that follows another's, and a tendon over two
+    joints.
+    """
+    allegro = dataclasses.replace(
+        get_hand("allegro"), name="coupled", couplings=COUPLINGS, tendons=(TENDON,)
+    )
     return hand_from_text(hand_text(allegro))
 
 
@@ -38,19 +44,34 @@ def _index(hand, *names):
 
 def test_motors_and_joints_by_hand(hand):
     names = [motor.name for motor in hand.motors]
-    assert len(names) == 16 - 3 and names[:6] == ["thumb_0", "thumb_1", "thumb_2", "thumb_3", "index_0", "index_1"]
+    assert len(names) == 16 - 3 and names[:6] == [
+        "thumb_0",
+        "thumb_1",
+        "thumb_2",
+        "thumb_3",
+        "index_0",
+        "index_1",
+    ]
     assert "middle_tendon" in names and not {"index_3", "ring_1", "middle_2", "middle_3"} & {*names}
     m = np.zeros(len(names), np.float32)
-    m[names.index("index_2")], m[names.index("index_1")], m[names.index("middle_tendon")] = 1.0, 0.5, 1.0
+    m[names.index("index_2")], m[names.index("index_1")], m[names.index("middle_tendon")] = (
+        1.0,
+        0.5,
+        1.0,
+    )
     q = joint_positions(hand, m)
     i2, i3, r1, m2, m3 = _index(hand, "index_2", "index_3", "ring_1", "middle_2", "middle_3")
     np.testing.assert_allclose(q[[i2, i3, r1]], [1.0, 0.9, 0.1 + 0.8 * 0.5], rtol=1e-6)
-    # Of -0.174 to 1.709 and -0.227 to 1.618 rad: the tendon goes from -0.2875 to 2.518, and both joints with it.
+    # Of -0.174 to 1.709 and -0.227 to 1.618 rad: the tendon goes from -0.2875 to 2.518, and both
+    # joints with it.
     share = (1.0 + 0.174 + 0.5 * 0.227) / (1.709 + 0.174 + 0.5 * (1.618 + 0.227))
-    np.testing.assert_allclose(q[[m2, m3]], [-0.174 + share * 1.883, -0.227 + share * 1.845], rtol=1e-5)
+    np.testing.assert_allclose(
+        q[[m2, m3]], [-0.174 + share * 1.883, -0.227 + share * 1.845], rtol=1e-5
+    )
     lower, upper = motor_limits(hand)
     assert lower[names.index("middle_tendon")] == pytest.approx(-0.174 - 0.5 * 0.227)
-    # The follower's 1.618 rad end its leader's way at 1.618 / 0.9, beyond the leader's own 1.709; its -0.227 do not.
+    # The follower's 1.618 rad end its leader's way at 1.618 / 0.9, beyond the leader's own 1.709;
+    # its -0.227 do not.
     assert upper[names.index("index_2")] == pytest.approx(1.709)
     assert upper[names.index("index_1")] == pytest.approx(1.61)
     assert lower[names.index("index_1")] == pytest.approx(-0.196)
@@ -64,7 +85,9 @@ def test_motors_go_to_joints_and_back_within_all_limits(hand):
     np.testing.assert_allclose(coupled(hand, q), q, atol=1e-6)
     assert (q > hand.lower - 1e-5).all() and (q < hand.upper + 1e-5).all()
     human = get_hand("human")
-    assert motor_positions(human, q) is q and joint_positions(human, q) is q and coupled(human, q) is q
+    assert (
+        motor_positions(human, q) is q and joint_positions(human, q) is q and coupled(human, q) is q
+    )
 
 
 def test_poses_follow_and_fingers_that_one_motor_moves_close_together(hand):
@@ -90,15 +113,25 @@ def test_wrong_couplings_are_one_line(hand):
 
     follow = {"joint": "index_3", "leader": "index_2", "ratio": 0.9, "offset": 0.0}
     refused("'index_3' cannot follow 'elbow'", couplings=[{**follow, "leader": "elbow"}])
-    refused("cannot follow 'index_2'", couplings=[follow, {**follow, "joint": "index_2", "leader": "index_3"}])
+    refused(
+        "cannot follow 'index_2'",
+        couplings=[follow, {**follow, "joint": "index_2", "leader": "index_3"}],
+    )
     refused("ratio zero", couplings=[{**follow, "ratio": 0.0}])
     refused("leave it no range", couplings=[{**follow, "offset": 5.0}])
-    refused("'index_3' is outside its limits in the closed pose", couplings=[{**follow, "ratio": 1.5}])
+    refused(
+        "'index_3' is outside its limits in the closed pose", couplings=[{**follow, "ratio": 1.5}]
+    )
     tendon = fields["tendons"][0]
-    refused("pulls 'index_3', which", tendons=[{**tendon, "joints": {"index_3": 1.0, "middle_3": 1.0}}])
+    refused(
+        "pulls 'index_3', which", tendons=[{**tendon, "joints": {"index_3": 1.0, "middle_3": 1.0}}]
+    )
     refused("at least two joints", tendons=[{**tendon, "joints": {"middle_3": 1.0}}])
     refused("'thumb_0' of a tendon is taken", tendons=[{**tendon, "name": "thumb_0"}])
-    refused("torque limit of 'middle_tendon' must be above zero", tendons=[{**tendon, "torque_limit": 0.0}])
+    refused(
+        "torque limit of 'middle_tendon' must be above zero",
+        tendons=[{**tendon, "torque_limit": 0.0}],
+    )
 
 
 def _closing(hand):
@@ -114,7 +147,10 @@ def _closing(hand):
     data = mujoco.MjData(model)
     data.qpos[6:] = hand.q_open
     data.ctrl[6:] = motor_positions(hand, 0.5 * (hand.q_open + hand.q_closed))
-    assert [model.actuator(i).name for i in range(model.nu)] == [*WRIST_JOINTS, *(x.name for x in hand.motors)]
+    assert [model.actuator(i).name for i in range(model.nu)] == [
+        *WRIST_JOINTS,
+        *(x.name for x in hand.motors),
+    ]
     return model, data
 
 
@@ -142,14 +178,18 @@ def test_mjx_couples_joints_as_mujoco_c_does():
     follow = Coupling("left_middle", "left_root", 0.9)
     model, native = _closing(dataclasses.replace(claw, couplings=(follow,), tendons=(tendon,)))
     compiled, fresh = mjx.put_model(model, impl="jax"), mjx.put_data(model, native, impl="jax")
-    step = jax.jit(lambda data: jax.lax.scan(lambda d, _: (mjx.step(compiled, d), None), data, None, 100)[0])
+    step = jax.jit(
+        lambda data: jax.lax.scan(lambda d, _: (mjx.step(compiled, d), None), data, None, 100)[0]
+    )
     mujoco.mj_step(model, native, 100)
     np.testing.assert_allclose(step(fresh).qpos, native.qpos, atol=1e-3)
 
 
 def test_a_tendon_goes_on_where_one_of_its_joints_is_held_and_couplings_do_not_give(hand):
     model, data = _closing(hand)
-    held, other, leader, follower = (model.joint(x) for x in ("middle_2", "middle_3", "index_2", "index_3"))
+    held, other, leader, follower = (
+        model.joint(x) for x in ("middle_2", "middle_3", "index_2", "index_3")
+    )
     target = data.ctrl[model.actuator("middle_tendon").id]
     model.jnt_range[held.id, 1] = 0.3  # an object in its way
     for _ in range(400):

@@ -76,7 +76,9 @@ def test_parts_and_slots_are_usable(obj):
     kinds = [piece.kind for piece in obj.pieces]
     assert all(kinds.count(kind) <= slots for kind, slots in PRIMITIVE_SLOTS.items())
     assert kinds.count("mesh") <= MOST_MESHES
-    assert all(len(piece.vertices) <= MAX_MESH_VERTICES for piece in obj.pieces if piece.kind == "mesh")
+    assert all(
+        len(piece.vertices) <= MAX_MESH_VERTICES for piece in obj.pieces if piece.kind == "mesh"
+    )
 
 
 @settings(max_examples=12, deadline=None)
@@ -89,7 +91,9 @@ def test_mass_and_inertia_are_those_of_a_body(obj):
     assert a + b > c
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 @pytest.mark.parametrize("family", HOUSEHOLD_FAMILIES)
 def test_household_objects_are_of_one_piece(family, seed):
     spec = mujoco.MjSpec()
@@ -210,10 +214,17 @@ def test_training_never_touches_the_objects_of_evaluation(seed, count, shift):
     assert first >= 0 and first + count <= HELD_OUT_SEED
 
 
-@given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32), st.integers(0, 2**32))
+@given(
+    st.integers(0, HELD_OUT_SEED - 1),
+    st.integers(1, 5000),
+    st.integers(0, 2**32),
+    st.integers(0, 2**32),
+)
 def test_actors_share_no_object_while_there_are_enough(seed, count, one, other):
     actors = (HELD_OUT_SEED - seed % count) // count
-    firsts = [first_seed(ObjectsConfig(seed=seed, count=count), shift % actors) for shift in (one, other)]
+    firsts = [
+        first_seed(ObjectsConfig(seed=seed, count=count), shift % actors) for shift in (one, other)
+    ]
     assert one % actors == other % actors or abs(firsts[0] - firsts[1]) >= count
 
 
@@ -258,8 +269,21 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
     save(obj, tmp_path / "x.safetensors")
     back = load(tmp_path / "x.safetensors")
     assert digest(back) == digest(obj)
-    assert (back.name, back.family, back.part_names, back.mass) == (obj.name, obj.family, obj.part_names, obj.mass)
-    for name in ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_faces"):
+    assert (back.name, back.family, back.part_names, back.mass) == (
+        obj.name,
+        obj.family,
+        obj.part_names,
+        obj.mass,
+    )
+    for name in (
+        "graspable",
+        "inertia",
+        "points",
+        "normals",
+        "labels",
+        "rest_poses",
+        "visual_faces",
+    ):
         np.testing.assert_array_equal(getattr(back, name), getattr(obj, name))
         assert getattr(back, name).dtype == getattr(obj, name).dtype
     for a, b in zip(back.pieces, obj.pieces, strict=True):
@@ -277,7 +301,10 @@ def test_a_catalogue_lists_what_was_added(tmp_path):
         catalogue.add(generate(2, family))
     assert catalogue.list() == ["box_2", "mug_2"]
     assert digest(catalogue.get("mug_2")) == digest(generate(2, "mug"))
-    assert sorted(path.name for path in catalogue.folder.iterdir()) == ["box_2.safetensors", "mug_2.safetensors"]
+    assert sorted(path.name for path in catalogue.folder.iterdir()) == [
+        "box_2.safetensors",
+        "mug_2.safetensors",
+    ]
     with pytest.raises(CongraspError, match="no object file"):
         catalogue.get("cup_2")
     with pytest.raises(CongraspError, match="cannot name an object"):

@@ -21,15 +21,27 @@ def make(*pieces, density=800.0):
     points, normals, _ = sample_union(pieces, np.random.default_rng(0))
     vertices = np.concatenate([shapes.tessellate(piece)[0] for piece in pieces])
     return GraspObject(
-        "test", "test", pieces, ("whole",), np.array([True]), mass, inertia, points, normals,
-        np.zeros(512, np.int32), np.zeros((0, 7)), vertices, np.zeros((0, 3), np.int32),
-    )  # fmt: skip
+        "test",
+        "test",
+        pieces,
+        ("whole",),
+        np.array([True]),
+        mass,
+        inertia,
+        points,
+        normals,
+        np.zeros(512, np.int32),
+        np.zeros((0, 7)),
+        vertices,
+        np.zeros((0, 3), np.int32),
+    )
 
 
 def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces():
     half = np.array([0.02, 0.03, 0.05])
     poses, likelihood = quasi_static_poses((Piece("box", tuple(half)),))
-    # A rectangle of half sides a, b seen from d before its middle: 4 asin(ab / sqrt((a^2 + d^2)(b^2 + d^2))).
+    # A rectangle of half sides a, b seen from d before its middle: 4 asin(ab / sqrt((a^2 + d^2)(b^2
+    # + d^2))).
     a, b, d = half[[1, 2, 0]], half[[2, 0, 1]], half
     share = np.arcsin(a * b / np.sqrt((a**2 + d**2) * (b**2 + d**2))) / np.pi
 
@@ -45,7 +57,9 @@ def test_a_cylinder_stands_with_the_likelihood_of_its_ends():
     standing = np.isclose(poses[:, 2], half, atol=1e-6)
     assert standing.sum() == 2
     # Solid angle of a disc: 2 pi (1 - h / sqrt(h^2 + r^2)); the object's is a polygon of 24 sides.
-    np.testing.assert_allclose(likelihood[standing], (1 - half / np.hypot(half, radius)) / 2, rtol=0.03)
+    np.testing.assert_allclose(
+        likelihood[standing], (1 - half / np.hypot(half, radius)) / 2, rtol=0.03
+    )
     np.testing.assert_allclose(poses[~standing, 2], radius, rtol=1e-4)
 
 
@@ -70,7 +84,11 @@ def test_an_egg_ends_on_its_flattest_side():
 
 @pytest.mark.parametrize(
     "piece",
-    [Piece("ellipsoid", (0.03, 0.03, 0.03)), Piece("cylinder", (0.03, 0.05, 0)), Piece("capsule", (0.02, 0.05, 0))],
+    [
+        Piece("ellipsoid", (0.03, 0.03, 0.03)),
+        Piece("cylinder", (0.03, 0.05, 0)),
+        Piece("capsule", (0.02, 0.05, 0)),
+    ],
 )
 def test_round_objects_rest_still(piece):
     obj = make(piece)
@@ -89,9 +107,12 @@ def test_the_free_joints_damping_stops_a_rolling_ball_after_the_distance_worked_
     data.qpos[:] = [0, 0, radius, 1, 0, 0, 0]
     data.qvel[:] = [speed, 0, 0, 0, speed / radius, 0]
     mujoco.mj_step(scene.model, data, nstep=2000)
-    # (m + I/r^2) dv/dt = -(c/r^2 + c) v for rolling without slip; the way is v0 times the time constant.
+    # (m + I/r^2) dv/dt = -(c/r^2 + c) v for rolling without slip; the way is v0 times the time
+    # constant.
     inertia = 0.4 * obj.mass * radius**2
-    constant = (obj.mass + inertia / radius**2) / (CONTACT.free_damping / radius**2 + CONTACT.free_damping)
+    constant = (obj.mass + inertia / radius**2) / (
+        CONTACT.free_damping / radius**2 + CONTACT.free_damping
+    )
     assert np.linalg.norm(data.qvel) < 0.01
     np.testing.assert_allclose(data.qpos[0], speed * constant, rtol=0.1)
 
@@ -101,7 +122,8 @@ def test_settling_reports_what_moved():
     fallen = settle(obj, np.array([0, 0, 0.05, 1.0, 0, 0, 0]), 1.0)
     np.testing.assert_allclose(fallen.moved, 0.03, atol=1e-3)
     flying = settle(obj, np.array([0, 0, 1.0, 1.0, 0, 0, 0]), 0.2)
-    np.testing.assert_allclose(flying.speed, 9.81 * (0.2 - 0.025 / 2), rtol=0.02)  # the mean of the last 25 ms
+    # The mean of the last 25 ms
+    np.testing.assert_allclose(flying.speed, 9.81 * (0.2 - 0.025 / 2), rtol=0.02)
 
 
 @pytest.mark.parametrize("family", ["mug", "bowl", "hammer"])
@@ -115,7 +137,9 @@ def test_the_mujoco_body_is_the_object(family):
     body = model.body("body")
     np.testing.assert_allclose(body.mass, obj.mass)
     turn = shapes.matrix(body.iquat)
-    np.testing.assert_allclose(turn @ np.diag(body.inertia) @ turn.T, obj.inertia, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        turn @ np.diag(body.inertia) @ turn.T, obj.inertia, rtol=1e-5, atol=1e-12
+    )
     np.testing.assert_allclose(body.ipos, 0, atol=1e-12)
     assert model.nq == 7
     np.testing.assert_allclose(model.dof_damping, CONTACT.free_damping)
@@ -128,7 +152,10 @@ def test_the_mujoco_body_is_the_object(family):
             np.testing.assert_allclose(geom.pos, piece.pos, atol=1e-9)
             continue
         start, count = model.mesh_vertadr[geom.dataid[0]], model.mesh_vertnum[geom.dataid[0]]
-        placed = model.mesh_vert[start : start + count] @ data.geom_xmat[i].reshape(3, 3).T + data.geom_xpos[i]
+        placed = (
+            model.mesh_vert[start : start + count] @ data.geom_xmat[i].reshape(3, 3).T
+            + data.geom_xpos[i]
+        )
         expected = piece.vertices @ shapes.rotation(piece).T + piece.pos
         np.testing.assert_allclose(np.sort(placed, 0), np.sort(expected, 0), atol=1e-6)
 
@@ -138,7 +165,9 @@ def test_poses_follow_the_object_when_it_is_turned():
     turn = np.array([0.6, 0.0, 0.8, 0.0])
     moved = tuple(
         dataclasses.replace(
-            piece, pos=tuple(shapes.matrix(turn) @ piece.pos), quat=tuple(_product(turn, np.array(piece.quat)))
+            piece,
+            pos=tuple(shapes.matrix(turn) @ piece.pos),
+            quat=tuple(_product(turn, np.array(piece.quat))),
         )
         for piece in obj.pieces
     )

@@ -1,4 +1,6 @@
-"""Pieces against MuJoCo's own numbers, the definition of convexity, and volumes worked out by hand."""
+"""Pieces against MuJoCo's own numbers, the definition of convexity, and volumes worked out by
+hand.
+"""
 
 import numpy as np
 import pytest
@@ -6,13 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.objects import shapes
-from congrasp.common.objects.families.draft import extrude, lathe, shell, slab, smooth, sweep, vessel
+from congrasp.common.objects.families.draft import (
+    extrude,
+    lathe,
+    shell,
+    slab,
+    smooth,
+    sweep,
+    vessel,
+)
 from congrasp.common.objects.shapes import halves, mass_properties, sample_mesh, sample_union
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, Piece
 from tests.solids import mujoco_mass_properties
 
 QUAT = tuple(np.array([0.8, 0.3, -0.4, 0.33]) / np.linalg.norm([0.8, 0.3, -0.4, 0.33]))
-WEDGE = np.array([[0, 0, 0], [0.05, 0, 0], [0, 0.03, 0], [0, 0, 0.04], [0.05, 0, 0.04], [0, 0.03, 0.04]])
+WEDGE = np.array(
+    [[0, 0, 0], [0.05, 0, 0], [0, 0.03, 0], [0, 0, 0.04], [0.05, 0, 0.04], [0, 0.03, 0.04]]
+)
 PIECES = {
     "box": Piece("box", (0.03, 0.02, 0.05), (0.01, -0.02, 0.03), QUAT),
     "cylinder": Piece("cylinder", (0.02, 0.05, 0), (0.01, -0.02, 0.03), QUAT),
@@ -40,8 +52,11 @@ def test_surface_samples_have_supporting_planes_and_separate_inside_from_outside
     points, normals, keep = shapes.propose(piece, u)
     points, normals = points[keep], normals[keep]
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-12)
-    # The tangent plane of a convex body at a point with normal n is its supporting plane in the direction n.
-    np.testing.assert_allclose((points * normals).sum(-1), shapes.support(piece, normals), atol=1e-9)
+    # The tangent plane of a convex body at a point with normal n is its supporting plane in the
+    # direction n.
+    np.testing.assert_allclose(
+        (points * normals).sum(-1), shapes.support(piece, normals), atol=1e-9
+    )
     assert shapes.contains(piece, points - 1e-6 * normals).mean() > 0.999
     assert not shapes.contains(piece, points + 1e-6 * normals).any()
 
@@ -52,7 +67,14 @@ def test_tessellations_lie_on_the_surface_and_wind_outwards(piece):
     assert not shapes.contains(piece, middle + 1.001 * (vertices - middle)).any()
     assert shapes.contains(piece, middle + 0.999 * (vertices - middle)).all()
     corners = vertices[faces]
-    signed = np.einsum("ij,ij->i", corners[:, 0] - middle, np.cross(corners[:, 1] - middle, corners[:, 2] - middle)) / 6
+    signed = (
+        np.einsum(
+            "ij,ij->i",
+            corners[:, 0] - middle,
+            np.cross(corners[:, 1] - middle, corners[:, 2] - middle),
+        )
+        / 6
+    )
     assert (signed > -1e-15).all()
     assert 0.9 * shapes.volume(piece) < signed.sum() <= 1.0001 * shapes.volume(piece)
 
@@ -71,11 +93,14 @@ def test_samples_are_uniform_in_area():
     # Prolate spheroid: area beyond |z| > c/2 by its surface of revolution.
     z = np.linspace(-1, 1, 20_001)
     ring = np.sqrt(np.clip(1 - z**2, 0, None) + (z * 0.02 / 0.06) ** 2)
-    assert np.isclose((np.abs(points[keep, 2]) > 0.03).mean(), ring[np.abs(z) > 0.5].sum() / ring.sum(), atol=0.01)
+    assert np.isclose(
+        (np.abs(points[keep, 2]) > 0.03).mean(), ring[np.abs(z) > 0.5].sum() / ring.sum(), atol=0.01
+    )
 
 
 def test_a_union_has_no_points_inside_or_on_seams_and_keeps_flush_faces():
-    # Two cubes side by side, and a bar through both: the shared face and the inside of the bar must stay free.
+    # Two cubes side by side, and a bar through both: the shared face and the inside of the bar must
+    # stay free.
     pieces = (
         Piece("box", (0.02, 0.02, 0.02), (-0.02, 0, 0)),
         Piece("box", (0.02, 0.02, 0.02), (0.02, 0, 0)),
@@ -87,7 +112,8 @@ def test_a_union_has_no_points_inside_or_on_seams_and_keeps_flush_faces():
     assert (np.abs(points[bar, 0]) > 0.04 - 1e-9).all()
     on_seam = (np.abs(points[:, 0]) < 1e-9) & (np.abs(normals[:, 0]) > 0.5)
     assert not on_seam.any()
-    # Area: a 8 x 4 x 4 cm block without two 1 x 1 cm holes, and two stubs of 2 cm with 1 x 1 cm ends.
+    # Area: a 8 x 4 x 4 cm block without two 1 x 1 cm holes, and two stubs of 2 cm with 1 x 1 cm
+    # ends.
     block, stubs = 2 * 16 + 4 * 32 - 2, 2 * (4 * 2 + 1)
     assert np.isclose(bar.mean(), stubs / (block + stubs), atol=0.02)
     # Any prefix covers the surface as the whole does.
@@ -107,7 +133,9 @@ def test_mesh_samples_leave_out_what_the_pieces_cover():
     inner = np.asarray(outer.triangles)[:, ::-1] * 0.6
     triangles = np.concatenate([outer.triangles, inner])
     piece = Piece("box", (0.03, 0.03, 0.03))
-    points, normals, face = sample_mesh(triangles, (piece,), np.random.default_rng(0), oriented=True)
+    points, normals, face = sample_mesh(
+        triangles, (piece,), np.random.default_rng(0), oriented=True
+    )
     assert len(points) == 512
     assert (face < 12).all()
     assert ((points * normals).sum(-1) > 0.029).all()
@@ -167,8 +195,11 @@ def test_swept_frames_have_mitred_corners():
 
 
 def test_a_plate_loses_its_corners():
-    # Three chords stand for each quarter of a circle: three triangles of 30 degrees instead of a square.
-    assert shapes.volume(slab((0.03, 0.05, 0.01), 0.02)) == pytest.approx(0.02 * (4 * 0.03 * 0.05 - 0.02**2))
+    # Three chords stand for each quarter of a circle: three triangles of 30 degrees instead of a
+    # square.
+    assert shapes.volume(slab((0.03, 0.05, 0.01), 0.02)) == pytest.approx(
+        0.02 * (4 * 0.03 * 0.05 - 0.02**2)
+    )
 
 
 @settings(max_examples=40, deadline=None)

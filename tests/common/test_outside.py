@@ -1,7 +1,9 @@
-"""A constraint and a reward term that only this file knows: the project makes of them all that it makes of its own.
+"""A constraint and a reward term that only this file knows: the project makes of them all that it
+makes of its own.
 
-Options, weights and probabilities are made of constraints and terms when their modules are imported. So the test runs
-this file as a program, which adds its own before it imports anything else.
+Options, weights and probabilities are made of constraints and terms when their modules are
+imported. So the test runs this file as a program, which adds its own before it imports anything
+else.
 """
 
 import dataclasses
@@ -40,12 +42,19 @@ class Level(Constraint):
     errors = (ErrorSpec("level_m", "m", "hold", 0.05, 0.05, "height beside the object's"),)
     options = (
         Option("level", "What must be as high as the object: wrist or centre."),
-        Option("levelled", "A wrist path: the wrist must be as high as the object if it ends level.", "path"),
+        Option(
+            "levelled",
+            "A wrist path: the wrist must be as high as the object if it ends level.",
+            "path",
+        ),
     )
 
     def fields(self, hand, task):
         return (
-            (ObservationField("level_wrist", 1, "1 for the wrist"), ObservationField("level_height", 1, "m, world")),
+            (
+                ObservationField("level_wrist", 1, "1 for the wrist"),
+                ObservationField("level_height", 1, "m, world"),
+            ),
         )
 
     def columns(self, hand, bank):
@@ -78,9 +87,14 @@ class Level(Constraint):
 
     def _height(self, scene):
         features = scene.features
-        center = features.wrist_position + rotations.rotate(features.wrist_quaternion, features.center)
+        center = features.wrist_position + rotations.rotate(
+            features.wrist_quaternion, features.center
+        )
         wrist = scene.goal["level"].wrist[:, 0]
-        return jnp.where(wrist, features.wrist_position[:, 2], center[:, 2]) - scene.state.object_position[:, 2]
+        return (
+            jnp.where(wrist, features.wrist_position[:, 2], center[:, 2])
+            - scene.state.object_position[:, 2]
+        )
 
 
 def height(scene, earning):
@@ -92,7 +106,17 @@ def test_nothing_else_must_be_changed():
     done = python("-m", "tests.common.test_outside", timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [
-        *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX", "term")
+        *(
+            "episodes",
+            "tables",
+            "server",
+            "command line",
+            "file",
+            "marker",
+            "studio",
+            "ONNX",
+            "term",
+        )
     ]
 
 
@@ -114,9 +138,16 @@ def episodes(task):
         return jnp.zeros((batch, len(hand.joints) + 6)), jnp.zeros(batch)
 
     worker = RolloutWorker(
-        hand, task, physics, build_bank(hand, task, objects, 0), policy,
-        batch=batch, seed=0, half_precision=False, traced="all",
-    )  # fmt: skip
+        hand,
+        task,
+        physics,
+        build_bank(hand, task, objects, 0),
+        policy,
+        batch=batch,
+        seed=0,
+        half_precision=False,
+        traced="all",
+    )
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)
     physics.close()
@@ -125,33 +156,53 @@ def episodes(task):
     found = finished_episodes(rollout, task)
     np.testing.assert_array_equal(found["episode/mask_level"], active)
 
-    # What the engine shows, worked out from the traces; in `final` the steps after the table's removal.
+    # What the engine shows, worked out from the traces; in `final` the steps after the table's
+    # removal.
     height = np.asarray(rollout.trace.wrist_position - rollout.trace.object_position)[..., 2]
     final = np.asarray(rollout.trace.table)[-1] == 0
     assert final.all() and task.hold_steps == 1
-    np.testing.assert_allclose(found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5)
+    np.testing.assert_allclose(
+        found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
+    )
     paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
     np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
-    assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][~active].any()
+    assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][
+        ~active
+    ].any()
     assert layout(hand, task)[-2:] == (("level", 2), ("mask", 1))
     block = np.asarray(rollout.observation)[..., -3:-1]
     np.testing.assert_array_equal(block[0, :, 0], active & wrist)
     np.testing.assert_allclose(block[1, :, 1][active & wrist], height[0][active & wrist], atol=1e-5)
     assert not block[:, ~active].any()
-    return {name.removeprefix("episode/"): values for name, values in found.items() if name.startswith("episode/")}
+    return {
+        name.removeprefix("episode/"): values
+        for name, values in found.items()
+        if name.startswith("episode/")
+    }
 
 
 def tables(task, values):
-    """Its row of an evaluation, from those episodes that had it alone, as if they had all held the object."""
+    """Its row of an evaluation, from those episodes that had it alone, as if they had all held the
+    object.
+    """
     from congrasp.services.evaluate import episodes, scores, table
 
-    assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {"level_m": "level_m"}
+    assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {
+        "level_m": "level_m"
+    }
     alone = values["mask_level"] > 0
     plan = {"identity": np.arange(len(alone)), "mass_kg": np.full(len(alone), 0.2)}
-    some = {name: column[alone] for name, column in {**values, **plan, "success": np.ones(len(alone))}.items()}
+    some = {
+        name: column[alone]
+        for name, column in {**values, **plan, "success": np.ones(len(alone))}.items()
+    }
     nothing = np.zeros((0, 1, 1))
     row = scores.summarise(
-        "level", "human", episodes.Sample(some, nothing, nothing), held_2s=False, objects=list("abcdefgh")
+        "level",
+        "human",
+        episodes.Sample(some, nothing, nothing),
+        held_2s=False,
+        objects=list("abcdefgh"),
     )
     np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
     assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
@@ -179,7 +230,12 @@ def command_line():
     from congrasp.services.cli import main
     from congrasp.services.grasp.parse import read_request
 
-    train = ["--task.p-level", "--task.reward.level-height", "--task.reward.height", "Per metre of rise."]
+    train = [
+        "--task.p-level",
+        "--task.reward.level-height",
+        "--task.reward.height",
+        "Per metre of rise.",
+    ]
     for command, words in {"grasp": ["--level"], "train": train}.items():
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
@@ -189,9 +245,9 @@ def command_line():
     parsed = main._parsed("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
-    assert list(request.constraints) == ["heading", "level"] and request.constraints["level"]["wrist"].tolist() == [
-        True
-    ]
+    assert list(request.constraints) == ["heading", "level"] and request.constraints["level"][
+        "wrist"
+    ].tolist() == [True]
     assert RunConfig().task.reward.level_height == 0.7
 
 
@@ -209,7 +265,9 @@ def file():
             path = pathlib.Path(folder, "path.json")
             written = {"position": [[0.2, 0, 0], [0.1, 0, end]], "quaternion": [[1, 0, 0, 0]] * 2}
             path.write_text(json.dumps(written))
-            request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, levelled=path)
+            request = read_request(
+                procedural.generate(0, "box"), get_hand("human"), 15, levelled=path
+            )
             assert request.constraints["level"]["wrist"].tolist() == [level]
 
 
@@ -217,7 +275,11 @@ def marker():
     """What pictures, recordings and the studio's player draw of it."""
     from congrasp.services.record.episode import markers
 
-    heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), "cross": np.array([1.0, 0.0, 0.0])}
+    heading = {
+        "position": np.zeros(3),
+        "direction": np.array([0.0, 0.0, -1.0]),
+        "cross": np.array([1.0, 0.0, 0.0]),
+    }
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
     arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
     drawn = dict(markers(arrays))
@@ -267,7 +329,9 @@ def term():
     weights = dataclasses.replace(RewardWeights(), height=3.0)
     paid = evaluated(reward_terms, scene_of(task, state, surface, goal), weights)
     np.testing.assert_allclose(paid["height"], [3.0 * 0.05, 0.0, 3.0 * 0.2], rtol=1e-5)
-    assert set(paid) == set(terms(task)) and "height" in terms(task) and RewardWeights().height == 2.0
+    assert (
+        set(paid) == set(terms(task)) and "height" in terms(task) and RewardWeights().height == 2.0
+    )
     config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))
     assert run_config_from_json(to_json(config)) == config
 
@@ -280,7 +344,9 @@ if __name__ == "__main__":
 
     from congrasp.common.task.config import TaskConfig
 
-    TASK = TaskConfig(constraints=("heading", "level"), approach_steps=2, hold_steps=1, hold_steps_max=1)
+    TASK = TaskConfig(
+        constraints=("heading", "level"), approach_steps=2, hold_steps=1, hold_steps_max=1
+    )
     metrics = episodes(TASK)
     print("episodes")
     tables(TASK, metrics)

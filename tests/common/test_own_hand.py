@@ -53,5 +53,7 @@ def test_a_hand_file_is_a_hand_by_path_by_name_and_by_its_text(tmp_path, monkeyp
 
 
 def test_a_hand_file_from_before_links_had_solids_stays_as_it_is():
-    """Its text names the hand in policies, and says whether a training that was interrupted was of this hand."""
+    """Its text names the hand in policies, and says whether a training that was interrupted was of
+    this hand.
+    """
     assert hand_text(read_hand(FILE)) == FILE.read_text()

@@ -109,7 +109,9 @@ def test_a_script_without_a_guard_runs_once(kind, by, tmp_path):
     script.write_text(f'print("started", __name__)\n{_dedented(_SCRIPTS[kind])}')
     command = [sys.executable, {"file": script, "stdin": "-", "interpreter": "-i"}[by]]
     with script.open() as stdin:
-        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, cwd=_ROOT, timeout=600)
+        done = subprocess.run(
+            command, stdin=stdin, capture_output=True, text=True, cwd=_ROOT, timeout=600
+        )
     lines = [line for line in done.stdout.splitlines() if line.startswith(("started", "RESULT"))]
     assert lines == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}"], done.stderr
     assert done.returncode == 0 and "Traceback" not in done.stderr
@@ -148,21 +150,35 @@ def test_workers_end_with_a_killed_parent(tmp_path):
 @pytest.mark.parametrize(
     ("membership", "files", "expected"),
     [
-        ("0::/jobs/mine", {"jobs/mine/cpu.max": "50000 100000", "jobs/mine/memory.max": "max"}, (1, None)),
-        ("0::/jobs/mine", {"jobs/mine/cpu.max": "max 100000", "jobs/cpu.max": "150000 100000"}, (2, None)),
-        ("0::/", {"cpu.max": "800000 100000", "memory.max": f"{8 << 20}"}, (3, 0)),  # less than this process uses
+        (
+            "0::/jobs/mine",
+            {"jobs/mine/cpu.max": ("50000 100000"), "jobs/mine/memory.max": "max"},
+            (1, None),
+        ),
+        (
+            "0::/jobs/mine",
+            {"jobs/mine/cpu.max": ("max 100000"), "jobs/cpu.max": "150000 100000"},
+            (2, None),
+        ),
+        # Less than this process uses
+        ("0::/", {"cpu.max": "800000 100000", "memory.max": f"{8 << 20}"}, (3, 0)),
         (
             "5:memory:/docker/1\n4:cpu,cpuacct:/docker/1",
-            {"cpu/cpu.cfs_quota_us": "110000", "cpu/cpu.cfs_period_us": "100000",
-             "memory/docker/1/memory.limit_in_bytes": f"{8 << 20}"},
+            {
+                "cpu/cpu.cfs_quota_us": "110000",
+                "cpu/cpu.cfs_period_us": "100000",
+                "memory/docker/1/memory.limit_in_bytes": f"{8 << 20}",
+            },
             (2, 0),
         ),
         ("4:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, (3, None)),
         ("", {}, (3, None)),
     ],
-)  # fmt: skip
+)
 def test_quotas_of_control_groups_count(membership, files, expected, monkeypatch, tmp_path):
-    """Those of the process's group and of all above it, in both versions, on a machine with three cores."""
+    """Those of the process's group and of all above it, in both versions, on a machine with three
+    cores.
+    """
     monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1, 2})
     monkeypatch.setattr(parallel, "_GROUPS", tmp_path)
     monkeypatch.setattr(parallel, "_MEMBERSHIP", tmp_path / "membership")

@@ -36,7 +36,15 @@ def test_what_python_writes_comes_back(tmp_path, protocol):
     path = tmp_path / "file.pkl"
     path.write_bytes(pickle.dumps(value, protocol))
     read = read_pickle(path)
-    assert read.keys() == {"numbers", "words/a", "words/none", "array", "fortran", "scalar", "again"}
+    assert read.keys() == {
+        "numbers",
+        "words/a",
+        "words/none",
+        "array",
+        "fortran",
+        "scalar",
+        "again",
+    }
     for name in ("numbers", "array", "fortran", "scalar", "again"):
         np.testing.assert_array_equal(read[name], value[name])
     assert str(read["words/a"]) == "ü" and read["words/none"].shape == (0,)
@@ -56,7 +64,10 @@ def test_several_files_are_read_in_one_process_and_the_wrong_one_is_named(monkey
 
 def test_the_process_imports_no_package_but_numpy(tmp_path):
     (tmp_path / "pickles.zip").write_bytes(b"PK\x05\x06" + bytes(18))
-    listed = "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='__main__'); print(*sys.modules)"
+    listed = (
+        "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='__main__'); "
+        "print(*sys.modules)"
+    )
     files = pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"
     modules = python("-c", listed, *files, 1 << 30, 10, 1 << 20).stdout.split()
     assert "numpy" in modules and not {"jax", "congrasp", "scipy", "zenoh"}.intersection(modules)
@@ -89,13 +100,23 @@ def test_hostile_pickles_are_refused_in_one_line_and_nothing_runs(tmp_path):
         deep = [deep]
     flags = Reduced("numpy dtype", ("O8", 0, 1), (3, "|", None, None, None, 8, 8, 0))
     pointers = Reduced("numpy.core.multiarray scalar", (flags, "A" * 8))
-    fields = Reduced("numpy dtype", ("V8", 0, 1), (3, "|", None, ("x",), {"x": (flags, 0)}, 8, 1, 0))
+    fields = Reduced(
+        "numpy dtype", ("V8", 0, 1), (3, "|", None, ("x",), {"x": (flags, 0)}, 8, 1, 0)
+    )
     record = Reduced("numpy.core.multiarray _reconstruct", (), (1, (1,), fields, False, "A" * 8))
     files = {
         "call": (pickle.dumps(_Runs(mark)), "mkdir"),
         "eval": (dumps(Reduced("__builtin__ eval", ("1",))), "eval"),
         "nested": (
-            dumps({"J": [Reduced("numpy.core.multiarray _reconstruct", (), Reduced("os system", ("x",)))]}),
+            dumps(
+                {
+                    "J": [
+                        Reduced(
+                            "numpy.core.multiarray _reconstruct", (), Reduced("os system", ("x",))
+                        )
+                    ]
+                }
+            ),
             "os",
         ),
         "getattr": (dumps(Reduced("__builtin__ getattr", ("", "a"))), "getattr"),
@@ -117,7 +138,11 @@ def test_hostile_pickles_are_refused_in_one_line_and_nothing_runs(tmp_path):
         "huge string": (b"\x80\x04\x8d" + b"\xff" * 8 + b".", "damaged"),
         "shape": (
             dumps(
-                Reduced("numpy.core.multiarray _reconstruct", (), (1, (10**9,), Reduced("numpy dtype", ("f8",)), 0, ""))
+                Reduced(
+                    "numpy.core.multiarray _reconstruct",
+                    (),
+                    (1, (10**9,), Reduced("numpy dtype", ("f8",)), 0, ""),
+                )
             ),
             "damaged",
         ),
@@ -145,13 +170,19 @@ def test_hostile_pickles_are_refused_in_one_line_and_nothing_runs(tmp_path):
 def _laugh(levels):
     """Dictionaries each of which holds the one before it twice."""
     names = (b"U\x01ah%cU\x01bh%c" % (i, i) for i in range(levels))
-    return b"\x80\x02}q\x00" + b"".join(b"}q%c(%su" % (i + 1, name) for i, name in enumerate(names)) + b"."
+    return (
+        b"\x80\x02}q\x00"
+        + b"".join(b"}q%c(%su" % (i + 1, name) for i, name in enumerate(names))
+        + b"."
+    )
 
 
 _TUPLES = b"\x80\x02)" + b"".join(b"q%c0h%ch%c\x86" % (i, i, i) for i in range(40))
 _NESTED = b"\x80\x02)" + b"\x85" * 200_000
 _BYTES = Reduced("numpy dtype", ("u1",))
-_WIDE = Reduced("numpy.core.multiarray _reconstruct", (), (1, (1 << 20,), _BYTES, 0, "x" * (1 << 20)))
+_WIDE = Reduced(
+    "numpy.core.multiarray _reconstruct", (), (1, (1 << 20,), _BYTES, 0, "x" * (1 << 20))
+)
 _SHARED = dumps(_WIDE)[2:-1] + b"q\x01" + b"0"
 _REPEATED = b"".join(b"U\x04%04dh\x01" % i for i in range(1000))
 _TORCH = (
@@ -159,7 +190,9 @@ _TORCH = (
     *(b"\x80\x02(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000tQ.", ["0"]),
 )
 _STORAGE = (
-    b"".join(part if isinstance(part, bytes) else dumps(part) for part in _TORCH) + (1).to_bytes(8, "little") + bytes(4)
+    b"".join(part if isinstance(part, bytes) else dumps(part) for part in _TORCH)
+    + (1).to_bytes(8, "little")
+    + bytes(4)
 )
 _TENSOR = Reduced(
     "torch._utils _rebuild_tensor_v2",
@@ -171,12 +204,34 @@ _TENSOR = Reduced(
     ("data", "word"),
     [
         pytest.param(_laugh(40)[:-1] + b"U\x01xK\x01s.", "needs", id="dictionaries that repeat"),
-        pytest.param(b"\x80\x02}" + _TUPLES[2:] + b"Ns.", "needs", id="a key of 2^40 values", marks=pytest.mark.slow),
-        pytest.param(b"\x80\x04\x8f(" + _TUPLES[2:] + b"\x90.", "needs", id="a member of them", marks=pytest.mark.slow),
-        pytest.param(b"\x80\x02}" + _NESTED[2:] + b"Ns.", "needs|deeply", id="a deep key", marks=pytest.mark.slow),
-        pytest.param(b"\x80\x02(" + b"]" * 50_000_000 + b"l.", "needs", id="many values", marks=pytest.mark.slow),
+        pytest.param(
+            b"\x80\x02}" + _TUPLES[2:] + b"Ns.",
+            "needs",
+            id="a key of 2^40 values",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            b"\x80\x04\x8f(" + _TUPLES[2:] + b"\x90.",
+            "needs",
+            id="a member of them",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            b"\x80\x02}" + _NESTED[2:] + b"Ns.",
+            "needs|deeply",
+            id="a deep key",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            b"\x80\x02(" + b"]" * 50_000_000 + b"l.",
+            "needs",
+            id="many values",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(dumps([_TENSOR]), "damaged", id="a tensor of one number"),
-        pytest.param(b"\x80\x02" + _SHARED + b"}(" + _REPEATED + b"u.", "large|needs", id="one buffer"),
+        pytest.param(
+            b"\x80\x02" + _SHARED + b"}(" + _REPEATED + b"u.", "large|needs", id="one buffer"
+        ),
     ],
 )
 def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
@@ -206,28 +261,50 @@ def _zip(path, members, method=zipfile.ZIP_DEFLATED):
 
 
 def test_arrays_come_back(tmp_path):
-    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.asfortranarray(np.eye(3, 2))}
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.array("text"),
+        "c": np.asfortranarray(np.eye(3, 2)),
+    }
     arrays["d"] = np.ones(0)
     np.savez_compressed(tmp_path / "a.npz", **arrays)
     read = read_npz(tmp_path / "a.npz", "")
     assert read.keys() == arrays.keys()
     for name, array in arrays.items():
         np.testing.assert_array_equal(read[name], array)
-        assert read[name].flags.f_contiguous == array.flags.f_contiguous and read[name].flags.writeable
+        assert (
+            read[name].flags.f_contiguous == array.flags.f_contiguous and read[name].flags.writeable
+        )
 
 
 @pytest.mark.parametrize(
     ("members", "why"),
     [
-        pytest.param({"a.npy": _npy((32 << 20,), "|u1", bytes(32 << 20))}, "4 MB", id="inflates to 32 MB"),
-        pytest.param({f"{i}.npy": _npy((1 << 19,), "|u1", bytes(1 << 19)) for i in range(9)}, "4 MB", id="nine"),
+        pytest.param(
+            {"a.npy": _npy((32 << 20,), "|u1", bytes(32 << 20))}, "4 MB", id="inflates to 32 MB"
+        ),
+        pytest.param(
+            {f"{i}.npy": _npy((1 << 19,), "|u1", bytes(1 << 19)) for i in range(9)},
+            "4 MB",
+            id="nine",
+        ),
         pytest.param({"a.npy": _npy((1 << 40,))}, "bytes, which is not", id="claims 8 TB"),
-        pytest.param({"a.npy": _npy((1 << 62, 8))}, "bytes, which is not", id="claims more than there is"),
+        pytest.param(
+            {"a.npy": _npy((1 << 62, 8))}, "bytes, which is not", id="claims more than there is"
+        ),
         pytest.param({"a.npy": _npy((1 << 40,), "|V0")}, "type", id="values of no size"),
-        pytest.param({"a.npy": _npy((1 << 40,), "<U0")}, "bytes, which is not", id="texts of no size"),
+        pytest.param(
+            {"a.npy": _npy((1 << 40,), "<U0")}, "bytes, which is not", id="texts of no size"
+        ),
         pytest.param({"a.npy": _npy((1,), "|O", b"\x80\x04N.")}, "type", id="an object"),
-        pytest.param({f"{i}.npy": _npy((0,)) for i in range(2000)}, "more than 1000 arrays", id="many"),
-        pytest.param({"a.npy": b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535}, "not an NPZ file", id="deep header"),
+        pytest.param(
+            {f"{i}.npy": _npy((0,)) for i in range(2000)}, "more than 1000 arrays", id="many"
+        ),
+        pytest.param(
+            {"a.npy": b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535},
+            "not an NPZ file",
+            id="deep header",
+        ),
         pytest.param({"a.txt": b""}, "else than arrays", id="a text"),
     ],
 )
@@ -235,7 +312,11 @@ def test_what_is_larger_than_it_looks_is_refused_before_it_is_in_memory(tmp_path
     _zip(tmp_path / "a.npz", members)
     read = functools.partial(read_npz, largest=4 << 20)
     said = limited(read, tmp_path / "a.npz", "Get it again.", memory=24 << 20)
-    assert said.startswith(f"CongraspError: {tmp_path / 'a.npz'}") and why in said and said.endswith("Get it again.")
+    assert (
+        said.startswith(f"CongraspError: {tmp_path / 'a.npz'}")
+        and why in said
+        and said.endswith("Get it again.")
+    )
 
 
 def test_a_directory_that_lies_about_sizes_inflates_no_further(tmp_path):

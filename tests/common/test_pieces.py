@@ -52,7 +52,11 @@ def test_pieces_grow_on_a_fast_link_and_shrink_on_a_slow_one():
     for seconds in [0.01] * 10 + [0.5] * 12:
         lengths.append(int.from_bytes(pace.request(b"t" * 8, 0)[-4:], "little"))
         pace.note(seconds, came=seconds < 1)
-    assert lengths[:3] == [32 << 10, 64 << 10, 128 << 10] and max(lengths) == 4 << 20 and lengths[-1] == 8 << 10
+    assert (
+        lengths[:3] == [32 << 10, 64 << 10, 128 << 10]
+        and max(lengths) == 4 << 20
+        and lengths[-1] == 8 << 10
+    )
     pace.note(0.0, came=False)  # put off: says nothing of the link
     assert pace.request(b"t" * 8, 0)[-4:] == (8 << 10).to_bytes(4, "little")
 
@@ -77,7 +81,12 @@ def test_a_reply_comes_whole_to_an_asker_that_has_had_pieces_as_long():
         pace.note(0.01, came=True)
     piece, head = _first(outbox, payload, pace.wish())
     assert len(piece) == 2 << 20
-    assert fetch(head, piece, lambda request, _: outbox.piece(request), pace, most=1 << 30, timeout=5.0) == payload
+    assert (
+        fetch(
+            head, piece, lambda request, _: outbox.piece(request), pace, most=1 << 30, timeout=5.0
+        )
+        == payload
+    )
     pace.note(0.01, came=True)
     assert _first(outbox, payload, pace.wish()) == (payload, None)
     with outbox.turn("a"):  # one of its pieces is on its way
@@ -98,19 +107,28 @@ def test_what_cannot_be_whole_is_an_error_with_a_deadline():
     with pytest.raises(TransportError, match="no longer available"):
         fetch(head, first, lambda request, seconds: b"", Pace(), most=1 << 30, timeout=1.0)
     with pytest.raises(TransportError, match="no longer available"):  # longer than announced
-        fetch(head, first, lambda request, seconds: bytes(2 << 20), Pace(), most=1 << 30, timeout=1.0)
+        fetch(
+            head, first, lambda request, seconds: bytes(2 << 20), Pace(), most=1 << 30, timeout=1.0
+        )
     with pytest.raises(TransportError, match="invalid attachment"):
         fetch(b"x", first, lambda request, seconds: b"", Pace(), most=1 << 30, timeout=1.0)
 
 
 def test_one_account_has_few_pieces_on_their_way():
     outbox = Outbox(at_once=2)
-    with outbox.turn("a") as one, outbox.turn("a") as two, outbox.turn("a") as three, outbox.turn("b") as other:
+    with (
+        outbox.turn("a") as one,
+        outbox.turn("a") as two,
+        outbox.turn("a") as three,
+        outbox.turn("b") as other,
+    ):
         assert (one, two, three, other) == (True, True, False, True)
     with outbox.turn("a") as one, outbox.turn("a") as two:
         assert one and two
     assert not outbox._sending
-    assert account("congrasp/r/weights/latest/actor/3.gpu") == account("congrasp/r/weights/latest/actor/3.b")
+    assert account("congrasp/r/weights/latest/actor/3.gpu") == account(
+        "congrasp/r/weights/latest/actor/3.b"
+    )
     assert account("congrasp/r/policy/act/3.b") != account("congrasp/r/policy/act/4.b")
 
 

@@ -1,4 +1,6 @@
-"""Plausibility: capsules against distances worked out by hand and against MuJoCo, measures against simple motions."""
+"""Plausibility: capsules against distances worked out by hand and against MuJoCo, measures against
+simple motions.
+"""
 
 import dataclasses
 import functools
@@ -40,9 +42,13 @@ def posed(name: str, q: np.ndarray):
 
 
 def deepest_contact(name: str, q: np.ndarray) -> float:
-    """Deepest contact in metres between the links in MuJoCo, whose hand excludes what it excludes."""
+    """Deepest contact in metres between the links in MuJoCo, whose hand excludes what it
+    excludes.
+    """
     hand, spec = get_hand(name), mujoco.MjSpec()
-    hand = dataclasses.replace(hand, links=tuple(dataclasses.replace(link, solids=()) for link in hand.links))
+    hand = dataclasses.replace(
+        hand, links=tuple(dataclasses.replace(link, solids=()) for link in hand.links)
+    )
     spec.compiler.degree = False
     add_hand(spec, hand, self_collision=True)
     model = spec.compile()
@@ -80,20 +86,31 @@ def test_no_points_of_two_segments_are_nearer_than_their_distance(seed):
 def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
     hand, rng = get_hand(name), np.random.default_rng(0)
     measured = jax.jit(lambda q: hand_hand(hand, link_transforms(hand, q)))
-    poses = [hand.q_open, hand.q_closed, *rng.uniform(hand.lower, hand.upper, (8, len(hand.joints)))]
+    poses = [
+        hand.q_open,
+        hand.q_closed,
+        *rng.uniform(hand.lower, hand.upper, (8, len(hand.joints))),
+    ]
     found = np.asarray(measured(np.array(poses, np.float32)))
     np.testing.assert_allclose(found, [deepest_contact(name, q) for q in poses], atol=1e-5)
-    assert found[0] == 0.0 and found.max() > 0.002  # open hands are free of themselves, some poses are not
+    # Open hands are free of themselves, some poses are not
+    assert found[0] == 0.0 and found.max() > 0.002
 
 
 def test_hand_in_table_is_the_lowest_point_of_a_capsule():
     hand, transforms = posed("human", np.zeros(20))
-    # At zero the lowest capsule is the thumb's last: its tip's centre at z = -0.0403, its radius 6.5 mm.
+    # At zero the lowest capsule is the thumb's last: its tip's centre at z = -0.0403, its radius
+    # 6.5 mm.
     for height, depth in ((0.0, 0.0468), (0.04, 0.0068), (0.05, 0.0)):
         found = hand_table(hand, transforms, np.array([[0.0, 0.0, height]], np.float32), UPRIGHT)
         assert float(found[0]) == pytest.approx(depth, abs=1e-6)
-    over = Rotation.from_euler("x", 180, degrees=True).as_quat(scalar_first=True)[None].astype(np.float32)
-    # Turned over, the middle finger's last joint is lowest: z = 0.0197, and the radius of its middle link 8 mm.
+    over = (
+        Rotation.from_euler("x", 180, degrees=True)
+        .as_quat(scalar_first=True)[None]
+        .astype(np.float32)
+    )
+    # Turned over, the middle finger's last joint is lowest: z = 0.0197, and the radius of its
+    # middle link 8 mm.
     found = hand_table(hand, transforms, np.zeros((1, 3), np.float32), over)
     assert float(found[0]) == pytest.approx(0.0197 + 0.008, abs=1e-6)
 
@@ -116,10 +133,21 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     hand, transforms = posed("human", np.zeros(20))
     blade = procedural.generate(1, "box")
     plate = Piece("box", (0.06, 0.001, 0.06))
-    vertices = np.array([[x, y, z] for x in (-0.06, 0.06) for y in (-0.001, 0.001) for z in (-0.06, 0.06)], np.float32)
+    vertices = np.array(
+        [[x, y, z] for x in (-0.06, 0.06) for y in (-0.001, 0.001) for z in (-0.06, 0.06)],
+        np.float32,
+    )
     blade = type(blade)(**{**blade.__dict__, "pieces": (plate,), "visual_vertices": vertices})
-    middle = 0.5 * np.add(*[np.array(getattr(hand.links[8].capsules[0], end)) for end in ("start", "end")])
-    found = _in_object(transforms, middle[None].astype(np.float32), UPRIGHT, np.zeros(1, int), distance_field([blade]))
+    middle = 0.5 * np.add(
+        *[np.array(getattr(hand.links[8].capsules[0], end)) for end in ("start", "end")]
+    )
+    found = _in_object(
+        transforms,
+        middle[None].astype(np.float32),
+        UPRIGHT,
+        np.zeros(1, int),
+        distance_field([blade]),
+    )
     # The plate lies across the middle finger; the points on the axis are at most 4 mm apart.
     thickest = max(capsule.radius for capsule in hand.links[8].capsules)
     assert thickest - 0.001 < float(found[0]) < thickest + 0.0025
@@ -129,12 +157,16 @@ def motion(steps: int, **arrays: np.ndarray) -> Sample:
     """Samples of one episode, zero but for what is given."""
     shapes = {"wrist_velocity": 3, "finger_velocity": 2, "link_force": 4, "torque_share": 2}
     shapes |= {"object_position": 3, "object_quaternion": 4}
-    zeros = {name: np.zeros((steps, 1, *([shapes[name]] if name in shapes else []))) for name in Sample._fields}
+    zeros = {
+        name: np.zeros((steps, 1, *([shapes[name]] if name in shapes else [])))
+        for name in Sample._fields
+    }
     return Sample(**{**zeros, **arrays})
 
 
 def test_measures_of_a_motion_worked_out_by_hand():
-    # The wrist jumps to 1 m/s in the first step, goes on, and stops; a joint speeds up by 100 rad/s^2.
+    # The wrist jumps to 1 m/s in the first step, goes on, and stops; a joint speeds up by 100
+    # rad/s^2.
     wrist = np.zeros((4, 1, 3))
     wrist[:3, 0, 0] = 1.0
     fingers = np.zeros((4, 1, 2))
@@ -145,7 +177,12 @@ def test_measures_of_a_motion_worked_out_by_hand():
     torque[3, 0] = [1.0, 0.6]
     depth = np.array([[0.001], [0.004], [0.0], [0.002]])
     samples = motion(
-        4, wrist_velocity=wrist, finger_velocity=fingers, link_force=force, torque_share=torque, hand_hand=depth
+        4,
+        wrist_velocity=wrist,
+        finger_velocity=fingers,
+        link_force=force,
+        torque_share=torque,
+        hand_hand=depth,
     )
     found = measures(samples, 0.01)
     assert set(found) == set(plausibility.MEASURES)
@@ -174,8 +211,19 @@ def test_hands_without_meshes_have_no_measure_of_them():
 
 def test_clean_is_held_and_shallow_everywhere():
     shallow = {"hand_hand_mm": 1.9, "hand_table_mm": 1.9, "hand_object_mm": 2.9}
-    assert is_clean(np.array([True]), {name: np.array([x]) for name, x in shallow.items()}).tolist() == [True]
-    assert is_clean(np.array([False]), {name: np.array([x]) for name, x in shallow.items()}).tolist() == [False]
-    for name, value in (("hand_hand_mm", 2.0), ("hand_table_mm", 2.0), ("hand_object_mm", 3.0), ("hand_mesh_mm", 3.0)):
+    assert is_clean(
+        np.array([True]), {name: np.array([x]) for name, x in shallow.items()}
+    ).tolist() == [True]
+    assert is_clean(
+        np.array([False]), {name: np.array([x]) for name, x in shallow.items()}
+    ).tolist() == [False]
+    for name, value in (
+        ("hand_hand_mm", 2.0),
+        ("hand_table_mm", 2.0),
+        ("hand_object_mm", 3.0),
+        ("hand_mesh_mm", 3.0),
+    ):
         found = {**shallow, name: value}
-        assert is_clean(np.array([True]), {name: np.array([x]) for name, x in found.items()}).tolist() == [False]
+        assert is_clean(
+            np.array([True]), {name: np.array([x]) for name, x in found.items()}
+        ).tolist() == [False]

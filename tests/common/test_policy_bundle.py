@@ -50,7 +50,11 @@ def test_file_keeps_everything_exactly(bundle, tmp_path):
     assert (loaded.spec, loaded.task) == (bundle.spec, bundle.task)
     assert (loaded.version, loaded.run_id, loaded.transitions) == (12, "ab12", 3_000_000_000)
     for name in ("params", "observation", "value"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(loaded, name), jax.device_get(getattr(bundle, name)))
+        jax.tree.map(
+            np.testing.assert_array_equal,
+            getattr(loaded, name),
+            jax.device_get(getattr(bundle, name)),
+        )
     assert loaded.observation.count == 2**40 + 1
     assert [p.name for p in tmp_path.iterdir()] == ["policy.safetensors"]
 
@@ -63,7 +67,9 @@ def test_file_is_read_by_other_programs(bundle, tmp_path):
 
 def test_content_hash_changes_with_the_content(bundle):
     first = bundles.content_hash(encode(bundle.to_message()))
-    again = bundles.content_hash(encode(PolicyBundle.from_message(decode(encode(bundle.to_message()))).to_message()))
+    again = bundles.content_hash(
+        encode(PolicyBundle.from_message(decode(encode(bundle.to_message()))).to_message())
+    )
     other = bundles.content_hash(encode(dataclasses.replace(bundle, version=13).to_message()))
     assert first == again != other
 
@@ -89,7 +95,10 @@ def test_schema_changes_with_what_it_covers(change):
         other.require(SPEC, "mine.safetensors")
     text = str(caught.value)
     assert "\n" not in text
-    assert all(word in text for word in ("mine.safetensors", "'claw'", SPEC.schema, other.hand, other.schema))
+    assert all(
+        word in text
+        for word in ("mine.safetensors", "'claw'", SPEC.schema, other.hand, other.schema)
+    )
 
 
 def test_initial_std_is_no_part_of_the_schema():
@@ -101,7 +110,9 @@ def _without(message: Message, name: str) -> Message:
 
 
 def _with(message: Message, name: str, value: float) -> Message:
-    return Message({**message.arrays, name: np.full_like(message.arrays[name], value)}, message.meta)
+    return Message(
+        {**message.arrays, name: np.full_like(message.arrays[name], value)}, message.meta
+    )
 
 
 @pytest.mark.parametrize(
@@ -111,14 +122,29 @@ def _with(message: Message, name: str, value: float) -> Message:
         (lambda m: Message(m.arrays, {k: v for k, v in m.meta.items() if k != "hand"}), "hand"),
         (lambda m: Message(m.arrays, {**m.meta, "task": {"wheels": 4}}), "wheels"),
         (lambda m: Message(m.arrays, {**m.meta, "layout": [["state", -3]]}), "layout|meta"),
-        (lambda m: Message(m.arrays, {**m.meta, "network": {"hidden": [-8], "encoder": 3}}), "meta|schema"),
+        (
+            lambda m: Message(m.arrays, {**m.meta, "network": {"hidden": [-8], "encoder": 3}}),
+            "meta|schema",
+        ),
         (lambda m: Message(m.arrays, {**m.meta, "schema": "0" * 16}), "schema"),
         (lambda m: _without(m, "critic/output/bias"), "critic/output/bias"),
         (lambda m: Message({**m.arrays, "extra": np.zeros(1)}, m.meta), "extra"),
-        (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(3, np.float32)}, m.meta), "actor/log_std"),
-        (lambda m: Message({**m.arrays, "actor/log_std": np.full(2, np.nan)}, m.meta), "actor/log_std"),
-        (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(2, np.int32)}, m.meta), "actor/log_std"),
-        (lambda m: Message({**m.arrays, "actor/log_std": np.full(2, 1e4, np.float32)}, m.meta), "actor/log_std"),
+        (
+            lambda m: Message({**m.arrays, "actor/log_std": np.zeros(3, np.float32)}, m.meta),
+            "actor/log_std",
+        ),
+        (
+            lambda m: Message({**m.arrays, "actor/log_std": np.full(2, np.nan)}, m.meta),
+            "actor/log_std",
+        ),
+        (
+            lambda m: Message({**m.arrays, "actor/log_std": np.zeros(2, np.int32)}, m.meta),
+            "actor/log_std",
+        ),
+        (
+            lambda m: Message({**m.arrays, "actor/log_std": np.full(2, 1e4, np.float32)}, m.meta),
+            "actor/log_std",
+        ),
         (lambda m: _with(m, "observation/m2", -1.0), "observation/m2"),
         (lambda m: _with(m, "observation/count", -1.0), "observation/count"),
         (lambda m: _with(m, "critic/output/bias", 1e30), "critic/output/bias"),
@@ -139,9 +165,13 @@ def test_inference_normalises_and_knows_its_log_probability(bundle):
     affine = normalizer.observation_affine(bundle.observation, LAYOUT)
     mean, log_std = network.policy(bundle.params, LAYOUT, normalizer.apply(affine, raw))
     parameters = bundle.inference_parameters
-    np.testing.assert_allclose(bundles.mean_action(LAYOUT, parameters, raw), mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        bundles.mean_action(LAYOUT, parameters, raw), mean, rtol=1e-5, atol=1e-6
+    )
     action, log_probability = bundles.sample_action(LAYOUT, parameters, raw, jax.random.PRNGKey(0))
-    np.testing.assert_allclose(log_probability, network.log_probability(mean, log_std, action), rtol=1e-4)
+    np.testing.assert_allclose(
+        log_probability, network.log_probability(mean, log_std, action), rtol=1e-4
+    )
     other, _ = bundles.sample_action(LAYOUT, parameters, raw, jax.random.PRNGKey(1))
     assert not np.allclose(action, other)
 
@@ -173,12 +203,17 @@ def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
     assert loaded.spec.privileged == seen
     np.testing.assert_array_equal(loaded.privileged.mean, statistics.mean)
     raw = np.random.default_rng(1).normal(size=(5, 17)).astype(np.float16)
-    same = [np.asarray(bundles.mean_action(LAYOUT, one.inference_parameters, raw)) for one in (bundle, loaded)]
+    same = [
+        np.asarray(bundles.mean_action(LAYOUT, one.inference_parameters, raw))
+        for one in (bundle, loaded)
+    ]
     np.testing.assert_array_equal(*same)
     message = wide.to_message()
     for wrong in ([["mass", -5]], [["mass", 1 << 20]], [["mass", 4]], [["mass"]], 7):
         with pytest.raises(CongraspError, match=r"p\.safetensors"):
-            PolicyBundle.from_message(Message(message.arrays, {**message.meta, "privileged": wrong}), "p.safetensors")
+            PolicyBundle.from_message(
+                Message(message.arrays, {**message.meta, "privileged": wrong}), "p.safetensors"
+            )
 
 
 def test_a_policy_that_observes_less_begins_with_the_same_actions():
@@ -186,7 +221,11 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
     plain, normals = TaskConfig(surface_normals=False), TaskConfig(surface_normals=True)
     spec, wider = (bundles.policy_spec(task, sizes) for task in (plain, normals))
     rng = np.random.default_rng(2)
-    names = [field.name for field in fields(get_hand("human"), normals)["state"] for _ in range(field.size)]
+    names = [
+        field.name
+        for field in fields(get_hand("human"), normals)["state"]
+        for _ in range(field.size)
+    ]
     kept = np.ones(sum(size for _, size in wider.layout), bool)
     kept[: len(names)] = [name not in ("normal", "height") for name in names]
     count, size = 1e9, np.count_nonzero(kept)
@@ -199,7 +238,9 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
     after = bundles.mean_action(wider.layout, more.inference_parameters, raw)
     np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-6)
     batch = normalizer.moments(raw, 1)
-    news = normalizer.merge(more.observation, batch._replace(count=np.float64(1e6), m2=batch.m2 * 1e6 / 6))
+    news = normalizer.merge(
+        more.observation, batch._replace(count=np.float64(1e6), m2=batch.m2 * 1e6 / 6)
+    )
     np.testing.assert_allclose(news.mean[~kept], raw[:, ~kept].mean(0), rtol=0.1, atol=1e-3)
     with pytest.raises(CongraspError, match="to begin with is for hand 'human'"):
         bundles.with_inputs_of(spec, plain, more)

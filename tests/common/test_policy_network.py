@@ -85,7 +85,11 @@ def test_a_block_matters_exactly_while_its_bit_is_set(params, mask):
 
 def test_gaussian_against_scipy():
     rng = np.random.default_rng(1)
-    mean, log_std, action = rng.normal(size=(5, 4)), rng.normal(size=4) * 0.3, rng.normal(size=(5, 4))
+    mean, log_std, action = (
+        rng.normal(size=(5, 4)),
+        rng.normal(size=4) * 0.3,
+        rng.normal(size=(5, 4)),
+    )
     expected = scipy.stats.norm.logpdf(action, mean, np.exp(log_std)).sum(-1)
     np.testing.assert_allclose(network.log_probability(mean, log_std, action), expected, rtol=1e-5)
     np.testing.assert_allclose(
@@ -95,18 +99,25 @@ def test_gaussian_against_scipy():
 
 def test_kl_divergence_by_hand():
     # One dimension: KL(N(0,1) || N(1,2^2)) = ln 2 + (1 + 1)/8 - 1/2.
-    kl = network.kl_divergence(jnp.zeros((1, 1)), jnp.zeros(1), jnp.ones((1, 1)), jnp.log(jnp.array([2.0])))
+    kl = network.kl_divergence(
+        jnp.zeros((1, 1)), jnp.zeros(1), jnp.ones((1, 1)), jnp.log(jnp.array([2.0]))
+    )
     np.testing.assert_allclose(kl, [np.log(2.0) + 0.25 - 0.5], rtol=1e-6)
 
 
 def test_samples_have_the_gaussians_moments():
-    mean, log_std = jnp.broadcast_to(jnp.array([1.0, -2.0]), (40_000, 2)), jnp.log(jnp.array([0.5, 0.1]))
+    mean, log_std = (
+        jnp.broadcast_to(jnp.array([1.0, -2.0]), (40_000, 2)),
+        jnp.log(jnp.array([0.5, 0.1])),
+    )
     draws = np.asarray(network.sample(jax.random.PRNGKey(3), mean, log_std))
     np.testing.assert_allclose(draws.mean(0), [1.0, -2.0], atol=4 * 0.5 / np.sqrt(40_000))
     np.testing.assert_allclose(draws.std(0), [0.5, 0.1], rtol=0.02)
 
 
-@pytest.mark.parametrize("layout", [LAYOUT[:-1], (*LAYOUT[:-1], ("mask", 5)), (("extra", 1), *LAYOUT), LAYOUT[1:]])
+@pytest.mark.parametrize(
+    "layout", [LAYOUT[:-1], (*LAYOUT[:-1], ("mask", 5)), (("extra", 1), *LAYOUT), LAYOUT[1:]]
+)
 def test_foreign_layouts_are_refused(layout):
     with pytest.raises(CongraspError, match="layout"):
         network.init(0, layout, ACTIONS, CONFIG)
@@ -117,23 +128,33 @@ def test_privileged_inputs_reach_the_critic_alone(params):
     jax.tree.map(np.testing.assert_array_equal, wide["actor"], params["actor"])
     x, inputs = np.ones((2, SIZE), np.float32), np.zeros((2, 3), np.float32)
     inputs[1, 2] = 1.0
-    assert len(wide["critic"]["trunk_0"]["kernel"]) == len(params["critic"]["trunk_0"]["kernel"]) + 3
+    assert (
+        len(wide["critic"]["trunk_0"]["kernel"]) == len(params["critic"]["trunk_0"]["kernel"]) + 3
+    )
     first, second = value_of(wide, x, inputs)
     assert first != second
 
 
 def test_new_inputs_leave_results_unchanged(params):
     rng = np.random.default_rng(0)
-    x, inputs = rng.normal(size=(5, SIZE)).astype(np.float32), rng.normal(size=(5, 3)).astype(np.float32)
+    x, inputs = (
+        rng.normal(size=(5, SIZE)).astype(np.float32),
+        rng.normal(size=(5, 3)).astype(np.float32),
+    )
     states = np.arange(dict(LAYOUT)["state"])
     wide = network.with_inputs(params, states, np.full(3, -1))
     np.testing.assert_allclose(value_of(wide, x, inputs), value_of(params, x), rtol=1e-5)
     back = network.with_inputs(wide, states, np.arange(0))
     jax.tree.map(np.testing.assert_array_equal, back, jax.device_get(params))
     swapped = network.with_inputs(wide, np.array([1, -1, 0, *states[2:]]), np.array([2, -1, 0]))
-    wider = np.concatenate([x[:, 1:2], rng.normal(size=(5, 1)), x[:, :1], x[:, 2:]], -1).astype(np.float32)
+    wider = np.concatenate([x[:, 1:2], rng.normal(size=(5, 1)), x[:, :1], x[:, 2:]], -1).astype(
+        np.float32
+    )
     layout = (("state", len(states) + 1), *LAYOUT[1:])
-    means = [network.policy(tree, *given)[0] for tree, given in ((params, (LAYOUT, x)), (swapped, (layout, wider)))]
+    means = [
+        network.policy(tree, *given)[0]
+        for tree, given in ((params, (LAYOUT, x)), (swapped, (layout, wider)))
+    ]
     np.testing.assert_allclose(*means, rtol=1e-5, atol=1e-7)
 
 
@@ -183,8 +204,13 @@ def test_merging_any_partition_gives_the_whole(samples, cuts):
 def test_merging_ranks_in_order_gives_every_rank_the_same_bits():
     rng = np.random.default_rng(2)
     state = exact(rng.normal(size=(50, 3)))
-    deltas = [normalizer.moments(jnp.asarray(rng.normal(size=(20, 3)), jnp.float32), 1) for _ in range(4)]
-    first, second = normalizer.merge(state, *deltas), normalizer.merge(state, *[Statistics(*d) for d in deltas])
+    deltas = [
+        normalizer.moments(jnp.asarray(rng.normal(size=(20, 3)), jnp.float32), 1) for _ in range(4)
+    ]
+    first, second = (
+        normalizer.merge(state, *deltas),
+        normalizer.merge(state, *[Statistics(*d) for d in deltas]),
+    )
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert first.count == 50 + 4 * 20
 

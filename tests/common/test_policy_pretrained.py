@@ -31,7 +31,9 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
     monkeypatch.setattr(module, "_FOLDER", tmp_path)
     given = tmp_path / "mine.safetensors"
     assert policy_file(given) == given
-    with pytest.raises(CongraspError, match=r"this installation has none for the hand 'human'.*--policy"):
+    with pytest.raises(
+        CongraspError, match=r"this installation has none for the hand 'human'.*--policy"
+    ):
         policy_file(None)
     with pytest.raises(CongraspError, match="no hand 'paw'"):
         policy_file(None, "paw")
@@ -51,7 +53,11 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     task = TaskConfig(hand=get_hand("mine").reference, constraints=("heading",))
     small = RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4))
     bundles.save(untrained(small), own_policy_file("mine"))
-    assert policy_file(None, "mine") == tmp_path / "mine.safetensors" == pretrained_file(get_hand("mine").reference)
+    assert (
+        policy_file(None, "mine")
+        == tmp_path / "mine.safetensors"
+        == pretrained_file(get_hand("mine").reference)
+    )
     assert hands_with_policy() == [*pretrained_hands(), "mine"]
     # Another hand of the same name as one of the package does not get the package's policy.
     (tmp_path / "human.json").write_text(hand_text(get_hand("human")))
@@ -66,12 +72,19 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
 
 
 def test_what_is_shipped_is_installed_and_can_be_loaded():
-    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    patterns = [pathlib.Path("congrasp/common/policy", pattern) for pattern in data["congrasp.common.policy"]]
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "package-data"
+    ]
+    patterns = [
+        pathlib.Path("congrasp/common/policy", pattern)
+        for pattern in data["congrasp.common.policy"]
+    ]
     assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
     assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
-        f"{hand}{kind}" for hand in pretrained_hands() for kind in ("", "-reference", "-student", "-camera")
+        f"{hand}{kind}"
+        for hand in pretrained_hands()
+        for kind in ("", "-reference", "-student", "-camera")
     }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand

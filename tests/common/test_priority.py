@@ -14,12 +14,23 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
-from congrasp.common.task.constraints.priority import active_blocks, contradictions, explain, resolve
+from congrasp.common.task.constraints.priority import (
+    active_blocks,
+    contradictions,
+    explain,
+    resolve,
+)
 from tests.scenes import HAND, points_of, scene
 
 
-def _flags(affordance: bool = False, pose: bool = False, trajectory: bool = False) -> dict[str, np.ndarray]:
-    return {"affordance": np.full(4, affordance), "pose": np.full(4, pose), "trajectory": np.full(4, trajectory)}
+def _flags(
+    affordance: bool = False, pose: bool = False, trajectory: bool = False
+) -> dict[str, np.ndarray]:
+    return {
+        "affordance": np.full(4, affordance),
+        "pose": np.full(4, pose),
+        "trajectory": np.full(4, trajectory),
+    }
 
 
 resolved = jax.jit(functools.partial(resolve, HAND))
@@ -32,13 +43,19 @@ def _resolve(affordance: bool, pose: bool, trajectory: bool):
 
 def test_what_is_active_follows_the_order_of_priority():
     for flags in itertools.product([False, True], repeat=3):
-        jax.tree.map(np.testing.assert_array_equal, _resolve(*flags)[1].goal.active, active_blocks(_flags(*flags)))
+        jax.tree.map(
+            np.testing.assert_array_equal,
+            _resolve(*flags)[1].goal.active,
+            active_blocks(_flags(*flags)),
+        )
 
 
 def test_a_lone_heading_stays_as_asked():
     asked, done = _resolve(False, False, False)
     np.testing.assert_allclose(done.goal["heading"].position, asked["heading"].position, atol=1e-6)
-    np.testing.assert_allclose(done.goal["heading"].direction, asked["heading"].direction, atol=1e-6)
+    np.testing.assert_allclose(
+        done.goal["heading"].direction, asked["heading"].direction, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("trajectory", [False, True])
@@ -51,7 +68,9 @@ def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
 
 
 def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by_two_fifths():
-    """By hand: the last waypoint is at (1, 2, 3) m and not turned, so that the centre is only shifted."""
+    """By hand: the last waypoint is at (1, 2, 3) m and not turned, so that the centre is only
+    shifted.
+    """
     _, surface, asked = scene(0)
     path = asked["trajectory"].position.copy()
     turns = asked["trajectory"].quaternion.copy()
@@ -61,7 +80,9 @@ def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by
     tips = np.asarray(points_of(q))[len(HAND.links) :]
     center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
     alone = resolved(surface, asked, _flags(trajectory=True)).goal
-    np.testing.assert_allclose(alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5)
+    np.testing.assert_allclose(
+        alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5
+    )
     # The fingers of a reference pose are known, and taken as they are.
     both = resolved(surface, asked, _flags(pose=True, trajectory=True)).goal
     tips = np.asarray(points_of(asked["pose"].q))[:, len(HAND.links) :]
@@ -78,7 +99,9 @@ def test_under_a_trajectory_the_poses_fingers_are_carried_by_its_last_waypoint()
 def _two_regions(graspable_x: float, avoid_x: float):
     _, surface, asked = scene(1)
     x = np.where(surface.avoid, avoid_x, graspable_x)
-    points = np.stack([x, 0.001 * surface.points[..., 1], 0.001 * surface.points[..., 2]], -1).astype(np.float32)
+    points = np.stack(
+        [x, 0.001 * surface.points[..., 1], 0.001 * surface.points[..., 2]], -1
+    ).astype(np.float32)
     return surface._replace(points=points), asked
 
 
@@ -95,22 +118,35 @@ def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avo
     assert not np.any(resolved(surface, asked, _flags()).redirected)
 
 
-def _redirected(points: list[list[float]], avoid: list[list[float]], direction: list[float], cross: list[float]):
-    """The heading of a hand that comes along a direction to (-0.1, 0, 0), and of an object with these points."""
+def _redirected(
+    points: list[list[float]], avoid: list[list[float]], direction: list[float], cross: list[float]
+):
+    """The heading of a hand that comes along a direction to (-0.1, 0, 0), and of an object with
+    these points.
+    """
     _, surface, asked = scene(1)
     rows = lambda v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
-    # As many as in the other tests, so that one program does for all: the last of each region counts several times.
+    # As many as in the other tests, so that one program does for all: the last of each region
+    # counts several times.
     points = [*points, *[points[-1]] * (48 - len(points))]
     cloud = np.tile(np.float32([*points, *avoid, *[avoid[-1]] * (16 - len(avoid))]), (4, 1, 1))
-    surface = surface._replace(points=cloud, avoid=np.tile(np.arange(cloud.shape[1]) >= len(points), (4, 1)))
-    asked = asked.replace("heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross))
+    surface = surface._replace(
+        points=cloud, avoid=np.tile(np.arange(cloud.shape[1]) >= len(points), (4, 1))
+    )
+    asked = asked.replace(
+        "heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross)
+    )
     done = resolved(surface, asked, _flags(affordance=True))
-    assert np.all(done.redirected) and not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
+    assert np.all(done.redirected) and not np.any(
+        resolved(surface, done.goal, _flags(affordance=True)).redirected
+    )
     return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
 
 
 def test_a_redirected_heading_keeps_its_direction_where_that_works():
-    """By hand: of two graspable points the nearer one is at (0.1, 0, 0), and the position 2 cm behind it."""
+    """By hand: of two graspable points the nearer one is at (0.1, 0, 0), and the position 2 cm
+    behind it.
+    """
     heading = _redirected([[0.1, 0, 0], [0.2, 0, 0]], [[-0.1, 0, 0]], [0, 0, -1], [1, 0, 0])
     np.testing.assert_allclose(heading.position, [0.1, 0, -0.02], atol=1e-6)
     np.testing.assert_allclose(heading.direction, [0, 0, -1], atol=1e-6)
@@ -129,10 +165,11 @@ def test_a_redirected_heading_never_ends_in_the_air():
 
 
 def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
-    """By hand: v = -z and w = x from 15 cm above the avoid region, at which the graspable one lies 20 cm aside.
+    """By hand: v = -z and w = x from 15 cm above the avoid region, at which the graspable one lies
+    20 cm aside.
 
-    Straight down is blocked by another avoided point. v turns by atan2(0.2, 0.15) about y, away from -z; w with it:
-    (0.6, 0, 0.8).
+    Straight down is blocked by another avoided point. v turns by atan2(0.2, 0.15) about y, away
+    from -z; w with it: (0.6, 0, 0.8).
     """
     heading = _redirected([[0.1, 0, 0]], [[-0.1, 0, 0], [0.1, 0, 0.1]], [0, 0, -1], [1, 0, 0])
     np.testing.assert_allclose(heading.direction, [0.8, 0, -0.6], atol=1e-6)
@@ -141,16 +178,20 @@ def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
 
 
 def test_a_redirected_heading_goes_where_the_hand_can_close():
-    """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the most."""
-    wide, narrow = ([[x, y, 0] for y in np.linspace(-half, half, 15)] for x, half in ((0.0, 0.07), (0.1, 0.03)))
+    """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the
+    most.
+    """
+    wide, narrow = (
+        [[x, y, 0] for y in np.linspace(-half, half, 15)] for x, half in ((0.0, 0.07), (0.1, 0.03))
+    )
     heading = _redirected([*wide, *narrow], [[-0.1, 0, 0]], [0, 0, -1], [0, 1, 0])
     np.testing.assert_allclose(heading.position[[0, 2]], [0.1, -0.02], atol=1e-6)
 
 
 @pytest.mark.parametrize("wobble", [0.0, 1e-7, -1e-7])
 def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
-    """The heading turns by a right angle, to where its cross-finger direction w pointed: w turns with it, whatever the
-    last bits of w were."""
+    """The heading turns by a right angle, to where its cross-finger direction w pointed: w turns
+    with it, whatever the last bits of w were."""
     avoid = [[-0.1, 0, 0], [-0.1, 0, 0.12], [0.1, 0, 0.25]]
     heading = _redirected([[0.1, 0, 0.15]], avoid, [0, 0, -1], [1, wobble, 0])
     np.testing.assert_allclose(heading.direction, [1, 0, 0], atol=1e-6)
@@ -160,13 +201,17 @@ def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_redirected_headings_lead_to_the_graspable_region(seed):
-    """For any cloud: a point of the region is 2 cm before the position, and the rules have nothing more to change."""
+    """For any cloud: a point of the region is 2 cm before the position, and the rules have nothing
+    more to change.
+    """
     _, surface, asked = scene(seed)
     done = resolved(surface, asked, _flags(affordance=True))
     moved, heading = np.asarray(done.redirected), jax.device_get(done.goal["heading"])
     assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     before = heading.position - 0.02 * heading.direction
-    away = np.where(surface.avoid, np.inf, np.linalg.norm(surface.points - before[:, None], axis=-1)).min(-1)
+    away = np.where(
+        surface.avoid, np.inf, np.linalg.norm(surface.points - before[:, None], axis=-1)
+    ).min(-1)
     assert (away[moved] < 1e-5).all()
     np.testing.assert_allclose(np.linalg.norm(heading.direction, axis=-1), 1.0, atol=1e-5)
     np.testing.assert_allclose(np.sum(heading.direction * heading.cross, -1), 0.0, atol=1e-5)
@@ -197,7 +242,8 @@ def test_trajectory_and_affordance_must_agree(end_x, aligned):
 def test_explanations_name_what_is_overridden():
     words = " ".join(explain(["affordance", "pose", "trajectory"]))
     assert (
-        "only the fingers of the reference pose count" in words.lower() and "overridden by the reference pose" in words
+        "only the fingers of the reference pose count" in words.lower()
+        and "overridden by the reference pose" in words
     )
     assert explain([]) == ["The heading guides the wrist."]
 
@@ -220,14 +266,21 @@ def at(place):
 
 def path_to(place):
     start = np.array(place) - CENTER - 0.15 * HEADING
-    return {"position": np.linspace(start, np.array(place) - CENTER, 15), "quaternion": np.tile(NOT_TURNED, (15, 1))}
+    return {
+        "position": np.linspace(start, np.array(place) - CENTER, 15),
+        "quaternion": np.tile(NOT_TURNED, (15, 1)),
+    }
 
 
 def all_of(avoid=None, **constraints):
-    """Contradictions of a request for these constraints, and for an affordance if points are to be avoided."""
+    """Contradictions of a request for these constraints, and for an affordance if points are to be
+    avoided.
+    """
     asked = constraints if avoid is None else {**constraints, "affordance": {}}
     goal = goal_of(HAND, TaskConfig(), GraspRequest(asked))
-    return contradictions(HAND, POINTS, np.zeros(len(POINTS), bool) if avoid is None else avoid, goal, asked)
+    return contradictions(
+        HAND, POINTS, np.zeros(len(POINTS), bool) if avoid is None else avoid, goal, asked
+    )
 
 
 def only(avoid=None, **constraints):
@@ -239,7 +292,14 @@ def test_what_agrees_says_nothing():
     place = (-0.06, 0.0, 0.0)
     path = path_to(place)
     on_graspable = {**path, "position": path["position"] - path["position"][-1] + [-0.1, 0.0, 0.05]}
-    assert all_of(AVOID, heading={"direction": HEADING, "position": np.array(place)}, trajectory=on_graspable) == []
+    assert (
+        all_of(
+            AVOID,
+            heading={"direction": HEADING, "position": np.array(place)},
+            trajectory=on_graspable,
+        )
+        == []
+    )
     assert all_of(heading={"direction": HEADING}, pose=at(place), trajectory=path) == []
     assert all_of() == []
 
@@ -250,16 +310,27 @@ def test_a_trajectory_that_ends_at_what_must_not_be_touched_is_refused():
     found = only(AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))})
     assert found.refused and (found.weaker, found.stronger) == ("affordance", "trajectory")
     graspable = np.hypot(0.08 - POINTS[~AVOID][:, 0].max(), 0.03)
-    assert "3.0 cm from the avoid region" in found.message and f"{100 * graspable:.1f} cm from the" in found.message
+    assert (
+        "3.0 cm from the avoid region" in found.message
+        and f"{100 * graspable:.1f} cm from the" in found.message
+    )
 
 
 def test_a_pose_away_from_the_trajectorys_end_keeps_its_fingers_alone():
     pose, path = at((-0.06, 0.0, 0.0)), path_to((-0.06, 0.0, 0.0))
-    found = only(pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path)
+    found = only(
+        pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path
+    )
     assert (found.weaker, found.stronger, found.refused) == ("pose", "trajectory", False)
-    assert "5.0 cm and 0 degrees" in found.message and "only the fingers of the pose count" in found.message
+    assert (
+        "5.0 cm and 0 degrees" in found.message
+        and "only the fingers of the pose count" in found.message
+    )
     turned = np.array([np.cos(0.5), np.sin(0.5), 0.0, 0.0])
-    assert "0.0 cm and 57 degrees" in only(pose={**pose, "quaternion": turned}, trajectory=path).message
+    assert (
+        "0.0 cm and 57 degrees"
+        in only(pose={**pose, "quaternion": turned}, trajectory=path).message
+    )
 
 
 def test_a_pose_that_touches_what_must_not_be_touched_names_the_links():
@@ -281,6 +352,11 @@ def test_a_heading_from_elsewhere_follows_the_reference(stronger):
 
 
 def test_a_heading_towards_what_must_not_be_touched_is_turned():
-    found = only(AVOID, heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])})
+    found = only(
+        AVOID,
+        heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])},
+    )
     assert (found.weaker, found.stronger, found.refused) == ("heading", "affordance", False)
-    assert "0.0 cm from the avoid region" in found.message and "redirects the heading" in found.message
+    assert (
+        "0.0 cm from the avoid region" in found.message and "redirects the heading" in found.message
+    )

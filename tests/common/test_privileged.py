@@ -28,7 +28,9 @@ def observed(time, hold, mass=0.5, friction=0.8):
     row = [jnp.array([x]) for x in (mass, friction, 1.1, False, hold)]
     scene = Scene(HAND, TASK, state, features=None, goal=None)
     values = np.asarray(privileged.observe(scene, Parameters(*row, sensors=None)))
-    return dict(zip((name for name, _ in privileged.layout(HAND, TASK)), values[0].tolist(), strict=True))
+    return dict(
+        zip((name for name, _ in privileged.layout(HAND, TASK)), values[0].tolist(), strict=True)
+    )
 
 
 def test_values_by_hand():
@@ -52,7 +54,10 @@ def test_the_hold_runs_down_once_the_table_is_gone(time, remaining):
 
 @hypothesis.settings(max_examples=30, deadline=None)
 @hypothesis.given(
-    time=st.integers(0, 400), hold=st.integers(-50, 200), mass=st.floats(0.001, 1e3), friction=st.floats(0.0, 10.0)
+    time=st.integers(0, 400),
+    hold=st.integers(-50, 200),
+    mass=st.floats(0.001, 1e3),
+    friction=st.floats(0.0, 10.0),
 )
 def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
     found = observed(time, hold, mass, friction)
@@ -61,7 +66,8 @@ def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"observation": "tracked"}, {"sensing": SensingConfig(position_noise=(0.001, 0.002))}]
+    "changes",
+    [{"observation": "tracked"}, {"sensing": SensingConfig(position_noise=(0.001, 0.002))}],
 )
 def test_policies_with_sensors_have_a_critic_of_the_true_state(changes):
     task = dataclasses.replace(TASK, **changes)

@@ -1,4 +1,6 @@
-"""Help and function of each reward term belong together: the paper's symbol, and the one quantity that changes it."""
+"""Help and function of each reward term belong together: the paper's symbol, and the one quantity
+that changes it.
+"""
 
 import dataclasses
 import re
@@ -16,9 +18,18 @@ from tests.scenes import HAND, L, evaluated, near_targets, scene, scene_of
 
 TASK, X = TaskConfig(), np.array([1.0, 0.0, 0.0])
 turned = partial(rotations.multiply, rotations.from_rotation_vector(0.2 * X))
-PRESSING, HARD, SOFT, FREE = np.flatnonzero(np.isin(HAND.link_fingers, (0, 1)))[:4]  # links of thumb and index finger
+# Links of thumb and index finger
+PRESSING, HARD, SOFT, FREE = np.flatnonzero(np.isin(HAND.link_fingers, (0, 1)))[:4]
 LITTLE = HAND.link_fingers == 4
-DOCS = ("distance from", "links in contact", "shares of", "newtons beyond", "displacement", "rotation", "i_drop")
+DOCS = (
+    "distance from",
+    "links in contact",
+    "shares of",
+    "newtons beyond",
+    "displacement",
+    "rotation",
+    "i_drop",
+)
 """Words in the docstrings of the grasp terms' functions, in order."""
 
 
@@ -27,7 +38,8 @@ def add(by, *index):
     return lambda array: jnp.asarray(array).at[:, *index].add(by)
 
 
-# The beginning of the help, the array on which alone the term's value depends in `base`, and a change of it.
+# The beginning of the help, the array on which alone the term's value depends in `base`, and a
+# change of it.
 CASES = {
     "distance": ("w_dis:", "features.nearest", add(0.1, 0, 0)),
     "contact": ("w_c:", "features.touching", lambda flags: flags | (np.arange(L) == FREE)),
@@ -41,18 +53,37 @@ CASES = {
     "heading_direction": ("w_dir:", "features.of.heading.direction", add(0.1)),
     "heading_position": ("w_pos:", "features.of.heading.position", add(0.03, 0)),
     "affordance_distance": ("w_d:", "features.of.affordance.distance", add(-0.008)),
-    "affordance_force": ("w_f of the affordance term:", "features.of.affordance.force", add(1.0, HARD, 0)),
+    "affordance_force": (
+        "w_f of the affordance term:",
+        "features.of.affordance.force",
+        add(1.0, HARD, 0),
+    ),
     "pose_finger": ("w_q of the pose term:", "goal.values.pose.q", add(0.1, 0)),
     "pose_link": ("w_x:", "features.of.pose.keypoints", add(0.05, 0, 0)),
     "pose_wrist_position": ("w_p:", "goal.values.pose.position", add(0.02, 0)),
     "pose_wrist_rotation": ("w_R of the pose term:", "goal.values.pose.quaternion", turned),
-    "trajectory_position": ("w_traj-p:", "goal.values.trajectory.position", add(0.02, slice(None), 0)),
+    "trajectory_position": (
+        "w_traj-p:",
+        "goal.values.trajectory.position",
+        add(0.02, slice(None), 0),
+    ),
     "trajectory_rotation": ("w_traj-q:", "goal.values.trajectory.quaternion", turned),
-    "fingers_distance": ("For each unit of softplus(", "features.nearest", add(-0.005, LITTLE[HAND.keypoint_links], 0)),
-    "fingers_contact": ("For each link of another finger", "features.touching", lambda flags: flags | LITTLE),
+    "fingers_distance": (
+        "For each unit of softplus(",
+        "features.nearest",
+        add(-0.005, LITTLE[HAND.keypoint_links], 0),
+    ),
+    "fingers_contact": (
+        "For each link of another finger",
+        "features.touching",
+        lambda flags: flags | LITTLE,
+    ),
     "force_over": ("Per newton beyond the limit", "goal.values.force.limit", add(1.0)),
 }
-HELP = {entry.name: entry.meaning for entry in (*GRASP, *(weight for c in CONSTRAINTS for weight in c.weights))}
+HELP = {
+    entry.name: entry.meaning
+    for entry in (*GRASP, *(weight for c in CONSTRAINTS for weight in c.weights))
+}
 
 
 def test_each_symbol_begins_the_help_of_its_term_and_is_in_no_other():
@@ -60,7 +91,9 @@ def test_each_symbol_begins_the_help_of_its_term_and_is_in_no_other():
     assert begins.keys() == HELP.keys() and len({*begins.values()}) == len(HELP)
     for name, text in HELP.items():
         symbols = re.findall(r"\bw_[\w-]+|\bf_max\b", text)
-        assert text.startswith(begins[name]) and symbols == re.findall(r"w_[\w-]+|f_max", begins[name]), (name, text)
+        assert text.startswith(begins[name]) and symbols == re.findall(
+            r"w_[\w-]+|f_max", begins[name]
+        ), (name, text)
     docs = [term.value.__doc__.lower() for term in GRASP if term.value and term.value.__doc__]
     assert all(words in text for words, text in zip(DOCS, docs, strict=True))
 
@@ -72,18 +105,25 @@ def replaced(thing, path, change):
     new = {name: replaced(old, rest, change) if rest else change(np.array(old))}
     if isinstance(thing, dict):
         return thing | new
-    return dataclasses.replace(thing, **new) if dataclasses.is_dataclass(thing) else thing._replace(**new)
+    return (
+        dataclasses.replace(thing, **new)
+        if dataclasses.is_dataclass(thing)
+        else thing._replace(**new)
+    )
 
 
 @pytest.fixture(scope="module")
 def base():
-    """The hand near the object and its targets; only the thumb and the index finger are allowed to touch."""
+    """The hand near the object and its targets; only the thumb and the index finger are allowed to
+    touch.
+    """
     state, surface, goal = scene(0)
     goal, force = near_targets(state, goal, 0), np.zeros((L, 3))
     force[[PRESSING, HARD, SOFT], 0] = 1.0, 12.0, 6.0  # of which the first is in contact
     found = scene_of(TASK, state, surface, goal)
     for path, value in {
-        "state.object_position_initial": state.object_position + X,  # beyond 0.2 m, where the cost saturates
+        "state.object_position_initial": state.object_position
+        + X,  # beyond 0.2 m, where the cost saturates
         "state.object_quaternion_initial": state.object_quaternion,
         "features.nearest": 0.02 * X,
         "features.force": force,
@@ -96,7 +136,11 @@ def base():
         "goal.values.fingers.allowed": np.arange(len(HAND.fingers)) < 2,
         "goal.values.force.limit": 8.0,
     }.items():
-        found = replaced(found, path, lambda old, value=value: np.broadcast_to(value, old.shape).astype(old.dtype))
+        found = replaced(
+            found,
+            path,
+            lambda old, value=value: np.broadcast_to(value, old.shape).astype(old.dtype),
+        )
     return found, evaluated(reward_terms, found, RewardWeights())
 
 

@@ -1,4 +1,6 @@
-"""The tracker: which pose it shows when, against numbers worked out by hand, and what policies see of it."""
+"""The tracker: which pose it shows when, against numbers worked out by hand, and what policies see
+of it.
+"""
 
 import dataclasses
 import functools
@@ -20,7 +22,9 @@ from congrasp.common.task.sensing import Readings, Sensors
 from tests.compiled import Compiled
 from tests.scenes import HAND, F, L, N, scene
 
-TASK = TaskConfig(observation="tracked", surface_points=N, constraints=("heading", "affordance", "fingers"))
+TASK = TaskConfig(
+    observation="tracked", surface_points=N, constraints=("heading", "affordance", "fingers")
+)
 FULL = dataclasses.replace(TASK, observation="full")
 STEPS = 40
 rotations = Compiled(module)
@@ -42,21 +46,32 @@ def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **give
         "latency": 0,
     }
     types = {"delay": np.int32, "latency": np.int32}
-    arrays = {name: np.full(1, value, types.get(name, np.float32)) for name, value in {**fields, **given}.items()}
-    biases = {name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")}
-    return Sensors(key=np.array([[3, 7]], np.uint32), **arrays, **biases, eye=np.ones((1, 3), np.float32))
+    arrays = {
+        name: np.full(1, value, types.get(name, np.float32))
+        for name, value in {**fields, **given}.items()
+    }
+    biases = {
+        name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")
+    }
+    return Sensors(
+        key=np.array([[3, 7]], np.uint32), **arrays, **biases, eye=np.ones((1, 3), np.float32)
+    )
 
 
 def truth(step):
     """Position and quaternion of the object after a control step; it rests before the first."""
     step = max(step, 0)
     half = 0.01 * step
-    return np.array([step, 2.0 * step, -step], np.float32), np.array([np.cos(half), 0, 0, np.sin(half)], np.float32)
+    return np.array([step, 2.0 * step, -step], np.float32), np.array(
+        [np.cos(half), 0, 0, np.sin(half)], np.float32
+    )
 
 
 @functools.partial(jax.jit, static_argnames="room")
 def shown(own, poses, room):
-    """(1 + T, 7) poses that a tracker with room for so many shows at the start and after T steps (1 + T, 7)."""
+    """(1 + T, 7) poses that a tracker with room for so many shows at the start and after T steps (1
+    + T, 7).
+    """
     tracker = sensing.begin(own, room, poses[:1, :3], poses[:1, 3:])
 
     def step(tracker, now):
@@ -83,8 +98,9 @@ def test_a_delay_of_k_steps_shows_the_pose_of_k_steps_ago(delay):
 
 
 def test_samples_are_held_until_the_next_one_arrives():
-    """At one sample in 2.5 control steps, which begin 0.6 periods after the last: floor(n / 2.5 + 0.6) rises at n = 1
-    (1.0), 4 (2.2), 6 (3.0), 9 (4.2), 11 (5.0); each is shown three steps later."""
+    """At one sample in 2.5 control steps, which begin 0.6 periods after the last: floor(n / 2.5 +
+    0.6) rises at n = 1 (1.0), 4 (2.2), 6 (3.0), 9 (4.2), 11 (5.0); each is shown three steps
+    later."""
     found = np.asarray(shown(sensors(period=2.5, phase=0.6, delay=3), PATH, 4))[:15, 0]
     np.testing.assert_array_equal(found, [0, 0, 0, 0, 1, 1, 1, 4, 4, 6, 6, 6, 9, 9, 11])
 
@@ -92,12 +108,16 @@ def test_samples_are_held_until_the_next_one_arrives():
 @settings(max_examples=12, deadline=None)
 @given(dropout=st.floats(0.0, 1.0), period=st.floats(1.0, 10.0))
 def test_what_is_lost_leaves_the_last_pose(dropout, period):
-    """Every step shows what the step before it showed, or the present pose; all are lost at 1, none at 0."""
+    """Every step shows what the step before it showed, or the present pose; all are lost at 1, none
+    at 0.
+    """
     found = np.asarray(shown(sensors(dropout=dropout, period=period), PATH, 1))[:, 0]
     held = found[1:] == found[:-1]
     np.testing.assert_array_equal(found[1:][~held], PATH[1:, 0][~held])
     assert held.mean() >= 1 - 1 / period - 2 / STEPS
-    assert held.all() if dropout == 1.0 else dropout > 0 or held.mean() <= 1 - 1 / period + 2 / STEPS
+    assert (
+        held.all() if dropout == 1.0 else dropout > 0 or held.mean() <= 1 - 1 / period + 2 / STEPS
+    )
 
 
 def test_errors_have_their_size_in_every_axis_and_are_those_of_a_seed():
@@ -117,7 +137,9 @@ def test_errors_have_their_size_in_every_axis_and_are_those_of_a_seed():
 def test_an_offset_is_that_of_every_sample():
     """The object lies turned by 0.1 rad about z; half a turn about x more takes its z axis down."""
     still = np.broadcast_to(np.append([0.1, 0.2, 0.3], PATH[5, 3:]), (20, 7)).astype(np.float32)
-    found = np.asarray(shown(sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), still, 1))
+    found = np.asarray(
+        shown(sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), still, 1)
+    )
     np.testing.assert_allclose(found[:, :3], np.tile([0.11, 0.2, 0.28], (20, 1)), atol=1e-6)
     np.testing.assert_array_equal(found, np.broadcast_to(found[0], found.shape))
     down = rotations.rotate(jnp.asarray(found[0, 3:]), jnp.array([0.0, 0.0, 1.0]))
@@ -129,7 +151,9 @@ def test_an_offset_is_that_of_every_sample():
 
 
 def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
-    """Readings at 0, 12, -6 and 2 mm; then one 5 cm away, after which 0 counts no more; a quaternion's sign is none."""
+    """Readings at 0, 12, -6 and 2 mm; then one 5 cm away, after which 0 counts no more; a
+    quaternion's sign is none.
+    """
     at = [0.0, 0.012, -0.006, 0.002, 0.05, 0.0]
     tilt = [0.0, 0.02, -0.02, 0.0, 0.0, 0.0]
     rows = [[x, 0.0, 0.1, np.cos(a), np.sin(a), 0.0, 0.0] for x, a in zip(at, tilt, strict=True)]
@@ -157,8 +181,12 @@ def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
 
 
 def test_trackers_are_drawn_from_their_ranges():
-    """60 ms are 6 control steps of 10 ms; a tracker that is faster than control samples once a step."""
-    config = SensingConfig((0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03))
+    """60 ms are 6 control steps of 10 ms; a tracker that is faster than control samples once a
+    step.
+    """
+    config = SensingConfig(
+        (0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03)
+    )
     drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 500))
     assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and sensing.longest(config, 0.01) == 11
     assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
@@ -174,7 +202,10 @@ _push = jax.jit(sensing.push)
 
 
 @settings(max_examples=8, deadline=None)
-@given(pushed=npst.arrays(np.float32, (7, 2, 3), elements=st.floats(-1, 1, width=32)), steps=st.integers(1, 5))
+@given(
+    pushed=npst.arrays(np.float32, (7, 2, 3), elements=st.floats(-1, 1, width=32)),
+    steps=st.integers(1, 5),
+)
 def test_readings_are_the_last_ones_newest_first(pushed, steps):
     def reading(row):
         return Readings(*[row] * len(Readings._fields))
@@ -191,11 +222,15 @@ def readings_of(seed, state):
     rng = np.random.default_rng(seed)
 
     def past(present, unit):
-        drawn = rng.normal(size=(len(present), TASK.history - 1, present.shape[-1])).astype(np.float32)
+        drawn = rng.normal(size=(len(present), TASK.history - 1, present.shape[-1])).astype(
+            np.float32
+        )
         drawn = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True) if unit else drawn
         return np.concatenate([np.asarray(present)[:, None], drawn], 1)
 
-    return Readings(*(past(getattr(state, name), "quaternion" in name) for name in Readings._fields))
+    return Readings(
+        *(past(getattr(state, name), "quaternion" in name) for name in Readings._fields)
+    )
 
 
 @jax.jit
@@ -228,7 +263,13 @@ def test_a_tracked_observation_knows_no_force_and_no_velocity():
     expected = np.asarray(tracked(state, surface, goal, readings))
     other, _, _ = scene(1)
     hidden = ("q_velocity", "u_velocity", "object_velocity", "object_angular_velocity")
-    hidden += ("contact_force", "contact_position", "contact_found", "object_position", "object_quaternion")
+    hidden += (
+        "contact_force",
+        "contact_position",
+        "contact_found",
+        "object_position",
+        "object_quaternion",
+    )
     changed = state._replace(**{name: getattr(other, name) for name in hidden})
     np.testing.assert_array_equal(tracked(changed, surface, goal, readings), expected)
     assert not {"force", "touching", "q_velocity", "force_minus", "force_other"} & {
@@ -245,14 +286,18 @@ def test_its_state_is_that_of_the_full_observation_through_the_tracked_pose():
         for field in content:
             if not field.privileged:
                 part = whole[start : start + field.size]
-                np.testing.assert_allclose(own.pop((block, field.name)), part, atol=1e-5, err_msg=field.name)
+                np.testing.assert_allclose(
+                    own.pop((block, field.name)), part, atol=1e-5, err_msg=field.name
+                )
             start += field.size
     assert all(name.startswith("past") for _, name in own) and len(own) == 6
 
 
 def test_its_past_is_worked_out_by_hand():
     state, surface, goal = scene(3)
-    state = state._replace(u=np.zeros_like(state.u), base_quaternion=np.tile([1, 0, 0, 0], (4, 1)).astype(np.float32))
+    state = state._replace(
+        u=np.zeros_like(state.u), base_quaternion=np.tile([1, 0, 0, 0], (4, 1)).astype(np.float32)
+    )
     present = Readings(*(jnp.asarray(getattr(state, name)) for name in Readings._fields))
     readings = sensing.still(present, TASK.history)
     quarter = np.array([np.cos(0.1), 0, 0, np.sin(0.1)], np.float32)  # 0.2 rad about z later
@@ -270,17 +315,29 @@ def test_its_past_is_worked_out_by_hand():
     }
     np.testing.assert_allclose(past["q - q"], -0.1, atol=1e-6)
     np.testing.assert_allclose(past["u - u"], 0.0)
-    np.testing.assert_allclose(past["q_target - past q"][3], (present.q_target - present.q)[0], atol=1e-6)
-    np.testing.assert_allclose(past["object_position"], np.tile([0.0, 0.0, -0.02], (7, 1)), atol=1e-6)
-    np.testing.assert_allclose(past["object_rotation"], np.tile([0.0, 0.0, 2 * np.sin(0.1)], (7, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        past["q_target - past q"][3], (present.q_target - present.q)[0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        past["object_position"], np.tile([0.0, 0.0, -0.02], (7, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        past["object_rotation"], np.tile([0.0, 0.0, 2 * np.sin(0.1)], (7, 1)), atol=1e-6
+    )
 
 
 def test_the_wrist_s_velocity_is_its_way_in_the_last_step():
     state, _, _ = scene(4)
     readings = readings_of(4, state)
     seen = sensing.seen_by(TASK, state, readings)
-    np.testing.assert_allclose(seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5)
-    assert not seen.contact_found.any() and not seen.contact_force.any() and not seen.object_velocity.any()
+    np.testing.assert_allclose(
+        seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5
+    )
+    assert (
+        not seen.contact_found.any()
+        and not seen.contact_force.any()
+        and not seen.object_velocity.any()
+    )
     full = sensing.seen_by(FULL, state, readings)
     np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
     np.testing.assert_array_equal(full.contact_force, state.contact_force)

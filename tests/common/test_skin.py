@@ -32,15 +32,21 @@ HANDS = ("human", "allegro", "sharpa")
 
 def posed(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     position, quaternion = mujoco_link_poses(hand, q)
-    return skin_of(hand).posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+    return skin_of(hand).posed(
+        position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    )
 
 
-def to_capsules(hand: Hand, q: np.ndarray, points: np.ndarray, links: set[int] | None = None) -> np.ndarray:
+def to_capsules(
+    hand: Hand, q: np.ndarray, points: np.ndarray, links: set[int] | None = None
+) -> np.ndarray:
     """(n,) distances of points to the surface of the nearest capsule of some links."""
     position, quaternion = mujoco_link_poses(hand, q)
     turns = Rotation.from_quat(quaternion, scalar_first=True)
     found = []
-    for ends, radius, link in zip(hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True):
+    for ends, radius, link in zip(
+        hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True
+    ):
         if links is None or link in links:
             a, b = turns[int(link)].apply(ends - skin_of(hand).origins[link]) + position[link]
             share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
@@ -50,7 +56,9 @@ def to_capsules(hand: Hand, q: np.ndarray, points: np.ndarray, links: set[int] |
 
 def test_a_surface_net_of_a_ball_is_a_ball() -> None:
     axis = np.arange(-8.0, 9.0)
-    values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 5.3
+    values = (
+        np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - 5.3
+    )
     points, faces = surface_net(values)
     mesh = trimesh.Trimesh(points - 8, faces, process=False)
     assert mesh.is_volume and mesh.euler_number == 2
@@ -60,9 +68,14 @@ def test_a_surface_net_of_a_ball_is_a_ball() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_nails_lie_on_the_skin_however_far_the_fingers_bend(share: float) -> None:
-    """By the nearest point of the flesh and its normal; one that only followed its link sank by half a millimetre."""
+    """By the nearest point of the flesh and its normal; one that only followed its link sank by
+    half a millimetre.
+    """
     hand = get_hand("human")
-    skin, (points, normals) = skin_of(hand), posed(hand, share * np.array([joint.upper for joint in hand.joints]))
+    skin, (points, normals) = (
+        skin_of(hand),
+        posed(hand, share * np.array([joint.upper for joint in hand.joints])),
+    )
     flesh, nail = (skin.material == MATERIALS.index(kind) for kind in ("flesh", "nail"))
     below = cKDTree(points[flesh]).query(points[nail])[1]
     height = np.einsum("ni,ni->n", points[nail] - points[flesh][below], normals[flesh][below])
@@ -108,7 +121,9 @@ def test_flesh_is_closed_and_fingers_have_no_webs() -> None:
 
 @pytest.mark.parametrize("closure", [0.0, 0.5, 1.0])
 def test_flesh_lies_on_the_capsules_of_the_fingers(closure: float) -> None:
-    """What touches in the simulation touches in the picture: within 2 mm on phalanges, 4 mm in a fist's folds."""
+    """What touches in the simulation touches in the picture: within 2 mm on phalanges, 4 mm in a
+    fist's folds.
+    """
     hand = get_hand("human")
     q = hand.q_open + closure * (hand.q_closed - hand.q_open)
     points, _ = posed(hand, q)
@@ -136,8 +151,12 @@ def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
     tip = hand.tip_links[1]
     own = skin.weights[:, tip] > 0.999
     position, quaternion = mujoco_link_poses(hand, hand.q_closed)
-    expected = Rotation.from_quat(quaternion[tip], scalar_first=True).apply(skin.points[own] - skin.origins[tip])
-    np.testing.assert_allclose(posed(hand, hand.q_closed)[0][own], expected + position[tip], atol=5e-5)
+    expected = Rotation.from_quat(quaternion[tip], scalar_first=True).apply(
+        skin.points[own] - skin.origins[tip]
+    )
+    np.testing.assert_allclose(
+        posed(hand, hand.q_closed)[0][own], expected + position[tip], atol=5e-5
+    )
 
 
 # --- meshes of a hand of one's own ---
@@ -154,14 +173,18 @@ def own(tmp_path, monkeypatch):
     cube = trimesh.creation.box((0.04, 0.04, 0.04))
     path = tmp_path / "own_claw.json"
     path.write_text(hand_text(dataclasses.replace(read_hand(FILE), name="own_claw")))
-    save_meshes(path, {"palm": (np.asarray(cube.vertices, np.float32), np.asarray(cube.faces, np.int32))})
+    save_meshes(
+        path, {"palm": (np.asarray(cube.vertices, np.float32), np.asarray(cube.faces, np.int32))}
+    )
     yield get_hand("own_claw")
     get_hand.cache_clear()
 
 
 def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
     skin = skin_of(own)
-    assert np.abs(np.sort(np.abs(skin.points[:8]), axis=None) - 0.02).max() < 1e-7 and set(skin.parts()) == {"link"}
+    assert np.abs(np.sort(np.abs(skin.points[:8]), axis=None) - 0.02).max() < 1e-7 and set(
+        skin.parts()
+    ) == {"link"}
     drawn = posed_hand(own, own.q_open, np.zeros(3), Rotation.identity())
     np.testing.assert_array_equal(drawn.faces, skin.faces)
     motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
@@ -175,7 +198,9 @@ def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
 
 
 @pytest.mark.parametrize("damaged", ["own_claw.json", "own_claw.visual.npz"])
-def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(own, damaged, tmp_path):
+def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(
+    own, damaged, tmp_path
+):
     motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
     expected = skin_of_motion(dataclasses.replace(motion, hand="unknown"))
     (tmp_path / damaged).write_bytes(b"{")
@@ -185,9 +210,13 @@ def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(o
 
 
 def test_depth_of_meshes_and_capsules(own):
-    """A ball of 3 cm whose centre is 4.5 cm from the cube's middle, along an edge's normal and a face's normal."""
+    """A ball of 3 cm whose centre is 4.5 cm from the cube's middle, along an edge's normal and a
+    face's normal.
+    """
     measures = (link_transforms, plausibility.hand_mesh, plausibility.hand_object)
-    transforms_of, hand_mesh, hand_object = (jax.jit(measure, static_argnums=0) for measure in measures)
+    transforms_of, hand_mesh, hand_object = (
+        jax.jit(measure, static_argnums=0) for measure in measures
+    )
     ball = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
     transforms = transforms_of(own, np.asarray(own.q_open, np.float32)[None])
     field, upright = distance_field([ball]), np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
@@ -205,7 +234,12 @@ def test_depth_of_meshes_and_capsules(own):
     # Allegro's palm is a box whose front is at x = 11.1 mm: the ball's middle is 25 mm before it.
     allegro = get_hand("allegro")
     flat = transforms_of(allegro, np.zeros((1, len(allegro.joints)), np.float32))
-    seen = np.array([[0.0111 + 0.025, -0.025, 0.0475]], np.float32), upright, np.zeros(1, int), field
+    seen = (
+        np.array([[0.0111 + 0.025, -0.025, 0.0475]], np.float32),
+        upright,
+        np.zeros(1, int),
+        field,
+    )
     assert float(hand_object(allegro, flat, *seen)[0]) == pytest.approx(0.005, abs=5e-4)
 
 
@@ -213,7 +247,10 @@ def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_pat
     """37 balls of 2 m, 1500 m^2: cells of 4 mm would ask for 7e8 samples."""
     ball = trimesh.creation.icosphere(1, 2.0)
     balls = trimesh.util.concatenate([ball] * 37)
-    save_meshes(tmp_path / "own_claw.json", {"palm": (balls.vertices.astype("f4"), balls.faces.astype("i4"))})
+    save_meshes(
+        tmp_path / "own_claw.json",
+        {"palm": (balls.vertices.astype("f4"), balls.faces.astype("i4"))},
+    )
     counts, draw = [], trimesh.sample.sample_surface
 
     def counted(mesh, count, seed):

@@ -24,14 +24,20 @@ def test_stages_are_in_the_order_of_their_begin_and_only_the_first_of_a_name_cou
     outer, inner = kept[1:]
     assert outer.began <= inner.began and inner.ended <= outer.ended
     assert inner.ended - inner.began >= 0.02
-    assert [record.getMessage().split()[1] for record in caplog.records] == ["imports", "inner", "outer"]
+    assert [record.getMessage().split()[1] for record in caplog.records] == [
+        "imports",
+        "inner",
+        "outer",
+    ]
 
 
 def test_long_work_of_jax_on_a_program_is_a_stage(monkeypatch):
     monkeypatch.setattr(stages, "_PROGRAM_SECONDS", 0.0)
     stages.imported()
     jax.jit(_program)(1.0)
-    assert {"trace _program", "lower _program", "compile or read _program"} <= {one.name for one in stages.stages()}
+    assert {"trace _program", "lower _program", "compile or read _program"} <= {
+        one.name for one in stages.stages()
+    }
 
 
 def _program(x):

@@ -53,11 +53,20 @@ def primitive_distance(pieces: Sequence[Piece], points: np.ndarray) -> np.ndarra
         (Piece("box", (0.01, 0.02, 0.03)), (0.04, 0.0, 0.0), 0.03),
         (Piece("box", (0.01, 0.02, 0.03)), (0.04, 0.06, 0.0), 0.05),  # 3-4-5 from the edge
         (Piece("box", (0.01, 0.02, 0.03)), (0.008, 0.0, 0.0), -0.002),
-        (Piece("box", (0.01, 0.01, 0.01), quat=DIAGONAL), (0.02, 0.0, 0.0), 0.02 - 0.01 * np.sqrt(2)),
+        (
+            Piece("box", (0.01, 0.01, 0.01), quat=DIAGONAL),
+            (0.02, 0.0, 0.0),
+            0.02 - 0.01 * np.sqrt(2),
+        ),
         (Piece("cylinder", (0.02, 0.05, 0.0)), (0.03, 0.04, 0.0), 0.03),
         (Piece("cylinder", (0.02, 0.05, 0.0)), (0.0, 0.05, 0.09), 0.05),  # 3-4-5 from the rim
         (Piece("cylinder", (0.02, 0.05, 0.0), pos=(0.1, 0.0, 0.0)), (0.1, 0.0, 0.0), -0.02),
-        (Piece("capsule", (0.02, 0.05, 0.0)), (0.0, 0.04, 0.08), 0.03),  # 3-4-5 from the end of the axis
+        # 3-4-5 from the end of the axis
+        (
+            Piece("capsule", (0.02, 0.05, 0.0)),
+            (0.0, 0.04, 0.08),
+            0.03,
+        ),
         (Piece("capsule", (0.02, 0.05, 0.0)), (0.005, 0.0, 0.03), -0.015),
         (Piece("ellipsoid", (0.02, 0.03, 0.06)), (0.0, 0.0, 0.07), 0.01),
         (Piece("ellipsoid", (0.02, 0.03, 0.06)), (0.0, 0.0, 0.0), -0.02),
@@ -65,7 +74,9 @@ def primitive_distance(pieces: Sequence[Piece], points: np.ndarray) -> np.ndarra
     ],
 )
 def test_distances_worked_out_by_hand(piece, point, distance):
-    assert float(primitive_distance([piece], np.array([point]))[0]) == pytest.approx(distance, abs=3e-5)
+    assert float(primitive_distance([piece], np.array([point]))[0]) == pytest.approx(
+        distance, abs=3e-5
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -78,7 +89,9 @@ def test_off_the_surface_of_a_convex_piece_it_is_the_way_along_the_normal(kind, 
     piece, rng = Piece(kind, size), np.random.default_rng(seed)
     points, normals, _ = shapes.propose(piece, rng.random((50, 4)))
     way = rng.uniform(0.0, 0.03, 50)
-    np.testing.assert_allclose(primitive_distance([piece], points + way[:, None] * normals), way, atol=2e-5)
+    np.testing.assert_allclose(
+        primitive_distance([piece], points + way[:, None] * normals), way, atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("family", ["mug", "knife", "ellipsoid"])
@@ -91,14 +104,19 @@ def test_grids_of_primitives_are_near_the_exact_distance(family):
 
 
 @pytest.mark.parametrize("oriented", [True, False])
-def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(oriented, tmp_path, monkeypatch):
+def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(
+    oriented, tmp_path, monkeypatch
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     mesh = trimesh.creation.annulus(0.02, 0.035, 0.06, sections=48)  # its hull would fill the hole
-    obj = of_mesh(mesh if oriented else trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False))
+    obj = of_mesh(
+        mesh if oriented else trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+    )
     points, _ = near(of_mesh(mesh))
     exact = np.linalg.norm(points - trimesh.proximity.closest_point(mesh, points)[0], axis=-1)
     found = at(distance_field([obj]), points)
-    error = np.abs(found - exact)[(exact > 0.002) & (exact < 0.017)]  # at the hole's axis it has a kink
+    # At the hole's axis it has a kink
+    error = np.abs(found - exact)[(exact > 0.002) & (exact < 0.017)]
     assert error.mean() < 1e-4 and np.percentile(error, 99) < 5e-4
     hole, wall = at(distance_field([obj]), np.array([[0.005, 0.0, 0.0], [0.0275, 0.0, 0.0]]))
     assert hole == pytest.approx(0.015, abs=3e-4)  # not filled
@@ -112,7 +130,9 @@ def test_each_object_has_its_own_grid_and_far_points_are_far():
     both = _at(field, np.array([1, 0]), np.stack([points, points]).astype(np.float32))
     np.testing.assert_allclose(both, [at(own[1], points), at(own[0], points)], atol=1e-7)
     far = np.array([[objects[1].visual_vertices[:, 0].max() + MARGIN + 0.1, 0.0, 0.0]])
-    np.testing.assert_allclose(at(field, far, 1), primitive_distance(objects[1].pieces, far), atol=1e-3)
+    np.testing.assert_allclose(
+        at(field, far, 1), primitive_distance(objects[1].pieces, far), atol=1e-3
+    )
 
 
 def test_grids_of_meshes_are_kept(tmp_path, monkeypatch):
@@ -175,10 +195,17 @@ def degrees(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("shape", "median", "most", "inward"),
-    [(sphere, 6.0, 15.0, 0.0), (box, 3.0, 70.0, 0.06), (cylinder, 8.0, 40.0, 0.04), (bowl, 15.0, 180.0, 0.2)],
+    [
+        (sphere, 6.0, 15.0, 0.0),
+        (box, 3.0, 70.0, 0.06),
+        (cylinder, 8.0, 40.0, 0.04),
+        (bowl, 15.0, 180.0, 0.2),
+    ],
 )
 def test_estimated_normals_are_near_the_exact_ones(shape, median, most, inward):
-    """Median and 90th percentile of the errors, and the share that points inward, of 20 clouds of 256 points each."""
+    """Median and 90th percentile of the errors, and the share that points inward, of 20 clouds of
+    256 points each.
+    """
     rng = np.random.default_rng(0)
     clouds, exact = map(np.stack, zip(*(shape(rng) for _ in range(20)), strict=True))
     found = np.asarray(estimate(clouds.astype(np.float32)))
@@ -193,7 +220,8 @@ def test_normals_turn_with_the_cloud_whatever_its_unit_and_place():
     points, _ = cylinder(rng)
     turn = Rotation.random(random_state=2)
     first, turned = (
-        np.asarray(estimate(cloud[None].astype(np.float32))[0]) for cloud in (points, 10 * turn.apply(points) + 3)
+        np.asarray(estimate(cloud[None].astype(np.float32))[0])
+        for cloud in (points, 10 * turn.apply(points) + 3)
     )
     assert np.percentile(degrees(turned, turn.apply(first)), 95) < 1.0
 
@@ -217,7 +245,9 @@ def test_any_cloud_has_unit_normals(count):
 
 
 def test_normals_of_a_camera_point_toward_it():
-    """The camera sees three faces of a box, whose normals are exact except at the edges; and a flat sheet."""
+    """The camera sees three faces of a box, whose normals are exact except at the edges; and a flat
+    sheet.
+    """
     points, exact = box(np.random.default_rng(4))
     eye = np.array([0.4, 0.5, 0.6])
     seen = np.sum(exact * (eye - points), -1) > 0

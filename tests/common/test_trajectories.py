@@ -18,7 +18,13 @@ from congrasp.common.task.constraints.pose import (
     fingers_numbers,
     wrist_numbers,
 )
-from congrasp.common.task.sampling.build import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
+from congrasp.common.task.sampling.build import (
+    AMPLITUDE,
+    CONE,
+    DISTANCE,
+    ROTATION,
+    make_trajectories,
+)
 from tests.scenes import quaternions
 
 HAND = get_hand("human")
@@ -46,7 +52,8 @@ def made(poses):
 def test_they_come_from_afar_and_end_at_their_poses(poses, made):
     (position, quaternion), (path, turns) = poses, made
     assert path.shape == (COUNT, WAYPOINTS, 3) and turns.shape == (COUNT, WAYPOINTS, 4)
-    # The controller has a quarter of a second to settle, five of its time constants of 0.05 s: e^-5 of 25 cm is 2 mm.
+    # The controller has a quarter of a second to settle, five of its time constants of 0.05 s: e^-5
+    # of 25 cm is 2 mm.
     np.testing.assert_allclose(path[:, -1], position, atol=2e-3)
     end = Rotation.from_quat(quaternion, scalar_first=True)
     final = Rotation.from_quat(turns[:, -1], scalar_first=True)
@@ -69,7 +76,9 @@ def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
     chord = path[:, -1] - path[:, 0]
     chord /= np.linalg.norm(chord, axis=-1, keepdims=True)
     off = path - path[:, :1]
-    aside = np.linalg.norm(off - np.sum(off * chord[:, None], -1, keepdims=True) * chord[:, None], axis=-1).max(-1)
+    aside = np.linalg.norm(
+        off - np.sum(off * chord[:, None], -1, keepdims=True) * chord[:, None], axis=-1
+    ).max(-1)
     assert aside.max() <= AMPLITUDE[1] and np.median(aside) > AMPLITUDE[0] / 2
     np.testing.assert_allclose(np.linalg.norm(turns, axis=-1), 1.0, atol=1e-5)
     assert (np.sum(turns[:, 1:] * turns[:, :-1], -1) > 0.9).all()  # neighbours in one hemisphere
@@ -91,7 +100,9 @@ def test_no_amount_changes_nothing():
     np.testing.assert_allclose(fingers_off(HAND, q, jnp.zeros(2), _uniform(2, 21)), q, atol=1e-6)
     path = jnp.arange(18.0).reshape(2, 3, 3)
     turns = jnp.tile(jnp.array([0.5, 0.5, -0.5, 0.5]), (2, 3, 1))
-    for found, given in zip(wrist_off(path, turns, jnp.zeros(2), _uniform(2, 15)), (path, turns), strict=True):
+    for found, given in zip(
+        wrist_off(path, turns, jnp.zeros(2), _uniform(2, 15)), (path, turns), strict=True
+    ):
         np.testing.assert_allclose(found, given, atol=1e-6)
 
 
@@ -102,7 +113,9 @@ def test_fingers_are_off_by_closure_and_joint():
     assert np.all(found >= HAND.lower) and np.all(found <= HAND.upper)
     wide = np.argmax(HAND.upper - HAND.lower)  # 2.1 rad: clipping hardly matters
     way = middle[wide] - HAND.q_open[wide]
-    np.testing.assert_allclose(found[:, wide].mean(), HAND.q_open[wide] + np.mean(CLOSURE) * way, atol=0.03)
+    np.testing.assert_allclose(
+        found[:, wide].mean(), HAND.q_open[wide] + np.mean(CLOSURE) * way, atol=0.03
+    )
     spread = np.sqrt(JOINTS**2 + (CLOSURE[1] - CLOSURE[0]) ** 2 / 12 * way**2)
     assert found[:, wide].std() == pytest.approx(spread, rel=0.1)
 
@@ -110,11 +123,17 @@ def test_fingers_are_off_by_closure_and_joint():
 def test_a_path_moves_and_turns_as_a_whole_but_for_its_jitter():
     rng = np.random.default_rng(0)
     path = jnp.array(np.tile(rng.normal(size=(1, 4, 3)), (MANY, 1, 1)), jnp.float32)
-    turns = jnp.array(np.tile(Rotation.random(4, 0).as_quat(scalar_first=True), (MANY, 1, 1)), jnp.float32)
-    moved, turned = (np.asarray(x) for x in wrist_off(path, turns, jnp.ones(MANY), _uniform(MANY, wrist_numbers(4))))
+    turns = jnp.array(
+        np.tile(Rotation.random(4, 0).as_quat(scalar_first=True), (MANY, 1, 1)), jnp.float32
+    )
+    moved, turned = (
+        np.asarray(x)
+        for x in wrist_off(path, turns, jnp.ones(MANY), _uniform(MANY, wrist_numbers(4)))
+    )
     assert (moved[:, -1] - path[:, -1]).std() == pytest.approx(WRIST[0], rel=0.05)
     by = [
-        Rotation.from_quat(turned[:, k], scalar_first=True) * Rotation.from_quat(turns[:, k], scalar_first=True).inv()
+        Rotation.from_quat(turned[:, k], scalar_first=True)
+        * Rotation.from_quat(turns[:, k], scalar_first=True).inv()
         for k in range(4)
     ]
     for k in range(3):

@@ -1,4 +1,6 @@
-"""All transports behave alike, one from outside among them; Zenoh's ends refuse what they should, and end."""
+"""All transports behave alike, one from outside among them; Zenoh's ends refuse what they should,
+and end.
+"""
 
 import contextlib
 import functools
@@ -47,7 +49,9 @@ def pair(request, tmp_path):
 
 def test_flows_and_keys():
     assert KEYS.rollout("a") == "congrasp/test/rollout/a"
-    assert [flow(key) for key in (KEYS.config, KEYS.ticket("a"), KEYS.status, KEYS.announcement)] == ["control"] * 4
+    assert [
+        flow(key) for key in (KEYS.config, KEYS.ticket("a"), KEYS.status, KEYS.announcement)
+    ] == ["control"] * 4
     assert flow(KEYS.everyone) == flow(KEYS.alive("actor", "a", "0f")) == "control"
     assert flow(KEYS.rollout("announce")) == flow(KEYS.weights) == "bulk"
     assert flow(KEYS.logs) == flow(KEYS.log("metrics", "actor", "a")) == "log"
@@ -195,7 +199,9 @@ def test_closing_waits_for_handlers_that_still_work(pair):
     server.serve(KEYS.act, handler)
 
     def ask():
-        with contextlib.suppress(CongraspError):  # its answer may come too late for the closing server
+        with contextlib.suppress(
+            CongraspError
+        ):  # its answer may come too late for the closing server
             client.query(KEYS.act, Message(), timeout=60)
 
     asker = threading.Thread(target=ask, daemon=True)
@@ -273,7 +279,9 @@ def test_busy_port_is_named():
     base = free_port()
     with (
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]),
-        pytest.raises(CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.* or use another"),
+        pytest.raises(
+            CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.* or use another"
+        ),
     ):
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"])
     with ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]):
@@ -292,7 +300,8 @@ def test_busy_port_of_a_later_flow_frees_the_earlier_ones():
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "", "tcp/127.0.0.1:65535"]
+    "endpoint",
+    ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "", "tcp/127.0.0.1:65535"],
 )
 def test_malformed_endpoint_is_named(endpoint):
     with pytest.raises(CongraspError, match=r"is not an endpoint.*Write it like tcp/"):
@@ -324,8 +333,15 @@ def test_damaged_and_oversized_messages_are_refused():
 
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     damaged = []
-    with ZenohTransport(listen=[endpoint], max_message=1 << 20) as server, ZenohTransport(connect=[endpoint]) as client:
-        server.serve(KEYS.act, lambda key, message: message, on_damage=lambda key, error: damaged.append(str(error)))
+    with (
+        ZenohTransport(listen=[endpoint], max_message=1 << 20) as server,
+        ZenohTransport(connect=[endpoint]) as client,
+    ):
+        server.serve(
+            KEYS.act,
+            lambda key, message: message,
+            on_damage=lambda key, error: damaged.append(str(error)),
+        )
         session = client._session(KEYS.act)
         whole = encode(Message({"x": np.zeros(8)}))
         for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
@@ -393,7 +409,9 @@ BUSY_PROCESS = """
 def test_process_always_ends(end, code):
     script = textwrap.dedent(BUSY_PROCESS).replace("{end}", end)
     process = subprocess.Popen(
-        [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
     try:
         assert process.stdout.readline() == b"ready\n"
@@ -432,31 +450,60 @@ def test_admission_sends_requests_away_unread(pair):
 def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_s(given, merged):
     code = "import os, congrasp.common.transport.zenoh_session; print(os.environ['ZENOH_RUNTIME'])"
     env = {**os.environ, "ZENOH_RUNTIME": given}
-    assert subprocess.check_output([sys.executable, "-c", code], env=env, text=True) == f"{merged}\n"
+    assert (
+        subprocess.check_output([sys.executable, "-c", code], env=env, text=True) == f"{merged}\n"
+    )
 
 
 def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
-    script = "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as T; "
-    script += "T(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), os.environ['ZENOH_RUNTIME'])"
+    script = (
+        "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as "
+        "T; "
+    )
+    script += (
+        "T(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), "
+        "os.environ['ZENOH_RUNTIME'])"
+    )
     command = [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"]
     env = {**os.environ, "ZENOH_RUNTIME": "(tx: (worker_threads: 2))"}
-    threads, settings = subprocess.run(command, capture_output=True, env=env, check=True).stdout.split(b" ", 1)
+    threads, settings = subprocess.run(
+        command, capture_output=True, env=env, check=True
+    ).stdout.split(b" ", 1)
     assert int(threads) > zenoh_session._CLOSERS and b"tx: (worker_threads: 2)" in settings
 
 
 @pytest.mark.parametrize(
     ("given", "sound"),
     [
-        *((text, False) for text in ("acc", "(tx: (worker_threads: 2)", "(tx: (worker_threads: two))", "(tx: 2)")),
-        *((text, False) for text in ("(all: ())", "(tx: (handover: all))", "(tx: (threads: 2))", "(tx: (),,)")),
+        *(
+            (text, False)
+            for text in (
+                "acc",
+                "(tx: (worker_threads: 2)",
+                "(tx: (worker_threads: two))",
+                "(tx: 2)",
+            )
+        ),
+        *(
+            (text, False)
+            for text in ("(all: ())", "(tx: (handover: all))", "(tx: (threads: 2))", "(tx: (),,)")
+        ),
         *((text, False) for text in ("(tx: (), tx: ())", "(tx: (max_blocking_threads: 0))")),
-        ("#![enable(implicit_some)] ( tx: (worker_threads: 1_0,), /* of\nmine */ rx: (handover: Some(tx)), )", True),
+        (
+            "#![enable(implicit_some)] ( tx: (worker_threads: 1_0,), /* of\nmine */ rx: (handover: "
+            "Some(tx)), )",
+            True,
+        ),
         ("AbstractRuntimeParam(app: (worker_threads: 2, max_blocking_threads: 9)) // mine", True),
     ],
 )
 def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sound):
     monkeypatch.setattr(zenoh_session, "_RUNTIME", given)
-    with contextlib.nullcontext() if sound else pytest.raises(CongraspError, match=r"ZENOH_RUNTIME is '.*Unset it"):
+    with (
+        contextlib.nullcontext()
+        if sound
+        else pytest.raises(CongraspError, match=r"ZENOH_RUNTIME is '.*Unset it")
+    ):
         zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
 
 
@@ -467,22 +514,38 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
     """Zenoh panics in a process that has no file left."""
     limits = [(1024, hard)]
     monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: limits[-1])
-    monkeypatch.setattr(zenoh_session.resource, "setrlimit", lambda kind, limit: limits.append(limit))
-    monkeypatch.setattr(zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__))
+    monkeypatch.setattr(
+        zenoh_session.resource, "setrlimit", lambda kind, limit: limits.append(limit)
+    )
+    monkeypatch.setattr(
+        zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__)
+    )
     for _ in range(2):
-        settings = zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
-    taken = [int(settings.get_json(f"transport/unicast/{name}")) for name in ("accept_pending", "max_sessions")]
+        settings = zenoh_session.configuration(
+            "policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None
+        )
+    taken = [
+        int(settings.get_json(f"transport/unicast/{name}"))
+        for name in ("accept_pending", "max_sessions")
+    ]
     assert taken == [files // 4, min(1000, files // 4)]
     assert limits[-1] == (files, hard)
     assert [record.args for record in caplog.records] == [(files, files // 4, 16_384)] * warnings
 
 
 def test_another_user_s_file_in_the_temporary_folder_takes_no_port_away(tmp_path):
-    (tmp_path / f"congrasp-ports-{os.getuid()}").mkdir()  # what cannot be opened, as another user's file
-    script = "from congrasp.common.transport.ports import free_port; print(free_port(), free_port())"
+    (
+        tmp_path / f"congrasp-ports-{os.getuid()}"
+    ).mkdir()  # what cannot be opened, as another user's file
+    script = (
+        "from congrasp.common.transport.ports import free_port; print(free_port(), free_port())"
+    )
     environment = {name: text for name, text in os.environ.items() if name != "XDG_RUNTIME_DIR"}
     done = subprocess.run(
-        [sys.executable, "-c", script], env={**environment, "TMPDIR": str(tmp_path)}, capture_output=True, text=True
+        [sys.executable, "-c", script],
+        env={**environment, "TMPDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
     )
     first, second = done.stdout.split()
     assert first != second, done.stderr

@@ -1,4 +1,6 @@
-"""URL and role are all that a process names: flows, ports and certificates follow, whatever carries the messages."""
+"""URL and role are all that a process names: flows, ports and certificates follow, whatever carries
+the messages.
+"""
 
 import contextlib
 import json
@@ -42,12 +44,15 @@ def test_every_role_opens_the_flows_of_all_that_it_may_do():
             keys = [*rights.ask, *rights.publish, *rights.hear, *rights.show]
             opened = urls.PEER_FLOWS[role]
             assert {flow(f"congrasp/test/{key}") for key in keys} <= set(opened)
-            assert urls.LISTENER_FLOWS[listener][: len(opened)] == opened  # so that their ports are the same
+            # So that their ports are the same
+            assert urls.LISTENER_FLOWS[listener][: len(opened)] == opened
 
 
 @pytest.mark.parametrize("url", ["carrier-pigeon/loft", "127.0.0.1:7447", ""])
 def test_an_unknown_scheme_is_named_with_those_that_are_known(url):
-    with pytest.raises(CongraspError, match=rf"'{url}' is not an endpoint\. Write it like tcp/.*memory, tcp, tls"):
+    with pytest.raises(
+        CongraspError, match=rf"'{url}' is not an endpoint\. Write it like tcp/.*memory, tcp, tls"
+    ):
         urls.connect(url, "actor")
 
 
@@ -56,7 +61,9 @@ def test_ports_follow_from_the_url():
     assert rank_url("socket/anywhere", 0) == "socket/anywhere"
     with pytest.raises(CongraspError, match="is not an endpoint"):
         rank_url("socket/anywhere", 1)
-    assert reachable_url("tls/0.0.0.0:7447") == reachable_url("tls/[::]:7447") == "tls/127.0.0.1:7447"
+    assert (
+        reachable_url("tls/0.0.0.0:7447") == reachable_url("tls/[::]:7447") == "tls/127.0.0.1:7447"
+    )
     assert reachable_url("tls/10.0.0.5:7447") == "tls/10.0.0.5:7447"
 
 
@@ -78,7 +85,9 @@ def test_within_a_process_a_name_is_enough():
 def test_who_connects_waits_for_the_listener(tmp_path):
     for url in ("memory/late", f"socket/{tmp_path}/late"):
         opened = []
-        late = threading.Timer(0.2, lambda url=url, opened=opened: opened.append(urls.listen(url, "learner")))
+        late = threading.Timer(
+            0.2, lambda url=url, opened=opened: opened.append(urls.listen(url, "learner"))
+        )
         late.start()
         with urls.connect(url, "observer", wait=10.0):
             late.join(10.0)
@@ -105,7 +114,9 @@ def test_certificates_follow_from_the_role(certs):
 
 def test_a_client_without_cryptography_leaves_the_judgement_to_its_peer(certs, monkeypatch):
     monkeypatch.setattr(urls.importlib.util, "find_spec", lambda name: None)
-    assert urls.find_credentials(str(certs / "actor.1"), "client") == Credentials(certs / "actor.1", "client")
+    assert urls.find_credentials(str(certs / "actor.1"), "client") == Credentials(
+        certs / "actor.1", "client"
+    )
 
 
 def test_beyond_loopback_nothing_listens_unprotected():
@@ -120,7 +131,10 @@ def test_beyond_loopback_nothing_listens_unprotected():
 
 def work(url):
     """What an actor does: takes a ticket and weights, and uploads a rollout."""
-    with urls.connect(url, "actor") as transport, ActorLink(transport, "test", "a", request_timeout=5.0) as link:
+    with (
+        urls.connect(url, "actor") as transport,
+        ActorLink(transport, "test", "a", request_timeout=5.0) as link,
+    ):
         assert link.config(10).schema == "s"
         ticket = link.acquire_ticket(5)
         version = link.weights(-1).meta["version"]
@@ -140,10 +154,13 @@ def in_process(url):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "start"), [("memory", in_thread), ("socket", in_thread), ("socket", in_process), ("tcp", in_process)]
+    ("scheme", "start"),
+    [("memory", in_thread), ("socket", in_thread), ("socket", in_process), ("tcp", in_process)],
 )
 def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_path):
-    url = {"memory": f"memory/{tmp_path}", "socket": f"socket/{tmp_path}/s", "tcp": local_url()}[scheme]
+    url = {"memory": f"memory/{tmp_path}", "socket": f"socket/{tmp_path}/s", "tcp": local_url()}[
+        scheme
+    ]
     with urls.listen(url, "learner") as transport:
         hub, rollouts = learner_hub(transport, "test")
         hub.publish_weights(bundle(0), 0)
@@ -166,12 +183,20 @@ for line in sys.stdin:
 
 
 def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
-    script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))  # above those that other tests take
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}  # and locks of its own
+    # Above those that other tests take
+    script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))
+    # And locks of its own
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "TMPDIR": str(tmp_path),
+    }
 
     def taker():
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        return stack.enter_context(subprocess.Popen([sys.executable, "-c", script], env=environment, **pipes))
+        return stack.enter_context(
+            subprocess.Popen([sys.executable, "-c", script], env=environment, **pipes)
+        )
 
     def take(process, count):
         process.stdin.write(f"{count}\n")

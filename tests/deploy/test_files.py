@@ -1,4 +1,6 @@
-"""What is in deploy/: valid by the published schemas, and made of command lines that this version understands."""
+"""What is in deploy/: valid by the published schemas, and made of command lines that this version
+understands.
+"""
 
 import json
 import pathlib
@@ -27,14 +29,22 @@ VERSIONS = ("1.29", "1.37")  # of Kubernetes: the oldest and the newest
 
 def manifests(text=None):
     files = [text] if text else [path.read_text() for path in KUBERNETES.glob("*.yaml")]
-    found = [document for file in files for document in yaml.safe_load_all(file) if "apiVersion" in document]
+    found = [
+        document
+        for file in files
+        for document in yaml.safe_load_all(file)
+        if "apiVersion" in document
+    ]
     return [document for document in found if not document["apiVersion"].startswith("kustomize")]
 
 
 def compose_commands():
     for name, service in yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].items():
         words = [re.sub(r"\$\{\w+:-(\w+)\}", r"\1", word) for word in service["command"]]
-        yield f"compose {name}", shlex.split(words[0].split("congrasp")[-1]) if name == "certs" else words
+        yield (
+            f"compose {name}",
+            shlex.split(words[0].split("congrasp")[-1]) if name == "certs" else words,
+        )
         if test := service.get("healthcheck", {}).get("test"):
             yield f"compose {name} health", test[2:]
 
@@ -48,14 +58,19 @@ def kubernetes_commands():
                 [re.sub(r"\$\((\w+)\)", "human", word) for word in container["args"]],
             )
             if "exec" in container.get("readinessProbe", {}):
-                yield f"kubernetes {container['name']} probe", container["readinessProbe"]["exec"]["command"][1:]
+                yield (
+                    f"kubernetes {container['name']} probe",
+                    container["readinessProbe"]["exec"]["command"][1:],
+                )
 
 
 def unit_commands():
     for unit in UNITS:
         text = unit.read_text().replace("\\\n", "")
         values = dict(
-            pair.split("=", 1) for line in re.findall("^Environment=(.*)", text, re.M) for pair in line.split()
+            pair.split("=", 1)
+            for line in re.findall("^Environment=(.*)", text, re.M)
+            for pair in line.split()
         )
         command = re.search("^ExecStart=(.*)", text, re.M)[1]
         for name, value in values.items():
@@ -72,7 +87,9 @@ def docker_commands():
 COMMANDS = [*compose_commands(), *kubernetes_commands(), *unit_commands(), *docker_commands()]
 
 
-@pytest.mark.parametrize("arguments", [arguments for _, arguments in COMMANDS], ids=[name for name, _ in COMMANDS])
+@pytest.mark.parametrize(
+    "arguments", [arguments for _, arguments in COMMANDS], ids=[name for name, _ in COMMANDS]
+)
 def test_command_lines_are_understood(arguments):
     """An option that no longer exists ends the parser, and so the test."""
     assert callable(load(arguments[0])(arguments[1:]))
@@ -80,7 +97,9 @@ def test_command_lines_are_understood(arguments):
 
 def test_compose_file_fits_the_schema_of_compose():
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
-    done = subprocess.run([*command, DEPLOY / "compose.yaml"], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [*command, DEPLOY / "compose.yaml"], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -111,26 +130,37 @@ def test_manifests_name_one_another_rightly():
             labels[document["metadata"]["name"]] = template["metadata"]["labels"]
             assert document["spec"]["selector"]["matchLabels"] == template["metadata"]["labels"]
             (container,) = template["spec"]["containers"]
-            ports[document["metadata"]["name"]] = {port["containerPort"] for port in container["ports"]}
+            ports[document["metadata"]["name"]] = {
+                port["containerPort"] for port in container["ports"]
+            }
             mounted = {mount["name"] for mount in container["volumeMounts"]}
-            claims = {claim["metadata"]["name"] for claim in document["spec"].get("volumeClaimTemplates", ())}
+            claims = {
+                claim["metadata"]["name"]
+                for claim in document["spec"].get("volumeClaimTemplates", ())
+            }
             assert mounted == {volume["name"] for volume in template["spec"]["volumes"]} | claims
             assert template["spec"]["securityContext"]["runAsNonRoot"]
     for document in found:
         if document["kind"] == "Service":
             assert document["spec"]["selector"] == labels[document["metadata"]["name"]]
-            assert {port["port"] for port in document["spec"]["ports"]} <= ports[document["metadata"]["name"]]
+            assert {port["port"] for port in document["spec"]["ports"]} <= ports[
+                document["metadata"]["name"]
+            ]
         elif document["kind"] == "PodDisruptionBudget":
             assert document["spec"]["selector"]["matchLabels"] in labels.values()
         elif document["kind"] == "HorizontalPodAutoscaler":
             target = document["spec"]["scaleTargetRef"]
             assert (target["kind"], target["name"]) in names
             (metric,) = document["spec"]["metrics"]
-            adapter = yaml.safe_load((KUBERNETES / "prometheus-adapter.yaml").read_text())["rules"]["external"]
+            adapter = yaml.safe_load((KUBERNETES / "prometheus-adapter.yaml").read_text())["rules"][
+                "external"
+            ]
             assert metric["external"]["metric"]["name"] in {rule["name"]["as"] for rule in adapter}
 
 
-@pytest.mark.skipif(not shutil.which("kubectl"), reason="kubectl, which builds kustomizations, is not here")
+@pytest.mark.skipif(
+    not shutil.which("kubectl"), reason="kubectl, which builds kustomizations, is not here"
+)
 def test_kustomizations_build(tmp_path):
     shutil.copytree(KUBERNETES, tmp_path / "k")
     for name in ("learner.0", "actor.0", "server.0", "client.0"):
@@ -139,7 +169,9 @@ def test_kustomizations_build(tmp_path):
             (tmp_path / "k" / "certificates" / name / file).write_text("x")
     built = []
     for folder in (tmp_path / "k", tmp_path / "k" / "certificates"):
-        done = subprocess.run(["kubectl", "kustomize", folder], capture_output=True, text=True, timeout=60, check=True)
+        done = subprocess.run(
+            ["kubectl", "kustomize", folder], capture_output=True, text=True, timeout=60, check=True
+        )
         built += manifests(done.stdout)
     secrets = {document["metadata"]["name"] for document in built if document["kind"] == "Secret"}
     for document in built:
@@ -147,7 +179,8 @@ def test_kustomizations_build(tmp_path):
         assert document["kind"] == "Namespace" or document["metadata"]["namespace"] == "congrasp"
         if document["kind"] in ("StatefulSet", "Deployment"):
             used = {
-                volume.get("secret", {}).get("secretName") for volume in document["spec"]["template"]["spec"]["volumes"]
+                volume.get("secret", {}).get("secretName")
+                for volume in document["spec"]["template"]["spec"]["volumes"]
             }
             assert used - {None} <= secrets
 
@@ -158,65 +191,122 @@ def test_units_are_valid_and_confined(tmp_path):
     for unit, copy in zip(UNITS, copies, strict=True):
         copy.write_text(unit.read_text().replace("/opt/congrasp/bin/congrasp", sys.executable))
     done = subprocess.run(
-        ["systemd-analyze", "verify", *copies], capture_output=True, text=True, timeout=60, check=False
+        ["systemd-analyze", "verify", *copies],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
-    assert done.returncode == 0 and not any(copy.name in done.stderr for copy in copies), done.stderr
+    assert done.returncode == 0 and not any(copy.name in done.stderr for copy in copies), (
+        done.stderr
+    )
     for copy in copies:
-        confined = ["systemd-analyze", "security", "--offline=yes", "--threshold=25", "--no-pager", copy]
+        confined = [
+            "systemd-analyze",
+            "security",
+            "--offline=yes",
+            "--threshold=25",
+            "--no-pager",
+            copy,
+        ]
         done = subprocess.run(confined, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_pass_shellcheck(script):
-    for command in (["bash", "-n"], [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash"]):
-        done = subprocess.run([*command, script], capture_output=True, text=True, timeout=60, check=False)
+    for command in (
+        ["bash", "-n"],
+        [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash"],
+    ):
+        done = subprocess.run(
+            [*command, script], capture_output=True, text=True, timeout=60, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
-    """With stand-ins for Slurm's commands, the script starts the learner's ranks with arguments that it understands."""
+    """With stand-ins for Slurm's commands, the script starts the learner's ranks with arguments
+    that it understands.
+    """
     stubs = {
         "scontrol": "echo node-7; echo node-8",
-        "srun": 'while [ "$1" != bash ]; do shift; done; for i in 0 1; do SLURM_PROCID=$i "$@"; done',
+        "srun": (
+            'while [ "$1" != bash ]; do shift; done; for i in 0 1; do SLURM_PROCID=$i "$@"; done'
+        ),
         "congrasp": 'for word in "$@"; do echo "$word"; done >> "$OUT/$SLURM_PROCID"',
     }
     for name, body in stubs.items():
         (tmp_path / name).write_text(f"#!/usr/bin/env bash\n{body}\n")
         (tmp_path / name).chmod(0o755)
-    environment = {"SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node-[7-8]", "OUT": str(tmp_path), "HOME": str(tmp_path)}
-    script = ["bash", DEPLOY / "slurm" / "train.sbatch", "human", tmp_path / "a run", "--updates", "9"]
-    subprocess.run(script, env={**environment, "PATH": f"{tmp_path}:/usr/bin:/bin"}, timeout=60, check=True)
+    environment = {
+        "SLURM_NTASKS": "2",
+        "SLURM_JOB_NODELIST": "node-[7-8]",
+        "OUT": str(tmp_path),
+        "HOME": str(tmp_path),
+    }
+    script = [
+        "bash",
+        DEPLOY / "slurm" / "train.sbatch",
+        "human",
+        tmp_path / "a run",
+        "--updates",
+        "9",
+    ]
+    subprocess.run(
+        script, env={**environment, "PATH": f"{tmp_path}:/usr/bin:/bin"}, timeout=60, check=True
+    )
     for rank in range(2):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
         given = load(arguments[0])(arguments[1:]).keywords
         options = given["options"]
         assert (options.rank, options.ranks, options.coordinator) == (rank, 2, "node-7:7440")
-        assert options.run_dir == tmp_path / "a run" and given["config"].updates == 9 and options.inside
+        assert (
+            options.run_dir == tmp_path / "a run"
+            and given["config"].updates == 9
+            and options.inside
+        )
 
 
 @pytest.mark.parametrize(
     ("rank", "learner", "words"),
-    [(0, "", ["learner", "--inside"]), (1, "", ["actor", "--patience"]), (0, "10.0.0.5", ["actor", "--patience"])],
+    [
+        (0, "", ["learner", "--inside"]),
+        (1, "", ["actor", "--patience"]),
+        (0, "10.0.0.5", ["actor", "--patience"]),
+    ],
 )
 def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, words):
     """With a stand-in for the package, each node runs a command that this version understands."""
     task = yaml.safe_load((DEPLOY / "skypilot.yaml").read_text())
     stubs = tmp_path / "congrasp" / "bin"
     stubs.mkdir(parents=True)
-    for name, body in {"congrasp": 'printf "%s\\n" "$@" > "$OUT"', "sudo": "cat > /dev/null"}.items():
+    for name, body in {
+        "congrasp": 'printf "%s\\n" "$@" > "$OUT"',
+        "sudo": "cat > /dev/null",
+    }.items():
         (stubs / name).write_text(f"#!/usr/bin/env bash\n{body}\n")
         (stubs / name).chmod(0o755)
     nodes = {"SKYPILOT_NODE_IPS": "10.0.0.5\n10.0.0.6", "SKYPILOT_NODE_RANK": str(rank)}
-    environment = {**nodes, **task["envs"], "LEARNER": learner, "HOME": str(tmp_path), "OUT": str(tmp_path / "said")}
+    environment = {
+        **nodes,
+        **task["envs"],
+        "LEARNER": learner,
+        "HOME": str(tmp_path),
+        "OUT": str(tmp_path / "said"),
+    }
     path = f"{stubs}:/usr/bin:/bin"
-    subprocess.run(["bash", "-c", task["run"]], env={**environment, "PATH": path}, check=True, timeout=60)
+    subprocess.run(
+        ["bash", "-c", task["run"]], env={**environment, "PATH": path}, check=True, timeout=60
+    )
     command, *rest = (tmp_path / "said").read_text().splitlines()
     assert command == words[0] and words[1] in rest
     load(command)(rest)
     check = [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash", "-"]
     for part in ("setup", "run"):
-        done = subprocess.run(check, input=task[part], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            check, input=task[part], capture_output=True, text=True, timeout=60, check=False
+        )
         assert done.returncode == 0, done.stdout
     assert {path.partition("/")[0] for path in task["file_mounts"].values()} == {"certs"}
 
@@ -230,7 +320,12 @@ WORDS = {"min", "max", "sum", "by", "le", "rate", "histogram_quantile", "outcome
 
 
 def test_every_expression_names_metrics_that_are_exposed():
-    learner, actor, server, port = LearnerMetrics(lambda: STATUS), ActorMetrics(), ServerMetrics(), free_port()
+    learner, actor, server, port = (
+        LearnerMetrics(lambda: STATUS),
+        ActorMetrics(),
+        ServerMetrics(),
+        free_port(),
+    )
     learner.update(dict.fromkeys(UPDATE, 1.0))
     server.health = lambda: {"ready": True, "version": 5, "queue": 2}
     server.answer("answered", 0.01)
@@ -238,7 +333,9 @@ def test_every_expression_names_metrics_that_are_exposed():
     with exposed(port, "127.0.0.1", learner, actor, server):
         found = scrape(port)
     names, labels = {name for name, *_ in found}, {label for _, *rest in found for label in rest}
-    expressions = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])]
+    expressions = [
+        target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])
+    ]
     assert len(expressions) > 20
     for expression in expressions:
         bare = re.sub(r"\{[^}]*\}|\[[^]]*\]", "", expression)
@@ -246,7 +343,9 @@ def test_every_expression_names_metrics_that_are_exposed():
         assert used and used <= names, expression
         for value in re.findall(r'(?:figure|outcome|role)="([^"]+)"', expression):
             assert value in labels, expression
-        assert all(expression.count(pair[0]) == expression.count(pair[1]) for pair in ("()", "{}", "[]"))
+        assert all(
+            expression.count(pair[0]) == expression.count(pair[1]) for pair in ("()", "{}", "[]")
+        )
         assert all('job=~"$job"' in selector for selector in re.findall(r"\{[^}]*\}", expression))
 
 
@@ -254,7 +353,11 @@ def test_the_panels_do_not_overlap():
     taken = set()
     for panel in DASHBOARD["panels"]:
         at = panel["gridPos"]
-        cells = {(x, y) for x in range(at["x"], at["x"] + at["w"]) for y in range(at["y"], at["y"] + at["h"])}
+        cells = {
+            (x, y)
+            for x in range(at["x"], at["x"] + at["w"])
+            for y in range(at["y"], at["y"] + at["h"])
+        }
         assert not cells & taken and max(x for x, _ in cells) < 24
         taken |= cells
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])

@@ -1,4 +1,6 @@
-"""The services of compose.yaml on hosts of their own: network namespaces on a bridge, with names and certificates."""
+"""The services of compose.yaml on hosts of their own: network namespaces on a bridge, with names
+and certificates.
+"""
 
 import contextlib
 import json
@@ -21,7 +23,16 @@ SERVICES = yaml.safe_load((ROOT / "deploy" / "compose.yaml").read_text())["servi
 HOSTS = {"learner": "10.77.0.1", "actor": "10.77.0.2", "server": "10.77.0.3"}
 """The recorder is on the learner's host."""
 TINY = (
-    *("--updates", "1000000", "--environments", "4", "--checkpoint-every", "3", "--objects.count", "2"),
+    *(
+        "--updates",
+        "1000000",
+        "--environments",
+        "4",
+        "--checkpoint-every",
+        "3",
+        "--objects.count",
+        "2",
+    ),
     *("--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
     *("--ppo.epochs", "1", "--ppo.minibatches", "2"),
 )
@@ -35,7 +46,9 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def hosts():
-    """A namespace for each host, with a name that the others know; what is needed to run a command there."""
+    """A namespace for each host, with a name that the others know; what is needed to run a command
+    there.
+    """
     prefix = f"congrasp{os.getpid()}-"
     names = {host: f"{prefix}{host}" for host in (*HOSTS, "switch")}
     with contextlib.ExitStack() as stack:
@@ -49,7 +62,20 @@ def hosts():
         ip("-n", names["switch"], "link", "set", "bridge", "up")
         for number, (host, address) in enumerate(HOSTS.items()):
             port, name = f"port{number}", names[host]
-            ip("-n", name, "link", "add", "eth0", "type", "veth", "peer", "name", port, "netns", names["switch"])
+            ip(
+                "-n",
+                name,
+                "link",
+                "add",
+                "eth0",
+                "type",
+                "veth",
+                "peer",
+                "name",
+                port,
+                "netns",
+                names["switch"],
+            )
             ip("-n", names["switch"], "link", "set", port, "master", "bridge", "up")
             ip("-n", name, "addr", "add", f"{address}/24", "dev", "eth0")
             ip("-n", name, "link", "set", "eth0", "up")
@@ -57,7 +83,9 @@ def hosts():
             etc = pathlib.Path("/etc/netns", name)
             etc.mkdir(parents=True)
             stack.callback(shutil.rmtree, etc)
-            (etc / "hosts").write_text("127.0.0.1 localhost\n" + "".join(f"{a} {h}\n" for h, a in HOSTS.items()))
+            (etc / "hosts").write_text(
+                "127.0.0.1 localhost\n" + "".join(f"{a} {h}\n" for h, a in HOSTS.items())
+            )
         yield {host: ["ip", "netns", "exec", names[host]] for host in HOSTS}
 
 
@@ -69,7 +97,9 @@ class Cluster:
         self.processes: dict[str, subprocess.Popen[str]] = {}
 
     def words(self, service: str, words: list[str]) -> list[str]:
-        """Command words of a service with the values of its variables and the paths of its volumes."""
+        """Command words of a service with the values of its variables and the paths of its
+        volumes.
+        """
         paths = {}
         for volume in SERVICES[service].get("volumes", ()):
             if isinstance(volume, str):
@@ -96,7 +126,9 @@ class Cluster:
             *more,
         ]
         with (self._folder / f"{name}.log").open("a") as log:
-            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+            self.processes[name] = subprocess.Popen(
+                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL
+            )
 
     def restart_ended(self, name: str, service: str) -> None:
         """What compose's `restart: always` does."""
@@ -104,7 +136,9 @@ class Cluster:
             self.start(name, service)
 
     def logs(self) -> str:
-        return "\n".join(f"{path.name}: {path.read_text()[-2000:]}" for path in self._folder.glob("*.log"))
+        return "\n".join(
+            f"{path.name}: {path.read_text()[-2000:]}" for path in self._folder.glob("*.log")
+        )
 
     def end(self) -> dict[str, int]:
         """SIGTERM to all; their exit codes."""
@@ -127,14 +161,19 @@ def test_a_run_on_three_hosts(hosts, tmp_path):
         cluster.start("recorder", "recorder")
         cluster.start("server", "server")
         deadline = time.monotonic() + 400
-        health = [*shlex.split(CONGRASP), *cluster.words("server", SERVICES["server"]["healthcheck"]["test"][2:])]
+        health = [
+            *shlex.split(CONGRASP),
+            *cluster.words("server", SERVICES["server"]["healthcheck"]["test"][2:]),
+        ]
         while True:
             for name in ("recorder", "server"):
                 cluster.restart_ended(name, name)
             trained = (run_dir / "version").exists() and int((run_dir / "version").read_text()) >= 1
             if trained and (asked := cluster.run("server", health)).returncode == 0:
                 break
-            assert cluster.processes["learner"].poll() is None and time.monotonic() < deadline, cluster.logs()
+            assert cluster.processes["learner"].poll() is None and time.monotonic() < deadline, (
+                cluster.logs()
+            )
             time.sleep(1.0)
         answer = json.loads(asked.stdout)
         assert answer["ready"] and answer["hand"] == "human"
@@ -142,7 +181,9 @@ def test_a_run_on_three_hosts(hosts, tmp_path):
         status = ["status", "--connect", "tls/learner:7447", *observer, "--json"]
         found = json.loads(cluster.run("actor", [*shlex.split(CONGRASP), *status]).stdout)
         roles = sorted(role["role"] for role in found["roles"])
-        assert roles == ["actor", "actor", "learner", "recorder", "server"] and found["warnings"] == []
+        assert (
+            roles == ["actor", "actor", "learner", "recorder", "server"] and found["warnings"] == []
+        )
         stranger = ["query", "--health", "--connect", "tls/server:7457", "--timeout", "3"]
         assert cluster.run("actor", [*shlex.split(CONGRASP), *stranger]).returncode != 0
     finally:

@@ -1,4 +1,6 @@
-"""The documentation: it builds without a warning, its commands parse, and the tutorials' commands run."""
+"""The documentation: it builds without a warning, its commands parse, and the tutorials' commands
+run.
+"""
 
 import importlib
 import inspect
@@ -50,7 +52,9 @@ def commands_of_modules():
 
 @pytest.mark.parametrize("line", list(command_lines()))
 def test_every_command_line_parses(line):
-    """Names of commands and options are right, values have the right form, and examples exist; nothing is run."""
+    """Names of commands and options are right, values have the right form, and examples exist;
+    nothing is run.
+    """
     for name in re.findall(r"\bexamples/[\w.-]+", line):
         assert (ROOT / name).is_file(), name
     words = shlex.split(PLACEHOLDERS.sub("x", line), comments=True)
@@ -63,7 +67,18 @@ def test_every_command_line_parses(line):
 
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        "docs",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     commands = (tmp_path / "reference" / "commands.html").read_text()
@@ -73,7 +88,9 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 
 def test_metrics_of_episodes_are_documented():
-    for name in episode_fields(TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))):
+    for name in episode_fields(
+        TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
+    ):
         assert name in TITLES or name.startswith("term/"), name
 
 
@@ -90,14 +107,26 @@ def test_every_help_page_ends_with_examples_that_parse(command):
 
 
 def test_help_pages_speak_to_people(capsys):
-    """Of every command, its options as they are typed: nothing of the parser's own types and headings."""
+    """Of every command, its options as they are typed: nothing of the parser's own types and
+    headings.
+    """
     for name in main.COMMANDS:
-        for words in ([name], *([name, below] for below in getattr(main.module_of(name), "COMMANDS", ()))):
+        for words in (
+            [name],
+            *([name, below] for below in getattr(main.module_of(name), "COMMANDS", ())),
+        ):
             with pytest.raises(SystemExit):
                 main.load(name)([*words[1:], "--help"])
             page = capsys.readouterr().out
             assert f"\n  congrasp {' '.join(words)}" in page, words
-            for noise in ("{None}", "None}", "options options", "[[", "(default: )", "(default: None)"):
+            for noise in (
+                "{None}",
+                "None}",
+                "options options",
+                "[[",
+                "(default: )",
+                "(default: None)",
+            ):
                 assert noise not in page, (words, noise)
 
 
@@ -113,14 +142,20 @@ def test_the_mug_is_what_its_code_makes(tmp_path):
 @pytest.mark.timeout(600)
 @pytest.mark.slow
 def test_the_commands_of_the_tutorials_run(tmp_path, monkeypatch):
-    """A stranger's first ten minutes, in a folder with the examples; what takes minutes is marked as text there.
+    """A stranger's first ten minutes, in a folder with the examples; what takes minutes is marked
+    as text there.
 
-    The script is there and starts; the commands themselves run in this process, which has its libraries already.
+    The script is there and starts; the commands themselves run in this process, which has its
+    libraries already.
     """
     script = shutil.which("congrasp", path=pathlib.Path(sys.executable).parent)
     assert script, "the package is not installed beside this Python"
     assert subprocess.run([script, "--help"], capture_output=True, timeout=60, check=True).stdout
-    for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "MUJOCO_GL"):
+    for name in (
+        "JAX_COMPILATION_CACHE_DIR",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+        "MUJOCO_GL",
+    ):
         monkeypatch.setenv(name, os.environ.get(name, {"MUJOCO_GL": "disable"}.get(name, "0")))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)

@@ -59,10 +59,14 @@ def source_of(names):
     raise AssertionError(".".join(names))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if not name_of(page).startswith(FREE)], ids=name_of)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if not name_of(page).startswith(FREE)], ids=name_of
+)
 def test_a_users_page_is_short(page):
     words = [word for word in prose(page).split() if re.search(r"\w", word)]
-    assert len(words) <= 900, "Move what was measured to docs/notes/, and tables to docs/reference/."
+    assert len(words) <= 900, (
+        "Move what was measured to docs/notes/, and tables to docs/reference/."
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -73,9 +77,13 @@ def test_a_page_is_written_in_plain_english(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_extras_exist(page):
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     named = {
-        name for names in re.findall(r"(?:congrasp|\.)\[([\w,]+)\]", page.read_text()) for name in names.split(",")
+        name
+        for names in re.findall(r"(?:congrasp|\.)\[([\w,]+)\]", page.read_text())
+        for name in names.split(",")
     }
     assert named <= extras.keys()
 
@@ -92,7 +100,9 @@ def test_paths_and_modules_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page):
-    for path, anchor in re.findall(r"\]\(([^)#\s:]*)(?:#([^)]*))?\)", CODE.sub("", page.read_text())):
+    for path, anchor in re.findall(
+        r"\]\(([^)#\s:]*)(?:#([^)]*))?\)", CODE.sub("", page.read_text())
+    ):
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), path
         if anchor:
@@ -107,7 +117,12 @@ def test_the_functions_that_the_architecture_lists_exist():
         file = path or file
         if file:
             source = ROOT / file
-            texts = [part.read_text() for part in (source.glob("*.py") if source.is_dir() else [source])]
-            assert any(re.search(rf"^\s*(?:def|class) {name}\b", text, re.M) for text in texts), (file, name)
+            texts = [
+                part.read_text() for part in (source.glob("*.py") if source.is_dir() else [source])
+            ]
+            assert any(re.search(rf"^\s*(?:def|class) {name}\b", text, re.M) for text in texts), (
+                file,
+                name,
+            )
             found += 1
     assert found >= 20

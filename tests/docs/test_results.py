@@ -32,7 +32,9 @@ def test_results_are_of_the_policies_that_ship(name):
     """A new policy needs new figures: run the command in the file again."""
     for policy in RESULTS[name].about["policies"]:
         path = pretrained_file(policy["hand"]).with_name(policy["file"])
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == policy["sha256"], RESULTS[name].about["command"]
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == policy["sha256"], RESULTS[
+            name
+        ].about["command"]
 
 
 @pytest.mark.parametrize("name", RESULTS)
@@ -44,11 +46,17 @@ def test_a_table_is_written_between_its_marks_and_nothing_else_changes():
     results = RESULTS["human"]
     page = "Before.\n\n" + MARKS.format(kind="rates", text="old\n") + "\nAfter.\n"
     new = filled(page, {"human": results})
-    assert new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |") and "old" not in new
+    assert (
+        new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |")
+        and "old" not in new
+    )
     assert new.endswith("<!-- end of results -->\n\nAfter.\n")
     assert filled(new, {"human": results}) == new
     row = results.rows[0]
-    assert f"| {row.episodes} ({row.independent:.0f}) |" in new and f"{100 * row.success:.1f} % (" in new
+    assert (
+        f"| {row.episodes} ({row.independent:.0f}) |" in new
+        and f"{100 * row.success:.1f} % (" in new
+    )
     other = dataclasses.replace(results, rows=[dataclasses.replace(row, success=0.123)])
     assert "12.3 % (" in filled(page, {"human": other}) != new
 
@@ -63,7 +71,12 @@ def test_every_kind_of_table_is_markdown(kind):
 def test_conditions_name_the_policy_the_machine_and_the_command():
     about = RESULTS["human"].about
     text = "\n".join(KINDS["conditions"](RESULTS["human"]))
-    for part in (about["policy"]["sha256"][:12], about["machine"], about["command"], about["version"]):
+    for part in (
+        about["policy"]["sha256"][:12],
+        about["machine"],
+        about["command"],
+        about["version"],
+    ):
         assert part in text
 
 

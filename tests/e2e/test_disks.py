@@ -1,4 +1,6 @@
-"""A disk that is full or slow under a run: training goes on and says so in one line, and nothing is lost."""
+"""A disk that is full or slow under a run: training goes on and says so in one line, and nothing is
+lost.
+"""
 
 import dataclasses
 import threading
@@ -63,13 +65,19 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
                 filler[0].unlink()
 
         last = run_learner(
-            run_dir, config, transport, stop_event=threading.Event(), recorder=recorder,
-            on_update=on_update, on_event=lambda level, text: said.append((level, text)),
-        )  # fmt: skip
+            run_dir,
+            config,
+            transport,
+            stop_event=threading.Event(),
+            recorder=recorder,
+            on_update=on_update,
+            on_event=lambda level, text: said.append((level, text)),
+        )
     actor.join(10.0)
     assert last.version == 12 and actor.ended == "The run is finished."
     errors = [text for level, text in said if level == "error"]
-    (error,) = (text for text in errors if "checkpoint_" in text)  # although every update tries again
+    # Although every update tries again
+    (error,) = (text for text in errors if "checkpoint_" in text)
     assert "checkpoint_000000004.safetensors could not be written" in error
     assert "A kill now would lose 2 update(s), those since update 2." in error
     (warning,) = (text for text in warnings if "checkpoint_000000005" in text)
@@ -108,10 +116,18 @@ def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
     create_run(disk / "run", config)
     hub = MemoryHub()
     MadeUpActor(MemoryTransport(hub))
-    with MemoryTransport(hub) as transport, pytest.raises(CongraspError, match=r"000000003\..*could not be") as caught:
+    with (
+        MemoryTransport(hub) as transport,
+        pytest.raises(CongraspError, match=r"000000003\..*could not be") as caught,
+    ):
         run_learner(
-            disk / "run", config, transport, stop_event=threading.Event(),
+            disk / "run",
+            config,
+            transport,
+            stop_event=threading.Event(),
             on_update=lambda values: values["update"] == 3 and fill(disk),
-        )  # fmt: skip
+        )
     assert "\n" not in str(caught.value)
-    assert (disk / "run" / "checkpoints" / "latest").resolve().name == "checkpoint_000000002.safetensors"
+    assert (
+        disk / "run" / "checkpoints" / "latest"
+    ).resolve().name == "checkpoint_000000002.safetensors"

@@ -1,7 +1,8 @@
-"""Outcomes of rollouts when real processes are killed and stopped, links and disks are slow, and clocks jump.
+"""Outcomes of rollouts when real processes are killed and stopped, links and disks are slow, and
+clocks jump.
 
-Every test ends with the audit of `Cluster.stop`: nothing that was accepted is lost, duplicated or corrupted, and
-nothing was learnt from that is older than the cap.
+Every test ends with the audit of `Cluster.stop`: nothing that was accepted is lost, duplicated or
+corrupted, and nothing was learnt from that is older than the cap.
 """
 
 import random
@@ -32,7 +33,9 @@ def taken_up(folder):
 
 
 def test_a_killed_learner_costs_no_rollout(cluster):
-    """Killed with rollouts in its queue and in its update, each time; the next takes them up, and uses each once."""
+    """Killed with rollouts in its queue and in its update, each time; the next takes them up, and
+    uses each once.
+    """
     cluster.options["pause"] = 0.05
     learner = cluster.start_learner()
     for name in ("a", "b"):
@@ -45,7 +48,9 @@ def test_a_killed_learner_costs_no_rollout(cluster):
         learner = cluster.start_learner()
     cluster.wait_for_updates(3)
     final, counts = cluster.stop(learner)
-    assert counts["used"] + counts.get("waiting", 0) + counts.get("dropped", 0) == counts["accepted"]
+    assert (
+        counts["used"] + counts.get("waiting", 0) + counts.get("dropped", 0) == counts["accepted"]
+    )
     # What a learner refused as stale before it died is a gap for the next one.
     assert final["counters"]["missing"] <= counts["made"] - counts["accepted"]
     assert_books_balance(final)
@@ -54,12 +59,20 @@ def test_a_killed_learner_costs_no_rollout(cluster):
         outcomes = cluster.outcomes(name)
         assert sorted(entry["sequence"] for entry in outcomes) == list(range(len(outcomes)))
         asked = {entry["sequence"] for entry in outcomes if entry["outcome"] == "unknown"}
-        taken = {entry["sequence"] for entry in outcomes if entry["outcome"] in ("accepted", "duplicate")}
+        taken = {
+            entry["sequence"] for entry in outcomes if entry["outcome"] in ("accepted", "duplicate")
+        }
         assert len(asked) <= 2  # on their way when the learner ended
-        assert {sequence for actor, _, sequence in final["history"] if actor == name} <= taken | asked
+        assert {
+            sequence for actor, _, sequence in final["history"] if actor == name
+        } <= taken | asked
         made, unknown = made + len(outcomes), unknown + len(asked)
     ledger = final["counters"]
-    assert made - unknown <= sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing")) <= made
+    assert (
+        made - unknown
+        <= sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing"))
+        <= made
+    )
 
 
 def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together(cluster):
@@ -95,7 +108,9 @@ def test_an_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     assert_books_balance(final)
     history = {tuple(identity[1:]) for identity in final["history"]}
     acknowledged = {
-        (entry["incarnation"], entry["sequence"]) for entry in cluster.outcomes() if entry["outcome"] == "accepted"
+        (entry["incarnation"], entry["sequence"])
+        for entry in cluster.outcomes()
+        if entry["outcome"] == "accepted"
     }
     # All that was acknowledged was learnt from, or waited at the end.
     assert len(acknowledged - history) <= final["counters"]["queued"] + final["counters"]["dropped"]
@@ -107,7 +122,11 @@ def test_a_stopped_actor_is_noticed_holds_no_other_up_and_comes_back(cluster):
     learner = cluster.start_learner()
     actor = cluster.start_actor("a")
     cluster.start_actor("b")
-    cluster.wait(lambda status: min(contributions(status).values(), default=0) > 1 and len(actors(status)) == 2)
+    cluster.wait(
+        lambda status: (
+            min(contributions(status).values(), default=0) > 1 and len(actors(status)) == 2
+        )
+    )
     actor.send_signal(signal.SIGSTOP)
     before = cluster.wait(lambda status: len(actors(status)) == 1)
     assert "b" in contributions(before)
@@ -129,13 +148,19 @@ def test_a_learner_that_is_stopped_for_fifteen_seconds_continues_with_all_actors
     time.sleep(15)
     learner.send_signal(signal.SIGCONT)
     before = contributions(cluster.wait(lambda status: len(contributions(status)) == 2))
-    cluster.wait(lambda status: all(contributions(status).get(name, 0) > count for name, count in before.items()))
+    cluster.wait(
+        lambda status: all(
+            contributions(status).get(name, 0) > count for name, count in before.items()
+        )
+    )
     cluster.stop(learner)
 
 
 @pytest.mark.slow
 def test_a_slow_link_slows_its_actor_alone(cluster):
-    """Two rollouts take some five seconds, longer than the three that the actor allows other requests."""
+    """Two rollouts take some five seconds, longer than the three that the actor allows other
+    requests.
+    """
     cluster.options["steps"] = 400  # 560 kB
     learner = cluster.start_learner(pause=0.3)
     with throttled(cluster.endpoint, 220e3) as slow:

@@ -1,6 +1,8 @@
-"""Mutated messages at every key, and mutated files at every loader: no traceback, no growth, no hang.
+"""Mutated messages at every key, and mutated files at every loader: no traceback, no growth, no
+hang.
 
-Each takes half of `CONGRASP_FUZZ_SECONDS`, 4 by default, from the seed `CONGRASP_FUZZ_SEED`, 0 by default:
+Each takes half of `CONGRASP_FUZZ_SECONDS`, 4 by default, from the seed `CONGRASP_FUZZ_SEED`, 0 by
+default:
 
     CONGRASP_FUZZ_SECONDS=600 pytest tests/e2e/test_fuzz.py -n 0
 """
@@ -58,8 +60,31 @@ KEYS = Keys("chaos")
 FORM = RolloutForm(3, 2, 32, 4, half=True)
 GROWTH, LONGEST = 150 << 20, 20.0  # bytes of memory; seconds of one message or file
 pytestmark = pytest.mark.timeout(240 + 2 * SECONDS)
-ODD = [None, True, -1, 0, 2**53, 10**30, 1e300, 0.5, "", "x" * 70_000, "../../etc/passwd", "/dev/zero", "a.json", "{",
-       "\ud800", "\x1b[2J", "*", "a/b", [], [[]], ["x"] * 1000, {}, {"a": {"b": {}}}]  # fmt: skip
+ODD = [
+    None,
+    True,
+    -1,
+    0,
+    2**53,
+    10**30,
+    1e300,
+    0.5,
+    "",
+    "x" * 70_000,
+    "../../etc/passwd",
+    "/dev/zero",
+    "a.json",
+    "{",
+    "\ud800",
+    "\x1b[2J",
+    "*",
+    "a/b",
+    [],
+    [[]],
+    ["x"] * 1000,
+    {},
+    {"a": {"b": {}}},
+]
 DTYPES = ["f2", "f4", "f8", "i4", "i8", "u1", "?"]
 
 
@@ -80,7 +105,9 @@ def odd_array(rng, array):
     """An array of another shape, dtype or with other values."""
     kind = rng.randrange(5)
     if kind == 0:
-        return np.zeros([rng.choice([0, 1, 2, 7, 99]) for _ in range(rng.randrange(4))], rng.choice(DTYPES))
+        return np.zeros(
+            [rng.choice([0, 1, 2, 7, 99]) for _ in range(rng.randrange(4))], rng.choice(DTYPES)
+        )
     if kind == 1:
         with np.errstate(all="ignore"):
             return np.asarray(array).astype(rng.choice(DTYPES))
@@ -88,8 +115,14 @@ def odd_array(rng, array):
         return np.asarray(array)[..., None]
     changed = np.array(array)
     if changed.size:
-        worst = [np.nan, np.inf, -3e38, 65504.0, 1e19, 0.0, -1.0] if changed.dtype.kind == "f" else [0, 1, 127]
-        changed.reshape(-1)[rng.randrange(changed.size)] = np.asarray(rng.choice(worst)).astype(changed.dtype)
+        worst = (
+            [np.nan, np.inf, -3e38, 65504.0, 1e19, 0.0, -1.0]
+            if changed.dtype.kind == "f"
+            else [0, 1, 127]
+        )
+        changed.reshape(-1)[rng.randrange(changed.size)] = np.asarray(rng.choice(worst)).astype(
+            changed.dtype
+        )
     return changed
 
 
@@ -97,7 +130,11 @@ def odd_bytes(rng, data):
     """Bytes with flips, cuts, doubled parts and noise."""
     changed = bytearray(data)
     for _ in range(rng.randrange(1, 4)):
-        at = rng.randrange(len(changed) + 1) if rng.random() < 0.5 else rng.randrange(min(2000, len(changed)) + 1)
+        at = (
+            rng.randrange(len(changed) + 1)
+            if rng.random() < 0.5
+            else rng.randrange(min(2000, len(changed)) + 1)
+        )
         kind = rng.randrange(5)
         if kind == 0 and at < len(changed):
             changed[at] ^= 1 << rng.randrange(8)
@@ -106,7 +143,9 @@ def odd_bytes(rng, data):
         elif kind == 2:
             changed[at:at] = changed[at : at + rng.randrange(64)]
         elif kind == 3:
-            noise = rng.choice([b"9" * 9, b"-1", b"1e99", b"null", b"[[[[", b'"', b"NaN", b"\xff" * 8, b"\0" * 8])
+            noise = rng.choice(
+                [b"9" * 9, b"-1", b"1e99", b"null", b"[[[[", b'"', b"NaN", b"\xff" * 8, b"\0" * 8]
+            )
             changed[at : at + len(noise)] = noise
         else:
             changed[at : at + rng.randrange(16)] = rng.randbytes(rng.randrange(16))
@@ -122,7 +161,9 @@ def mutated(rng, message):
             meta = meta if isinstance(meta, dict) else {}
         if arrays and rng.random() < 0.5:
             name = rng.choice(list(arrays))
-            arrays[rng.choice([name, name, "made/up", "episode/" + "x" * 300])] = odd_array(rng, arrays.pop(name))
+            arrays[rng.choice([name, name, "made/up", "episode/" + "x" * 300])] = odd_array(
+                rng, arrays.pop(name)
+            )
         data = encode(Message(arrays, meta))
         return data if rng.random() < 0.7 else odd_bytes(rng, data)
     return odd_bytes(rng, encode(message))
@@ -172,13 +213,19 @@ def requests():
         KEYS.health: Message(),
     }
     told = {
-        KEYS.log("metrics", "actor", "NAME"): Message(meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}),
-        KEYS.log("event", "actor", "NAME"): Message(meta={"time": 1.0, "level": "info", "text": "x"}),
+        KEYS.log("metrics", "actor", "NAME"): Message(
+            meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}
+        ),
+        KEYS.log("event", "actor", "NAME"): Message(
+            meta={"time": 1.0, "level": "info", "text": "x"}
+        ),
         KEYS.log("version", "actor", "NAME"): Message(meta={"version": 1, "run_id": "e"}),
         KEYS.log("episode", "actor", "NAME"): episode(3),
         KEYS.log("rollout", "actor", "NAME"): Message(named, {"actor": "a", "version": 1}),
         KEYS.log("odd", "actor", "NAME"): Message(),
-        KEYS.announcement: Message(meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}),
+        KEYS.announcement: Message(
+            meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}
+        ),
     }
     return list(asked.items()), list(told.items())
 
@@ -189,7 +236,9 @@ QUERY = {"constraints": ["heading"], "layout": LAYOUT.digest, "timeout": 1.0}
 
 @contextlib.contextmanager
 def served(endpoint, folder):
-    """Everything that listens: a learner's hub, what a policy server makes of a query, and a recorder."""
+    """Everything that listens: a learner's hub, what a policy server makes of a query, and a
+    recorder.
+    """
 
     def act(key, request):
         PolicyServer._deadline(request.meta.get("timeout", 1.0))
@@ -231,7 +280,10 @@ def test_mutated_messages_at_every_key(tmp_path):
                 assert time.monotonic() - now < 2 * LONGEST, key
                 for answer in answers:
                     text = b"" if answer.ok else answer.err.payload.to_bytes()
-                    assert b"failed on" not in text and len(text) < 1500 and b"\n" not in text, (key, text)
+                    assert b"failed on" not in text and len(text) < 1500 and b"\n" not in text, (
+                        key,
+                        text,
+                    )
             sent += 1
             if sent % 50 == 0:
                 shown = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
@@ -242,15 +294,23 @@ def test_mutated_messages_at_every_key(tmp_path):
                 first = memory()
             while len(list(tmp_path.glob("*.mcap"))) > 2:
                 next(tmp_path.glob("*.mcap")).unlink()
-        assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
+        assert memory() - first < GROWTH, (
+            f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
+        )
         # An honest one is served as ever.
         rollouts.next_batch(2, 0.0)
         hub.publish_weights(bundle(1), 1)
         fine = Message(meta={"actor": "77777.a", "incarnation": "1", "ticket": "t"})
         assert raw.query(KEYS.ticket("77777.a"), fine, timeout=10.0).meta["version"] == 1
-        raw.query(KEYS.act, Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY), timeout=10.0)
+        raw.query(
+            KEYS.act,
+            Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
+            timeout=10.0,
+        )
         assert not recorder.error and recorder.messages and recorder.damaged
-    print(f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out")
+    print(
+        f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out"
+    )
 
 
 # --- files ---
@@ -264,7 +324,10 @@ def resealed(data):
     with contextlib.suppress(ValueError, KeyError, TypeError):
         length = int.from_bytes(data[:8], "little")
         header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
-        header = {"__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]}, **header}
+        header = {
+            "__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]},
+            **header,
+        }
         text = json.dumps(header, separators=(",", ":")).encode()
         text = text.replace(b"00000000", b"%08x" % zlib.crc32(text, zlib.crc32(section)), 1)
         return len(text).to_bytes(8, "little") + text + section
@@ -280,7 +343,10 @@ def odd_file(rng, name, data):
         return json.dumps(odd_tree(rng, json.loads(data))).encode()
     if name == "motion":
         arrays = dict(np.load(io.BytesIO(data)))
-        np.savez(made := io.BytesIO(), **{**arrays, "meta": json.dumps(odd_tree(rng, json.loads(str(arrays["meta"]))))})
+        np.savez(
+            made := io.BytesIO(),
+            **{**arrays, "meta": json.dumps(odd_tree(rng, json.loads(str(arrays["meta"]))))},
+        )
         return made.getvalue()
     return mutated(rng, decode(data)) if name in SEALED else odd_bytes(rng, data)
 
@@ -297,7 +363,9 @@ def _files(folder):
     (folder / "config").write_text(to_json(RunConfig()))
     (folder / "x.bvh").write_text(BVH)
     (folder / "x.csv").write_text("x,y,z,w,x,y,z\n" + "0,0,0,1,0,0,0\n" * 3)
-    np.savez(folder / "x.npz", position=np.zeros((2, 3)), quaternion=np.tile([1.0, 0, 0, 0], (2, 1)))
+    np.savez(
+        folder / "x.npz", position=np.zeros((2, 3)), quaternion=np.tile([1.0, 0, 0, 0], (2, 1))
+    )
     (folder / "pickle").write_bytes(pickle.dumps({"a": [1, "x", np.zeros(3)], "b": (None, 2.5)}, 4))
     journal = Journal(folder / "journal")
     for i in range(5):
@@ -333,7 +401,8 @@ def test_mutated_files_at_every_loader(tmp_path):
     valid = {path: path.read_bytes() for path in loaders}
     for path, load in loaders.items():
         load(path)
-    often = [0.1 if path.name == "pickle" else 1.0 for path in loaders]  # a process reads each pickle
+    # A process reads each pickle
+    often = [0.1 if path.name == "pickle" else 1.0 for path in loaders]
     began, first, count, refused = time.monotonic(), 0, 0, 0
     with no_tracebacks():
         while (now := time.monotonic()) < began + SECONDS or count < 50 * len(loaders):
@@ -348,7 +417,9 @@ def test_mutated_files_at_every_loader(tmp_path):
             except Exception as error:
                 kept = tmp_path / "failed"
                 kept.write_bytes(data)
-                raise AssertionError(f"{path.name}, seed {SEED}, number {count}: {error!r}, see {kept}") from error
+                raise AssertionError(
+                    f"{path.name}, seed {SEED}, number {count}: {error!r}, see {kept}"
+                ) from error
             assert time.monotonic() - now < LONGEST, path.name
             count += 1
             if not first and time.monotonic() > began + SECONDS / 3:

@@ -29,20 +29,37 @@ def congrasp(*arguments):
 
 
 def test_the_shipped_policy_grasps_on_warp_as_on_a_cpu(tmp_path):
-    congrasp("evaluate", "--table", "single", "composed", "--episodes", 1000, "--physics", "warp",
-             "--json", tmp_path / "rows.json")  # fmt: skip
-    rows = {row["constraint"]: row for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
+    congrasp(
+        "evaluate",
+        "--table",
+        "single",
+        "composed",
+        "--episodes",
+        1000,
+        "--physics",
+        "warp",
+        "--json",
+        tmp_path / "rows.json",
+    )
+    rows = {
+        row["constraint"]: row for row in json.loads((tmp_path / "rows.json").read_text())["rows"]
+    }
     assert len(rows) == 6
     for name, row in rows.items():
-        # Four standard errors of 1,000 episodes below what docs/notes/training.md has for the rarest success, 97.7 %.
+        # Four standard errors of 1,000 episodes below what docs/notes/training.md has for the
+        # rarest success, 97.7 %.
         assert row["success"] > 0.958, name
         assert row["diverged"] < 0.005, name
 
 
 def test_training_on_the_device_stops_and_goes_on(tmp_path):
-    """Learner and actor in one process, rollouts that stay on the device, and a second start from the checkpoint."""
+    """Learner and actor in one process, rollouts that stay on the device, and a second start from
+    the checkpoint.
+    """
     run = ["train", "--run-dir", tmp_path / "run", "--evaluation", 0, "--physics", "warp"]
-    congrasp(*run, "--preset", "human", "--environments", 512, "--objects.count", 16, "--updates", 3)
+    congrasp(
+        *run, "--preset", "human", "--environments", 512, "--objects.count", 16, "--updates", 3
+    )
     first = bundles.load(tmp_path / "run" / POLICY_FILE)
     congrasp(*run, "--resume", "--updates", 5)
     second = bundles.load(tmp_path / "run" / POLICY_FILE)
@@ -53,6 +70,16 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
 def test_two_ranks_train_on_two_gpus(tmp_path, gpus):
     if gpus < 2:
         pytest.skip("two ranks need two GPUs")
-    run = ["train", "--run-dir", tmp_path / "run", "--evaluation", 0, "--physics", "warp", "--ranks", 2]
+    run = [
+        "train",
+        "--run-dir",
+        tmp_path / "run",
+        "--evaluation",
+        0,
+        "--physics",
+        "warp",
+        "--ranks",
+        2,
+    ]
     congrasp(*run, "--preset", "human", "--environments", 256, "--objects.count", 8, "--updates", 2)
     assert bundles.load(tmp_path / "run" / POLICY_FILE).transitions == 2 * 2 * 256 * 75

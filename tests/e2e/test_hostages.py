@@ -1,4 +1,5 @@
-"""One who does not read, asks without end, says nothing, sends too much or is slow holds nobody else up.
+"""One who does not read, asks without end, says nothing, sends too much or is slow holds nobody
+else up.
 
 The attackers are programs in processes of their own (`tests.benchmarks.attackers`).
 """
@@ -60,7 +61,9 @@ def _updates(link, run, parameters, count):
 
 
 def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
-    """With answers that wait for their readers, both workers of the server would stand still for seconds."""
+    """With answers that wait for their readers, both workers of the server would stand still for
+    seconds.
+    """
     query = tmp_path / "query"
     query.write_bytes(encode(Message()))
     with (
@@ -91,7 +94,10 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
     pulled = []
 
     def pull(slow):
-        with urls.connect(slow, "actor") as transport, ActorLink(transport, "r", "slow", request_timeout=5.0) as link:
+        with (
+            urls.connect(slow, "actor") as transport,
+            ActorLink(transport, "r", "slow", request_timeout=5.0) as link,
+        ):
             link.config(10)
             pulled.append(link.weights(-1))
 
@@ -114,7 +120,9 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
 
 @pytest.mark.parametrize("flow", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_silent_connections_keep_nobody_out(flow):
-    """Connections that show nothing for seconds are closed, and hundreds of them are not too many."""
+    """Connections that show nothing for seconds are closed, and hundreds of them are not too
+    many.
+    """
     with learner(1000) as (endpoint, _), attacked("silent", shifted(endpoint, flow), "r"):
         time.sleep(1.0)
         for _ in range(5):
@@ -149,7 +157,10 @@ def test_rollouts_that_no_actor_makes_are_refused_before_they_are_in_memory(tmp_
     with urls.listen(endpoint, "learner", longest_rollout=1 << 20) as transport:
         taken = []
         transport.serve(KEYS.rollouts, lambda key, message: taken.append(key) or Message())
-        with urls.connect(endpoint, "actor") as actor, attacked("huge", shifted(endpoint, 1), "r", key):
+        with (
+            urls.connect(endpoint, "actor") as actor,
+            attacked("huge", shifted(endpoint, 1), "r", key),
+        ):
             send = lambda: actor.query(KEYS.rollout("a"), rollout(), timeout=5)  # noqa: E731
             assert _grown(send) < 100e6
     assert set(taken) == {KEYS.rollout("a")}

@@ -1,4 +1,6 @@
-"""Resume is resume: a learner that is killed with SIGKILL and goes on ends with the bits of one that was not."""
+"""Resume is resume: a learner that is killed with SIGKILL and goes on ends with the bits of one
+that was not.
+"""
 
 import dataclasses
 import json
@@ -21,7 +23,8 @@ from tests.learner.made_up_actor import random_steps
 from tests.learner.test_process import CONFIG
 
 UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
-# The stream is fixed by `feed` alone: what a write-ahead log takes up would be used in another order.
+# The stream is fixed by `feed` alone: what a write-ahead log takes up would be used in another
+# order.
 RUN = dataclasses.replace(CONFIG, updates=UPDATES, checkpoint_every=EVERY, write_ahead=False)
 STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.rollouts_per_update
 
@@ -35,7 +38,10 @@ def rollout(number, bundle):
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
     }
     who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
-    return Message(arrays, {**who, **{name: meta[name] for name in ("version", "run_id", "schema")}, "steps": 8})
+    return Message(
+        arrays,
+        {**who, **{name: meta[name] for name in ("version", "run_id", "schema")}, "steps": 8},
+    )
 
 
 def feed(hub, ended):
@@ -43,7 +49,9 @@ def feed(hub, ended):
     keys, known, transport = Keys(RUN.name), None, MemoryTransport(hub)
     while not ended.is_set():
         try:
-            bundle = transport.query(keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5)
+            bundle = transport.query(
+                keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5
+            )
             if not bundle.arrays or bundle.meta["version"] == known:
                 time.sleep(0.005)
                 continue
@@ -52,7 +60,10 @@ def feed(hub, ended):
                 message = rollout(number, bundle)
                 # A query whose answer came too late is repeated: its rollout had arrived.
                 arrived = ("accepted", "duplicate")
-                while transport.query(keys.rollout("a"), message, timeout=5).meta["outcome"] not in arrived:
+                while (
+                    transport.query(keys.rollout("a"), message, timeout=5).meta["outcome"]
+                    not in arrived
+                ):
                     time.sleep(0.005)
             known = bundle.meta["version"]
         except TransportError:
@@ -66,9 +77,15 @@ def train(run_dir, resume=False, killed_after=0):
     feeder.start()
     with MemoryTransport(hub) as transport:
         run_learner(
-            run_dir, open_run(run_dir), transport, stop_event=threading.Event(), resume=resume,
-            on_update=lambda values: values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL),
-        )  # fmt: skip
+            run_dir,
+            open_run(run_dir),
+            transport,
+            stop_event=threading.Event(),
+            resume=resume,
+            on_update=lambda values: (
+                values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL)
+            ),
+        )
     ended.set()
     feeder.join(10.0)
 
@@ -77,10 +94,17 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
     for name in ("straight", "killed"):
         create_run(tmp_path / name, RUN)
     train(tmp_path / "straight")
-    script = "import pathlib, sys; from tests.e2e.test_resume import train; train(pathlib.Path(sys.argv[1]), "
+    script = (
+        "import pathlib, sys; from tests.e2e.test_resume import train; "
+        "train(pathlib.Path(sys.argv[1]), "
+    )
     done = python("-c", script + f"killed_after={KILLED_AFTER})", tmp_path / "killed", timeout=240)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert (tmp_path / "killed" / "checkpoints" / "latest").resolve().name.endswith(f"{EVERY}.safetensors")
+    assert (
+        (tmp_path / "killed" / "checkpoints" / "latest")
+        .resolve()
+        .name.endswith(f"{EVERY}.safetensors")
+    )
     train(tmp_path / "killed", resume=True)
 
     ends = []
@@ -90,7 +114,13 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         ends.append((json.loads(arrays.pop("meta").tobytes()), arrays))
     (straight_meta, straight_arrays), (meta, arrays) = ends
     # Parameters, the optimiser's moments, rate, random key, normalisers, and counters.
-    assert {name.split("/")[0] for name in arrays} >= {"params", "optimizer", "key", "observation", "value"}
+    assert {name.split("/")[0] for name in arrays} >= {
+        "params",
+        "optimizer",
+        "key",
+        "observation",
+        "value",
+    }
     assert "optimizer/hyperparams/learning_rate" in arrays
     assert arrays.keys() == straight_arrays.keys() and len(arrays) > 20
     for name, array in arrays.items():
@@ -100,11 +130,14 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
     books, straight_books = meta["hubs"][0]["counters"], straight_meta["hubs"][0]["counters"]
     lost = (KILLED_AFTER - EVERY) * BATCH
     assert (books["undone"], straight_books["undone"]) == (lost, 0)
-    # All else as if nothing had happened; how many rollouts were sent again depends on how slow the answers were.
+    # All else as if nothing had happened; how many rollouts were sent again depends on how slow the
+    # answers were.
     assert {**books, "undone": 0, "duplicate": straight_books["duplicate"]} == straight_books
     assert meta["skipped"] == KILLED_AFTER - EVERY + 1  # versions are never given out twice
     standing, undone = replay(
-        json.loads(line) for line in journal_path(tmp_path / "killed", "0").read_text().split("\n") if line
+        json.loads(line)
+        for line in journal_path(tmp_path / "killed", "0").read_text().split("\n")
+        if line
     )
     assert [use.sequence for use in standing] == [*range(UPDATES * BATCH)]
     assert len(undone) == lost

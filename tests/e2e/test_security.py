@@ -1,4 +1,6 @@
-"""Who gets in, and what those inside may do: real sessions over TLS, with good, bad and no certificates."""
+"""Who gets in, and what those inside may do: real sessions over TLS, with good, bad and no
+certificates.
+"""
 
 import contextlib
 import dataclasses
@@ -69,7 +71,9 @@ class Run:
         mine = Credentials(self.certs / name, name.split(".")[0])
         options = {"flows": ("policy",)} | options if endpoint == self.policy else options
         endpoint = endpoint or self.endpoint
-        return self.stack.enter_context(ZenohTransport(connect=[endpoint], credentials=mine, **options))
+        return self.stack.enter_context(
+            ZenohTransport(connect=[endpoint], credentials=mine, **options)
+        )
 
 
 @contextlib.contextmanager
@@ -78,10 +82,14 @@ def listening(certs):
     endpoint, policy = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
-        transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1))
+        transport = stack.enter_context(
+            ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1)
+        )
         hub, rollouts = learner_hub(transport, "safe")
         hub.publish_weights(bundle(0), 0)
-        serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
+        serving = stack.enter_context(
+            ZenohTransport(listen=[policy], credentials=server, flows=("policy",))
+        )
         for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
         yield Run(certs, endpoint, policy, hub, rollouts, transport, stack)
@@ -139,21 +147,28 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(fresh):
             assert link.upload(rollout(), ticket).result(10) == "accepted"
         assert len(fresh.rollouts.next_batch(2, 5)) == 2
         fresh.hub.publish_weights(bundle(1), 1)
-        # The announcement arrives by itself: without one, a link that holds the newest version asks for nothing.
+        # The announcement arrives by itself: without one, a link that holds the newest version asks
+        # for nothing.
         eventually(lambda: (new := link.weights(0)) and new.meta["version"] == 1)
         key = KEYS.log("metrics", "actor", ME)
         transport.publish(key, Message(meta={"values": {}}))
         eventually(lambda: (received := logs.receive(5)) and received[0] == key)
-        status = eventually(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
+        status = eventually(
+            lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now
+        )
         assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
         assert status["counters"]["accepted"] == 2 and status["counters"]["rejected"] == 0
     assert (
-        server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
+        server.query(
+            KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5
+        ).meta["version"]
         == 1
     )
     with PolicyClient(fresh.policy, "safe", certs=fresh.certs / "client.0") as client:
         assert client.health()["ready"]
-    assert answers(fresh.connect("client.0", fresh.policy), KEYS.act_for("0.c")).meta["served"] == KEYS.act_for("0.c")
+    assert answers(fresh.connect("client.0", fresh.policy), KEYS.act_for("0.c")).meta[
+        "served"
+    ] == KEYS.act_for("0.c")
     assert answers(fresh.connect("observer.0", fresh.policy), KEYS.health)
 
 
@@ -167,7 +182,10 @@ def test_an_actor_whose_certificate_came_later_works_at_once(run):
 
 def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    mine, learner = Credentials(certs / "actor.0", "actor"), Credentials(certs / "learner.0", "learner")
+    mine, learner = (
+        Credentials(certs / "actor.0", "actor"),
+        Credentials(certs / "learner.0", "learner"),
+    )
     flows = ("control",)
     server = ZenohTransport(listen=[endpoint], credentials=learner, flows=flows)
     with ZenohTransport(connect=[endpoint], credentials=mine, flows=flows) as actor:
@@ -176,7 +194,9 @@ def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
             for keys in (KEYS.tickets, KEYS.status):
                 server.serve(keys, lambda key, request: Message(meta={"here": True}))
             eventually(lambda: answers(actor, KEYS.ticket(ME)))
-            assert answers(actor, KEYS.ticket(OTHER)) is None and answers(actor, KEYS.status) is None
+            assert (
+                answers(actor, KEYS.ticket(OTHER)) is None and answers(actor, KEYS.status) is None
+            )
 
 
 # --- what is not allowed ---
@@ -206,14 +226,20 @@ MAY = {
     "client.0": set(),
     "learner.0": set(),
 }
-MAY_ASK_THE_POLICY = {"client.0": {KEYS.act_for("0.c"), KEYS.health}, "observer.0": {KEYS.health}, "actor.0": set()}
+MAY_ASK_THE_POLICY = {
+    "client.0": {KEYS.act_for("0.c"), KEYS.health},
+    "observer.0": {KEYS.health},
+    "actor.0": set(),
+}
 
 
 def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(run):
     learner = str(run.transport._session(KEYS.config).info.zid())
 
     def answered(transport, key):
-        replies = transport._session(key).get(key.replace("{learner}", learner), FifoChannel(8), timeout=3.0)
+        replies = transport._session(key).get(
+            key.replace("{learner}", learner), FifoChannel(8), timeout=3.0
+        )
         return bool(list(replies))  # an empty question is answered with an error in words
 
     for who, may in MAY.items():
@@ -227,31 +253,68 @@ def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(r
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
 def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
-    """Forged weights, announcements, logs and answers reach neither the learner nor those connected to it."""
+    """Forged weights, announcements, logs and answers reach neither the learner nor those connected
+    to it.
+    """
     thief, victim, observer = run.connect(who), run.connect("actor.1"), run.connect("observer.0")
-    announcements, logs = victim.subscribe(KEYS.announcement, depth=64), observer.subscribe(KEYS.logs, depth=64)
-    here = run.transport.subscribe("congrasp/safe/**", depth=64), run.transport.subscribe(KEYS.logs, depth=64)
+    announcements, logs = (
+        victim.subscribe(KEYS.announcement, depth=64),
+        observer.subscribe(KEYS.logs, depth=64),
+    )
+    here = (
+        run.transport.subscribe("congrasp/safe/**", depth=64),
+        run.transport.subscribe(KEYS.logs, depth=64),
+    )
     asked = []
-    for key in (KEYS.weights, KEYS.status, KEYS.config, KEYS.ticket(OTHER), KEYS.rollout(OTHER), KEYS.act):
+    for key in (
+        KEYS.weights,
+        KEYS.status,
+        KEYS.config,
+        KEYS.ticket(OTHER),
+        KEYS.rollout(OTHER),
+        KEYS.act,
+    ):
         thief.serve(key, lambda key, request: asked.append(key) or Message(meta={"forged": True}))
     time.sleep(0.3)
-    for key in (KEYS.announcement, KEYS.log("metrics", "learner", "0"), KEYS.log("event", "actor", OTHER)):
+    for key in (
+        KEYS.announcement,
+        KEYS.log("metrics", "learner", "0"),
+        KEYS.log("event", "actor", OTHER),
+    ):
         thief.publish(key, Message(meta={"forged": True}))
-    assert heard(announcements) == heard(logs, 0.1) == heard(here[0], 0.1) == heard(here[1], 0.1) == []
+    assert (
+        heard(announcements) == heard(logs, 0.1) == heard(here[0], 0.1) == heard(here[1], 0.1) == []
+    )
     assert "forged" not in observer.query(KEYS.status, Message(), timeout=5).meta
     assert (
-        "forged" not in victim.query(KEYS.weights_for("actor", OTHER), Message(meta={"newer_than": -1}), timeout=5).meta
+        "forged"
+        not in victim.query(
+            KEYS.weights_for("actor", OTHER), Message(meta={"newer_than": -1}), timeout=5
+        ).meta
     )
     assert answers(run.transport, KEYS.act) is None and asked == []
 
 
 def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
-    actor, victim, observer = fresh.connect("actor.0"), fresh.connect("actor.1"), fresh.connect("observer.0")
-    everything = [actor.subscribe(key, depth=64) for key in ("congrasp/**", KEYS.logs, "congrasp/safe/alive/**")]
+    actor, victim, observer = (
+        fresh.connect("actor.0"),
+        fresh.connect("actor.1"),
+        fresh.connect("observer.0"),
+    )
+    everything = [
+        actor.subscribe(key, depth=64)
+        for key in ("congrasp/**", KEYS.logs, "congrasp/safe/alive/**")
+    ]
     seen = []
     actor.watch_alive(KEYS.everyone, lambda key, alive: seen.append(key))
     victim.declare_alive(KEYS.alive("actor", OTHER, "01"))
-    for name, session in ((OTHER, victim), ("1.c", victim), (ME, observer), (ME, victim), ("learner", victim)):
+    for name, session in (
+        (OTHER, victim),
+        ("1.c", victim),
+        (ME, observer),
+        (ME, victim),
+        ("learner", victim),
+    ):
         session.publish(KEYS.log("event", "actor", name), Message())
     for role, name in (("actor", OTHER), ("learner", "0"), ("actor", "a"), ("actor", ME)):
         actor.declare_alive(KEYS.alive(role, name, "66"))
@@ -273,7 +336,9 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
 
 def test_a_client_hears_no_logs(run):
     logs = run.connect("client.0").subscribe(KEYS.logs, depth=64)
-    also = run.connect("client.0", run.policy, flows=("policy",)).subscribe("congrasp/*/policy/**", depth=64)
+    also = run.connect("client.0", run.policy, flows=("policy",)).subscribe(
+        "congrasp/*/policy/**", depth=64
+    )
     run.connect("actor.0").publish(KEYS.log("metrics", "actor", ME), Message())
     run.transport.publish(KEYS.log("metrics", "learner", "0"), Message())
     assert heard(logs) == heard(also, 0.1) == []
@@ -303,17 +368,29 @@ def test_another_mode_of_connecting_gives_no_more(run, mode):
         assert answers(run.transport, KEYS.act) is None
         assert logs.try_recv() is None and all(one.try_recv() is None for one in stolen)
         for key in (KEYS.status, KEYS.ticket(OTHER), "congrasp/**"):
-            assert not [reply for reply in session.get(key, FifoChannel(8), timeout=1.0) if reply.ok]
+            assert not [
+                reply for reply in session.get(key, FifoChannel(8), timeout=1.0) if reply.ok
+            ]
 
 
 def test_every_right_is_a_key_of_a_run():
     """A right for a key that does not exist any more would be an open door without a room."""
     real = {
-        KEYS.config, KEYS.status, KEYS.announcement, KEYS.health, KEYS.logs, KEYS.act_for("name"),
-        KEYS.weights_for("actor", "name"), KEYS.weights_for("server", "name"),
-        KEYS.ticket("{name}".strip("{}")), KEYS.rollout("name"), KEYS.alive("actor", "name", "x"),
-        KEYS.alive("server", "x", "x"), KEYS.alive("recorder", "x", "x"), KEYS.log("x", "actor", "name"),
-    }  # fmt: skip
+        KEYS.config,
+        KEYS.status,
+        KEYS.announcement,
+        KEYS.health,
+        KEYS.logs,
+        KEYS.act_for("name"),
+        KEYS.weights_for("actor", "name"),
+        KEYS.weights_for("server", "name"),
+        KEYS.ticket("{name}".strip("{}")),
+        KEYS.rollout("name"),
+        KEYS.alive("actor", "name", "x"),
+        KEYS.alive("server", "x", "x"),
+        KEYS.alive("recorder", "x", "x"),
+        KEYS.log("x", "actor", "name"),
+    }
     real = {key.removeprefix("congrasp/safe/").replace("/x", "/*") for key in real}
     given = {
         key.replace("{name}", "name")
@@ -340,17 +417,29 @@ def test_wrong_credentials_do_not_get_in(run, evil, tmp_path):
     _refused(run.endpoint, Credentials(evil / "actor.0", "actor"), "not trusted: .*authority")
     mixed = tmp_path / "mixed"  # knows the right authority, but is certified by another
     mixed.mkdir()
-    for name, source in (("ca.crt", run.certs), ("tls.crt", evil / "actor.0"), ("tls.key", evil / "actor.0")):
+    for name, source in (
+        ("ca.crt", run.certs),
+        ("tls.crt", evil / "actor.0"),
+        ("tls.key", evil / "actor.0"),
+    ):
         (mixed / name).write_bytes((source / name).read_bytes())
     _refused(run.endpoint, Credentials(mixed, "actor"), "refuses the certificate .*: not accepted")
-    _refused(run.endpoint, Credentials(run.certs / "actor.9", "actor"), "refuses the certificate .*: expired")
+    _refused(
+        run.endpoint,
+        Credentials(run.certs / "actor.9", "actor"),
+        "refuses the certificate .*: expired",
+    )
     _refused(run.endpoint, None, "requires certificates.*Pass --certs")
     _refused(run.endpoint, Credentials(tmp_path, "actor"), "cannot be used")
 
 
-@pytest.mark.parametrize(("folder", "who"), [("certs", "actor.0"), ("evil", "learner.0"), ("certs", "actor.9")])
+@pytest.mark.parametrize(
+    ("folder", "who"), [("certs", "actor.0"), ("evil", "learner.0"), ("certs", "actor.9")]
+)
 def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
-    """A listener that another authority certified, or whose certificate is not for listening, gets no connection."""
+    """A listener that another authority certified, or whose certificate is not for listening, gets
+    no connection.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     mine = Credentials(request.getfixturevalue(folder) / who, "learner")
     with ZenohTransport(listen=[endpoint], credentials=mine):
@@ -358,7 +447,9 @@ def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
 
 
 def test_a_certificate_serves_the_run_that_it_names(run, certs):
-    """Another run's certificates of the same authority open the connection, and nothing behind it."""
+    """Another run's certificates of the same authority open the connection, and nothing behind
+    it.
+    """
     mine = {
         "actor": (KEYS.config, KEYS.ticket("20.a"), KEYS.rollout("20.a"), Keys("other").config),
         "observer": (KEYS.config, KEYS.status, Keys("other").status),
@@ -370,40 +461,70 @@ def test_a_certificate_serves_the_run_that_it_names(run, certs):
         with _raw_session(run.endpoint, folder, "client") as session:
             for key in keys:
                 time.sleep(0.02)
-                assert not list(session.get(key, FifoChannel(8), payload=encode(Message()), timeout=3.0)), key
+                assert not list(
+                    session.get(key, FifoChannel(8), payload=encode(Message()), timeout=3.0)
+                ), key
     assert answers(run.connect("observer.0"), KEYS.status)
 
 
 def test_a_policy_server_is_not_taken_for_the_learner(certs):
-    """Its certificate is one for listening, and of the same authority: those who want the learner see whose it is."""
+    """Its certificate is one for listening, and of the same authority: those who want the learner
+    see whose it is.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")):
         for role in ("actor", "observer", "server"):
-            _refused(endpoint, Credentials(certs / f"{role}.0", role), "server.0', which may not listen for safe")
+            _refused(
+                endpoint,
+                Credentials(certs / f"{role}.0", role),
+                "server.0', which may not listen for safe",
+            )
     issue(certs, "learner", run="other", number=20, force=True)
-    with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.20", "learner")):
-        _refused(endpoint, Credentials(certs / "actor.0", "actor"), "other.learner.20', which may not listen for safe")
+    with ZenohTransport(
+        listen=[endpoint], credentials=Credentials(certs / "learner.20", "learner")
+    ):
+        _refused(
+            endpoint,
+            Credentials(certs / "actor.0", "actor"),
+            "other.learner.20', which may not listen for safe",
+        )
 
 
 def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
-    """Zenoh connects again by itself, without asking us: the rules of who connects hold for whom it finds then."""
+    """Zenoh connects again by itself, without asking us: the rules of who connects hold for whom it
+    finds then.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    learner = ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "learner.0", "learner"))
+    learner = ZenohTransport(
+        listen=[endpoint], credentials=Credentials(certs / "learner.0", "learner")
+    )
     learner.serve(KEYS.config, lambda key, request: Message())
-    with ZenohTransport(connect=[endpoint], credentials=Credentials(certs / "actor.0", "actor")) as actor:
+    with ZenohTransport(
+        connect=[endpoint], credentials=Credentials(certs / "actor.0", "actor")
+    ) as actor:
         assert answers(actor, KEYS.config)
         learner.close()
         asked = []
-        with ZenohTransport(listen=[endpoint], credentials=Credentials(certs / "server.0", "server")) as thief:
+        with ZenohTransport(
+            listen=[endpoint], credentials=Credentials(certs / "server.0", "server")
+        ) as thief:
             for key in (KEYS.config, KEYS.ticket(ME)):
                 thief.serve(key, lambda key, request: asked.append(key) or Message())
             eventually(lambda: list(thief._sessions.get("control").info.links()))
             time.sleep(0.3)
-            assert answers(actor, KEYS.config) is None and answers(actor, KEYS.ticket(ME)) is None and asked == []
+            assert (
+                answers(actor, KEYS.config) is None
+                and answers(actor, KEYS.ticket(ME)) is None
+                and asked == []
+            )
 
 
 def test_who_is_revoked_is_out_and_the_others_stay(fresh):
-    thief, actor, observer = fresh.connect("actor.1"), fresh.connect("actor.0"), fresh.connect("observer.0")
+    thief, actor, observer = (
+        fresh.connect("actor.1"),
+        fresh.connect("actor.0"),
+        fresh.connect("observer.0"),
+    )
     logs = observer.subscribe(KEYS.logs, depth=64)
     thief.declare_alive(KEYS.alive("actor", OTHER, "66"))
     actor.declare_alive(KEYS.alive("actor", ME, "01"))
@@ -424,9 +545,15 @@ def test_who_is_revoked_is_out_and_the_others_stay(fresh):
             ticket = eventually(lambda: link.acquire_ticket(5))
             assert link.upload(rollout(), ticket).result(20) == "accepted"
             thief.publish(KEYS.log("event", "actor", OTHER), Message())
-            eventually(lambda: actor.publish(KEYS.log("event", "actor", ME), Message()) or logs.receive(0.3))
+            eventually(
+                lambda: (
+                    actor.publish(KEYS.log("event", "actor", ME), Message()) or logs.receive(0.3)
+                )
+            )
             assert answers(thief, KEYS.ticket(OTHER)) is None and out()
-            with pytest.raises(TransportError, match=r"may have .* revoked the certificate safe\.actor\.1\."):
+            with pytest.raises(
+                TransportError, match=r"may have .* revoked the certificate safe\.actor\.1\."
+            ):
                 thief.query(KEYS.config, Message(), timeout=5)
         finally:
             for path in fresh.certs.rglob("revoked"):
@@ -456,7 +583,10 @@ except CongraspError as error:
 def _started(*command):
     """A process, once it has printed its first line."""
     process = subprocess.Popen(
-        [sys.executable, *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, *map(str, command)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout.readline(), process.stderr.read()
     return process
@@ -471,16 +601,33 @@ def forgiven(certs):
 
 
 @pytest.mark.slow
-def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(forgiven, fresh, certs):
-    status = ["-m", "congrasp", "status", "--watch", "--json", "--run", "safe", "--connect", fresh.endpoint]
-    processes = _started("-c", ACTOR, fresh.endpoint, certs / "actor.0"), _started(*status, "--certs", certs)
+def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(
+    forgiven, fresh, certs
+):
+    status = [
+        "-m",
+        "congrasp",
+        "status",
+        "--watch",
+        "--json",
+        "--run",
+        "safe",
+        "--connect",
+        fresh.endpoint,
+    ]
+    processes = (
+        _started("-c", ACTOR, fresh.endpoint, certs / "actor.0"),
+        _started(*status, "--certs", certs),
+    )
     try:
         with PolicyClient(fresh.policy, "safe", certs=certs / "client.0") as client:
             revoke(certs, "learner", 0)
             for process in processes:
                 _, said = process.communicate(timeout=40)
                 assert process.returncode
-                assert "congrasp: error: The listener's certificate safe.learner.0 is revoked" in said
+                assert (
+                    "congrasp: error: The listener's certificate safe.learner.0 is revoked" in said
+                )
                 assert "Traceback" not in said
             assert client.health()["ready"]  # the policy server is another
     finally:
@@ -497,15 +644,21 @@ def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, fresh,
 
     eventually(client._sessions.closed.is_set)
     for _ in range(2):
-        with pytest.raises(CongraspError, match=r"The listener\'s certificate safe\.server\.0 is revoked"):
+        with pytest.raises(
+            CongraspError, match=r"The listener\'s certificate safe\.server\.0 is revoked"
+        ):
             client.query(key, Message(), timeout=5)
 
 
 def test_a_certificate_for_another_host_is_not_trusted(certs):
     """The learner's certificate names the loopback addresses alone; 127.0.0.2 is another host."""
     port = free_port()
-    with ZenohTransport(listen=[f"tls/127.0.0.2:{port}"], credentials=Credentials(certs / "learner.0", "learner")):
-        _refused(f"tls/127.0.0.2:{port}", Credentials(certs / "actor.0", "actor"), "not trusted.*--host")
+    with ZenohTransport(
+        listen=[f"tls/127.0.0.2:{port}"], credentials=Credentials(certs / "learner.0", "learner")
+    ):
+        _refused(
+            f"tls/127.0.0.2:{port}", Credentials(certs / "actor.0", "actor"), "not trusted.*--host"
+        )
 
 
 def test_a_connection_ends_when_its_certificate_expires(run):
@@ -521,10 +674,14 @@ def test_a_connection_ends_when_its_certificate_expires(run):
 def test_what_is_too_long_or_too_often_is_dropped(fresh):
     observer, actor = fresh.connect("observer.0"), fresh.connect("actor.0")
     long = Message({"x": np.zeros(100_000, np.uint8)})
-    assert answers(actor, KEYS.config, long) is None and answers(actor, KEYS.ticket(ME), long) is None
+    assert (
+        answers(actor, KEYS.config, long) is None and answers(actor, KEYS.ticket(ME), long) is None
+    )
     session = observer._session(KEYS.status)
     question = encode(Message())
-    channels = [session.get(KEYS.status, FifoChannel(2), payload=question, timeout=5.0) for _ in range(300)]
+    channels = [
+        session.get(KEYS.status, FifoChannel(2), payload=question, timeout=5.0) for _ in range(300)
+    ]
     answered = sum(reply.ok is not None for channel in channels for reply in channel)
     assert 1 <= answered < 300
     time.sleep(0.1)

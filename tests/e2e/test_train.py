@@ -1,4 +1,6 @@
-"""A whole small run of real processes over Zenoh whose actor and learner are killed, and which a signal ends."""
+"""A whole small run of real processes over Zenoh whose actor and learner are killed, and which a
+signal ends.
+"""
 
 import json
 import signal
@@ -17,9 +19,34 @@ pytestmark = pytest.mark.timeout(600)
 ENVIRONMENTS, STEPS = 8, 40
 # With objects, environments and networks of the suite's sizes, whose programs are compiled already.
 SMALL = (
-    *("--environments", str(ENVIRONMENTS), "--rollout-steps", str(STEPS), "--checkpoint-every", "3"),
-    *("--log-rollout-worlds", "3", "--episode-every", "1", "--objects.count", "4", "--objects.families", "box"),
-    *("--network.hidden", "16", "--network.encoder", "4", "--ppo.epochs", "1", "--ppo.minibatches", "2"),
+    *(
+        "--environments",
+        str(ENVIRONMENTS),
+        "--rollout-steps",
+        str(STEPS),
+        "--checkpoint-every",
+        "3",
+    ),
+    *(
+        "--log-rollout-worlds",
+        "3",
+        "--episode-every",
+        "1",
+        "--objects.count",
+        "4",
+        "--objects.families",
+        "box",
+    ),
+    *(
+        "--network.hidden",
+        "16",
+        "--network.encoder",
+        "4",
+        "--ppo.epochs",
+        "1",
+        "--ppo.minibatches",
+        "2",
+    ),
     *("--rollouts-per-update", "2", "--task.constraints", "heading", "pose"),  # with references
 )
 
@@ -49,7 +76,9 @@ def kill_an_actor_and_the_learner(run: Run, count: int) -> None:
     learner.wait()
     assert version(run) >= before
     updates(run, 3)  # resumed, with rising versions
-    assert {child.pid for child in run.children("actor")} == survivors  # which did not have to restart
+    assert {
+        child.pid for child in run.children("actor")
+    } == survivors  # which did not have to restart
 
 
 @pytest.fixture
@@ -88,9 +117,18 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
     assert any(name.endswith("episode/return") for name in metrics)
     assert next(read_episodes(run.run_dir)).meta["hand"] == "human"
     sampled = next(read_rollouts(run.run_dir))
-    assert sampled.arrays["observation"].shape == (STEPS, 3, sum(size for _, size in sampled.meta["layout"]))
-    assert sampled.arrays["action"].shape == (STEPS, 3, 26) and sampled.arrays["last_observation"].shape[0] == 3
-    assert np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == ENVIRONMENTS
+    assert sampled.arrays["observation"].shape == (
+        STEPS,
+        3,
+        sum(size for _, size in sampled.meta["layout"]),
+    )
+    assert (
+        sampled.arrays["action"].shape == (STEPS, 3, 26)
+        and sampled.arrays["last_observation"].shape[0] == 3
+    )
+    assert (
+        np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == ENVIRONMENTS
+    )
 
 
 @pytest.mark.slow

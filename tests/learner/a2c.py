@@ -1,6 +1,8 @@
-"""Advantage actor-critic (Mnih et al. 2016, arXiv 1602.01783): one step on a whole batch, no epochs, no clipping.
+"""Advantage actor-critic (Mnih et al. 2016, arXiv 1602.01783): one step on a whole batch, no
+epochs, no clipping.
 
-It shares nothing with PPO but the networks and the advantages, and learns from less: it needs no log probabilities.
+It shares nothing with PPO but the networks and the advantages, and learns from less: it needs no
+log probabilities.
 """
 
 import functools
@@ -20,7 +22,13 @@ from congrasp.learner.algorithms.protocol import (
     partition_specs,
     random_policy,
 )
-from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import (
+    REPLICATED,
+    Collectives,
+    shard,
+    shard_map,
+    unreplicate,
+)
 
 SCHEMA = {name: spec for name, spec in RECORDED.items() if name != "log_probability"}
 OPTIMIZER = optax.adam(0.01)

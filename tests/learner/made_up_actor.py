@@ -14,8 +14,12 @@ from congrasp.common.wire.codec import Message
 _PATIENCE = 300.0  # a learner may compile before it answers
 
 
-def random_steps(rng, steps: int, worlds: int, observation: int, privileged: int) -> dict[str, np.ndarray]:
-    """All that is recorded of a rollout but the actions, with values that every entry of a task can have."""
+def random_steps(
+    rng, steps: int, worlds: int, observation: int, privileged: int
+) -> dict[str, np.ndarray]:
+    """All that is recorded of a rollout but the actions, with values that every entry of a task can
+    have.
+    """
     seen = rng.uniform(-1.0, 1.0, (steps + 1, worlds, observation)).astype(np.float16)
     inputs = rng.uniform(0.0, 1.0, (steps + 1, worlds, privileged)).astype(np.float16)
     terminal = rng.random((steps, worlds)) < 0.3
@@ -31,21 +35,33 @@ def random_steps(rng, steps: int, worlds: int, observation: int, privileged: int
 
 
 class MadeUpActor(threading.Thread):
-    """Sends rollouts of random observations until the run `t` ends; keeps the versions that it acted with."""
+    """Sends rollouts of random observations until the run `t` ends; keeps the versions that it
+    acted with.
+    """
 
     def __init__(
-        self, transport, name: str = "a", reward: float = 1.0, links: float = 3.0, seed: int = 0, journal=None
+        self,
+        transport,
+        name: str = "a",
+        reward: float = 1.0,
+        links: float = 3.0,
+        seed: int = 0,
+        journal=None,
     ):
         super().__init__(daemon=True)
         self.versions: list[int] = []
         self.outcomes, self.names, self.ended = [], (), ""
-        """Futures of the uploads, names of the arrays that the learner takes, and how the run ended."""
+        """Futures of the uploads, names of the arrays that the learner takes, and how the run
+        ended.
+        """
         self.stop, self.rng, self.reward = threading.Event(), np.random.default_rng(seed), reward
         self._transport, self._actor, self._links, self._journal = transport, name, links, journal
         self.start()
 
     def run(self) -> None:
-        with ActorLink(self._transport, "t", self._actor, patience=_PATIENCE, journal=self._journal) as link:
+        with ActorLink(
+            self._transport, "t", self._actor, patience=_PATIENCE, journal=self._journal
+        ) as link:
             try:
                 self.names = link.config(_PATIENCE).arrays
                 self._act(link)
@@ -61,15 +77,23 @@ class MadeUpActor(threading.Thread):
             if ticket is None or bundle is None:
                 continue
             arrays = self.rollout(bundle, jax.random.PRNGKey(len(self.versions)))
-            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": arrays["reward"].size}
+            meta = {
+                "version": bundle.version,
+                "schema": bundle.spec.schema,
+                "steps": arrays["reward"].size,
+            }
             self.outcomes.append(link.upload(Message(arrays, meta), ticket))
             self.versions.append(bundle.version)
 
     def rollout(self, bundle: PolicyBundle, key: jax.Array) -> dict[str, np.ndarray]:
         """Arrays of a rollout of 4 steps in 2 worlds."""
         spec = bundle.spec
-        recorded = random_steps(self.rng, 4, 2, sum(size for _, size in spec.layout), spec.privileged_size)
-        act = bundles.sample_action(spec.layout, bundle.inference_parameters, recorded["observation"], key)
+        recorded = random_steps(
+            self.rng, 4, 2, sum(size for _, size in spec.layout), spec.privileged_size
+        )
+        act = bundles.sample_action(
+            spec.layout, bundle.inference_parameters, recorded["observation"], key
+        )
         recorded["action"], recorded["log_probability"] = map(np.asarray, act)
         recorded["reward"] *= self.reward
         return {name: recorded[name] for name in self.names} | {

@@ -1,7 +1,8 @@
-"""One rank of a run with a made-up actor in its process, to be started, killed and resumed by tests.
+"""One rank of a run with a made-up actor in its process, to be started, killed and resumed by
+tests.
 
-Arguments: rank, ranks, port of the coordinator, run directory, number of updates, `fresh` or `resume`, and optionally
-the rank that kills itself, with one of `PHASES` ("1:update").
+Arguments: rank, ranks, port of the coordinator, run directory, number of updates, `fresh` or
+`resume`, and optionally the rank that kills itself, with one of `PHASES` ("1:update").
 """
 
 import dataclasses
@@ -41,7 +42,9 @@ PHASES = {
     "checkpoint": (pathlib.Path, "replace", 8),
     "leave": (Ranks, "close", 1),
 }
-"""Function, and the number of its call at which a rank dies: others wait in a collective, a round, or JAX itself."""
+"""Function, and the number of its call at which a rank dies: others wait in a collective, a round,
+or JAX itself.
+"""
 
 
 def die_in(phase: str) -> None:

@@ -1,4 +1,6 @@
-"""An algorithm from outside: registered by name, it trains in the real learner, and nothing else knows of it."""
+"""An algorithm from outside: registered by name, it trains in the real learner, and nothing else
+knows of it.
+"""
 
 import threading
 
@@ -35,7 +37,9 @@ CONFIG = RunConfig(
 
 
 class ToyActor(MadeUpActor):
-    """Sends rollouts of the toy task with the arrays that the learner takes; the first has one more."""
+    """Sends rollouts of the toy task with the arrays that the learner takes; the first has one
+    more.
+    """
 
     def rollout(self, bundle, key):
         recorded = toy.sampled(bundle, key, WORLDS, self.rng)
@@ -43,7 +47,9 @@ class ToyActor(MadeUpActor):
 
 
 def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypatch):
-    """Wire check, warm-up, updates, checkpoint, resume and publication follow from its four members alone."""
+    """Wire check, warm-up, updates, checkpoint, resume and publication follow from its four members
+    alone.
+    """
     monkeypatch.setitem(ALGORITHMS, "a2c", A2C)
     monkeypatch.setattr(bundles, "policy_spec", lambda task, sizes: toy.SPEC)
     ranges = Ranges(np.full(sum(size for _, size in toy.LAYOUT), 1e6), 1e6, 1e6, {})
@@ -55,17 +61,27 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
     def learn(resume):
         with MemoryTransport(hub) as transport:
             return run_learner(
-                tmp_path, CONFIG, transport, stop_event=stop, resume=resume,
-                on_update=lambda values: values["update"] == UPDATES // 2 and not resume and stop.set(),
+                tmp_path,
+                CONFIG,
+                transport,
+                stop_event=stop,
+                resume=resume,
+                on_update=lambda values: (
+                    values["update"] == UPDATES // 2 and not resume and stop.set()
+                ),
                 on_event=lambda level, text: events.append(text),
-            )  # fmt: skip
+            )
 
     half = learn(resume=False)
     stop.clear()
     last = learn(resume=True)
     actor.join(10.0)
     assert actor.names == tuple(SCHEMA)
-    assert [outcome.result(0) for outcome in actor.outcomes[:3]] == ["refused", "accepted", "accepted"]
+    assert [outcome.result(0) for outcome in actor.outcomes[:3]] == [
+        "refused",
+        "accepted",
+        "accepted",
+    ]
     assert any("unknown array 'log_probability'" in text for text in events)
     assert half.version == UPDATES // 2 and last.transitions == UPDATES * WORLDS * toy.STEPS
     assert toy.mean_return(last) > toy.mean_return(half) > toy.STANDING_STILL / 2
@@ -88,7 +104,9 @@ def test_a_batch_is_joined_and_divided_along_the_axis_of_worlds():
 
 
 def test_an_unknown_algorithm_is_one_line_and_an_old_configuration_means_ppo():
-    with pytest.raises(CongraspError, match=r"There is no algorithm 'a2c'\. Choose from: ppo, distill\.") as caught:
+    with pytest.raises(
+        CongraspError, match=r"There is no algorithm 'a2c'\. Choose from: ppo, distill\."
+    ) as caught:
         make_algorithm(toy.SPEC, CONFIG)
     assert "\n" not in str(caught.value)
     old = to_json(RunConfig()).replace('  "algorithm": "ppo",\n', "")

@@ -1,4 +1,6 @@
-"""Distillation: the loss against numbers worked out by hand, a student that comes to its teacher, bad teachers."""
+"""Distillation: the loss against numbers worked out by hand, a student that comes to its teacher,
+bad teachers.
+"""
 
 import dataclasses
 
@@ -44,16 +46,19 @@ def run_of(teacher, **distill):
 
 
 def batch(run, seed, worlds=WORLDS):
-    """Random observations of both, of which the teacher's first entries are the student's: what it can learn from."""
+    """Random observations of both, of which the teacher's first entries are the student's: what it
+    can learn from.
+    """
     rng = np.random.default_rng(seed)
     own, whole = (
         sum(size for _, size in policy_spec(task, NETWORK).layout)
         for task in (run.task, dataclasses.replace(run.task, observation="full"))
     )
     seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
+    # One for all: it can be learnt
     given = (
         np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
-    )  # one for all: it can be learnt
+    )
     given = np.broadcast_to(given, (STEPS, worlds, len(given)))
     taught = np.concatenate([seen[..., :whole], given], -1)
     return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": taught}
@@ -64,7 +69,9 @@ def algorithm(run):
 
 
 def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher):
-    """Of a student whose mean is zero: half the sum of (mean / deviation)^2 over the action, averaged over all."""
+    """Of a student whose mean is zero: half the sum of (mean / deviation)^2 over the action,
+    averaged over all.
+    """
     run = run_of(teacher, epochs=1, learning_rate=0.0)
     student, rows = algorithm(run), batch(run, 0)
     state = student.init(0)
@@ -73,14 +80,24 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
     )
     bundle = bundles.load(teacher)
     wanted = mean_action(
-        bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"][..., : -extra(get_hand("allegro"))]
+        bundle.spec.layout,
+        bundle.inference_parameters,
+        rows["teacher_observation"][..., : -extra(get_hand("allegro"))],
     )
-    labels = np.asarray(student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted))
+    labels = np.asarray(
+        student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted)
+    )
     deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
     after, metrics = student.update(state, rows)
-    np.testing.assert_allclose(metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4)
+    np.testing.assert_allclose(
+        metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4
+    )
     np.testing.assert_allclose(metrics["action_std"], deviation.mean(), rtol=1e-5)
-    assert after.version == 1 and after.transitions == STEPS * WORLDS and metrics["learning_rate"] == 0.0
+    assert (
+        after.version == 1
+        and after.transitions == STEPS * WORLDS
+        and metrics["learning_rate"] == 0.0
+    )
     jax.tree.map(np.testing.assert_array_equal, after.params["critic"], state.params["critic"])
 
 
@@ -104,10 +121,15 @@ def test_a_batch_that_is_not_finite_changes_nothing(teacher):
     student, rows = algorithm(run), batch(run, 0)
     state = student.init(0)
     rows["teacher_observation"][3, 2] = np.nan
-    with pytest.raises(NonFiniteUpdate, match="Diverged in the rollouts of update 1: imitation_kl") as caught:
+    with pytest.raises(
+        NonFiniteUpdate, match="Diverged in the rollouts of update 1: imitation_kl"
+    ) as caught:
         student.update(state, rows)
     assert caught.value.state is state
-    with pytest.raises(CongraspError, match=r"8 transitions cannot be split into 16 minibatches\. Use fewer --distill"):
+    with pytest.raises(
+        CongraspError,
+        match=r"8 transitions cannot be split into 16 minibatches\. Use fewer --distill",
+    ):
         algorithm(dataclasses.replace(run, distill=DistillConfig(teacher=str(teacher)))).update(
             state, batch(run, 0, worlds=1)
         )
@@ -122,22 +144,37 @@ def test_a_teacher_that_does_not_fit_is_one_line(teacher):
             Distillation(spec, dataclasses.replace(run, **changed))
         assert "\n" not in str(caught.value)
 
-    refused("Distillation needs a teacher. Name a hand or a policy file with --teacher", distill=DistillConfig())
+    refused(
+        "Distillation needs a teacher. Name a hand or a policy file with --teacher",
+        distill=DistillConfig(),
+    )
     refused("cannot be read", distill=DistillConfig(teacher="absent.safetensors"))
-    refused("cannot teach the hand 'human'", PolicySpec("human", spec.layout, spec.action_size, NETWORK))
+    refused(
+        "cannot teach the hand 'human'", PolicySpec("human", spec.layout, spec.action_size, NETWORK)
+    )
     refused("learnt with another 'control_dt'", task=dataclasses.replace(run.task, control_dt=0.02))
-    refused("does not observe what", task=dataclasses.replace(run.task, constraints=("heading", "pose")))
+    refused(
+        "does not observe what", task=dataclasses.replace(run.task, constraints=("heading", "pose"))
+    )
 
 
 def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
-    """`--teacher FILE` takes its task, adds what a robot's sensors do, and names the file by its place."""
+    """`--teacher FILE` takes its task, adds what a robot's sensors do, and names the file by its
+    place.
+    """
     from congrasp.services.cli.train import defaults
 
     monkeypatch.chdir(teacher.parent)
-    config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])["config"]
+    config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])[
+        "config"
+    ]
     assert config.algorithm == "distill" and config.distill.teacher == str(teacher)
     assert config.name == "quickstart-student" and config.task.method == "student"
-    assert (config.task.observation, config.task.sensing, config.task.hand) == ("tracked", TRACKERS, "allegro")
+    assert (config.task.observation, config.task.sensing, config.task.hand) == (
+        "tracked",
+        TRACKERS,
+        "allegro",
+    )
     assert config.task.surface_points == TASK.surface_points
     assert config.task.approach_steps == 2 * TASK.approach_steps
     assert config.curriculum.weights(config.task.reward, 1) == config.task.reward

@@ -32,7 +32,14 @@ FORM = RolloutForm(T, B, D, A, half=True)
 
 def rollout(sequence=0, version=0, **meta):
     arrays = {**FORM.zeros(), "reward": np.full((T, B), sequence, np.float32)}
-    header = {"actor": "a", "incarnation": "01", "sequence": sequence, "version": version, "run_id": "e", "schema": "s"}
+    header = {
+        "actor": "a",
+        "incarnation": "01",
+        "sequence": sequence,
+        "version": version,
+        "run_id": "e",
+        "schema": "s",
+    }
     return Message(arrays, {**header, "steps": T * B, **meta})
 
 
@@ -60,7 +67,9 @@ class Bench:
         return self.peer.query(KEYS.rollout(message.meta["actor"]), message, timeout=60).meta
 
     def ticket(self, name="t", **meta):
-        return self.ask(KEYS.ticket("a"), {"actor": "a", "incarnation": "01", "ticket": name, **meta})
+        return self.ask(
+            KEYS.ticket("a"), {"actor": "a", "incarnation": "01", "ticket": name, **meta}
+        )
 
     def ledger(self):
         return self.ask(KEYS.status)["counters"]
@@ -86,7 +95,12 @@ def sequences(batch):
 
 def test_config(bench):
     reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
-    assert (reply["config"], reply["run_id"], reply["schema"], reply["version"]) == ('{"name": "x"}', "e", "s", -1)
+    assert (reply["config"], reply["run_id"], reply["schema"], reply["version"]) == (
+        '{"name": "x"}',
+        "e",
+        "s",
+        -1,
+    )
     assert reply["arrays"] == list(FORM.arrays)
 
 
@@ -146,10 +160,23 @@ def test_batches_come_in_order_and_wait(bench):
     threading.Timer(0.1, b.send, [3]).start()
     assert sequences(b.rollouts.next_batch(2, 10)) == [2, 3]
     assert b.ledger() | {"capacity": 0} == {
-        "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
-        "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
+        "granted": 0,
+        "redeemed": 0,
+        "returned": 0,
+        "expired": 0,
+        "accepted": 4,
+        "consumed": 4,
+        "dropped": 0,
+        "stale": 0,
+        "duplicate": 0,
+        "damaged": 0,
+        "undone": 0,
+        "running": 0,
+        "queued": 0,
+        "capacity": 0,
+        "missing": 0,
         "rejected": 0,
-    }  # fmt: skip
+    }
 
 
 def test_full_learner_says_when_to_come_again(bench):
@@ -181,7 +208,12 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
     texts = [events.receive(60)[1].meta["text"] for _ in range(2)]
     assert "refused" in texts[0] and texts[1] == "Dropped as too old at version 2: 1 of a."
     ledger = b.ledger()
-    assert (ledger["stale"], ledger["dropped"], ledger["consumed"], ledger["accepted"]) == (3, 1, 2, 3)
+    assert (ledger["stale"], ledger["dropped"], ledger["consumed"], ledger["accepted"]) == (
+        3,
+        1,
+        2,
+        3,
+    )
 
 
 def test_nobody_speaks_for_another(bench):
@@ -193,7 +225,12 @@ def test_nobody_speaks_for_another(bench):
     reply = b.peer.query(KEYS.rollout("b"), rollout(), timeout=60).meta
     assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
     ledger = b.ledger()
-    assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (1, 1, 0)  # a's ticket is still a's
+    # A's ticket is still a's
+    assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (
+        1,
+        1,
+        0,
+    )
 
 
 def test_nobody_makes_the_learner_forget_what_another_sent(bench):
@@ -205,10 +242,13 @@ def test_nobody_makes_the_learner_forget_what_another_sent(bench):
 
 
 def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
-    monkeypatch.setattr(hub, "RateLimit", functools.partial(RateLimit, clock=lambda: 0.0))  # no token returns
+    # No token returns
+    monkeypatch.setattr(hub, "RateLimit", functools.partial(RateLimit, clock=lambda: 0.0))
     b = bench(version=0)
     events = b.peer.subscribe(KEYS.logs, depth=8)
-    outcomes = [b.send(0, actor="1.b", run_id="of another training")["outcome"] for _ in range(2500)]
+    outcomes = [
+        b.send(0, actor="1.b", run_id="of another training")["outcome"] for _ in range(2500)
+    ]
     stale = outcomes.count("stale")
     assert outcomes == ["stale"] * stale + ["retry"] * (2500 - stale) and 1990 <= stale <= 2000
     reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
@@ -229,7 +269,8 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
     assert [answer["outcome"] for answer in answers] == ["refused", "refused", "retry", "retry"]
     assert 0.5 < answers[-1]["retry_after"] <= 1.0
     asked = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
-    assert not asked["granted"] and asked["retry_after"] > 0.5  # another name of the same certificate
+    # Another name of the same certificate
+    assert not asked["granted"] and asked["retry_after"] > 0.5
     assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
     time.sleep(1.0)
     assert b.send(0, actor="1.b", steps=1)["outcome"] == "refused"
@@ -239,7 +280,9 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
 
 
 def test_values_beyond_the_task_are_refused_with_the_range(bench):
-    ranges = Ranges(np.array([1.0, 1.0, 1.0, 400.0, 2.0]), 65.0, 1e3, {"episode/success": (0.0, 1.0)})
+    ranges = Ranges(
+        np.array([1.0, 1.0, 1.0, 400.0, 2.0]), 65.0, 1e3, {"episode/success": (0.0, 1.0)}
+    )
     b = bench(version=0, admission=Admission(lambda: ranges))
     fine = {
         "observation": np.tile(np.float16([-1, 1, 0, 400, 2]), (T, B, 1)),
@@ -248,9 +291,18 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
         "episode/success": np.ones(1, np.float32),
     }
     beyond = {
-        "observation": (np.tile(np.float16([0, 0, 0, 400, 2.002]), (T, B, 1)), r"'observation\[4\]' holds 2.002"),
-        "last_observation": (np.full((B, D), -65504, np.float16), r"'last_observation\[0\]' holds 6.55e\+04"),
-        "reward": (np.full((T, B), 1e19, np.float32), r"'reward' holds 1e\+19; the task's are within -65 and 65"),
+        "observation": (
+            np.tile(np.float16([0, 0, 0, 400, 2.002]), (T, B, 1)),
+            r"'observation\[4\]' holds 2.002",
+        ),
+        "last_observation": (
+            np.full((B, D), -65504, np.float16),
+            r"'last_observation\[0\]' holds 6.55e\+04",
+        ),
+        "reward": (
+            np.full((T, B), 1e19, np.float32),
+            r"'reward' holds 1e\+19; the task's are within -65 and 65",
+        ),
         "action": (np.full((T, B, A), -3e38, np.float32), r"'action' holds -3e\+38"),
         "log_probability": (np.full((T, B), 100, np.float32), "'log_probability' holds 100"),
         "episode/success": (np.full(1, 1.5, np.float32), "'episode/success' holds 1.5"),
@@ -262,9 +314,9 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
         reply = b.peer.query(KEYS.rollout(f"{number}.x"), bad, timeout=60).meta
         assert reply["outcome"] == "refused" and re.search(why, reply["why"]), reply["why"]
     good = rollout(0)
-    assert b.peer.query(KEYS.rollout("a"), Message({**good.arrays, **fine}, good.meta), timeout=60).meta["outcome"] == (
-        "accepted"
-    )
+    assert b.peer.query(
+        KEYS.rollout("a"), Message({**good.arrays, **fine}, good.meta), timeout=60
+    ).meta["outcome"] == ("accepted")
 
 
 def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
@@ -281,7 +333,9 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     assert len(encode(Message(meta=status))) < 32_000
     flood.close()
     eventually(lambda: not b.ask(KEYS.status)["unlisted"])
-    assert [role["id"] for role in b.ask(KEYS.status)["roles"] if role["role"] == "actor"] == ["0.a"]
+    assert [role["id"] for role in b.ask(KEYS.status)["roles"] if role["role"] == "actor"] == [
+        "0.a"
+    ]
     told = 0
     while events.receive(0.05):
         told += 1
@@ -300,17 +354,27 @@ def test_weights_are_pulled_by_version(bench):
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
     assert notices.receive(60)[1].meta == {
-        "version": 0, "run_id": "e", "session_id": b.rollouts.session_id, "finished": False,
-    }  # fmt: skip
+        "version": 0,
+        "run_id": "e",
+        "session_id": b.rollouts.session_id,
+        "finished": False,
+    }
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=60)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
     assert b.ask(KEYS.weights, {"newer_than": 0})["version"] == 0
     assert not b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=60).arrays
     b.hub.publish_weights(bundle(1), 1)
-    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=60).meta["version"] == 1
-    # A learner that resumed from a checkpoint has an older version, or another one of the same number.
-    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 7}), timeout=60).meta["version"] == 1
-    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 1, "session_id": "before"}), timeout=60).arrays
+    assert (
+        b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=60).meta["version"] == 1
+    )
+    # A learner that resumed from a checkpoint has an older version, or another one of the same
+    # number.
+    assert (
+        b.peer.query(KEYS.weights, Message(meta={"newer_than": 7}), timeout=60).meta["version"] == 1
+    )
+    assert b.peer.query(
+        KEYS.weights, Message(meta={"newer_than": 1, "session_id": "before"}), timeout=60
+    ).arrays
 
 
 def test_only_weights_of_this_run_are_published(bench):
@@ -331,7 +395,11 @@ def test_status_names_everything(bench):
     b.send(0)
     time.sleep(0.05)
     status = b.ask(KEYS.status)
-    assert status["run"] == "test" and status["version"] == 0 and status["queue"] == {"length": 1, "limit": 64}
+    assert (
+        status["run"] == "test"
+        and status["version"] == 0
+        and status["queue"] == {"length": 1, "limit": 64}
+    )
     rates = {"rollouts_per_second": 1.0, "steps_per_second": T * B}
     assert {
         "role": "actor",
@@ -371,15 +439,22 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     assert resumed.rollouts.session_id != b.rollouts.session_id
     assert resumed.ledger()["accepted"] == resumed.ledger()["consumed"] == 3
     assert resumed.send(2, version=3)["outcome"] == "duplicate"
-    # The actor goes on where it was: 3, 4 and 5 were acknowledged, and are gone with the killed learner.
+    # The actor goes on where it was: 3, 4 and 5 were acknowledged, and are gone with the killed
+    # learner.
     assert resumed.send(7, version=4)["outcome"] == "accepted"
     assert resumed.send(6, version=4)["outcome"] == "accepted"
     assert resumed.send(6, version=4)["outcome"] == "duplicate"
     ledger = resumed.ledger()
-    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (5, 3, 2, 3)
+    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (
+        5,
+        3,
+        2,
+        3,
+    )
     again = bench(version=5, batch=3, durable=resumed.rollouts.durable())
     assert again.send(8, version=5)["outcome"] == "accepted"
-    assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4  # 6 and 7 were waiting as well
+    # 6 and 7 were waiting as well
+    assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4
     with pytest.raises(CongraspError, match="run id e, not f"):
         bench(run_id="f", durable=durable)
 
@@ -415,7 +490,8 @@ def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
         assert b.send(sequence, version=7)["outcome"] == "stale"  # of a version that there will be
     assert b.ledger()["missing"] <= 64 + 71  # what may overtake, and tickets
     assert b.send(made_up[-1], version=0)["outcome"] == "stale"  # still
-    resumed = bench(batch=100, durable=b.rollouts.durable())  # whose size is bounded though sequence 0 waits
+    # Whose size is bounded though sequence 0 waits
+    resumed = bench(batch=100, durable=b.rollouts.durable())
     assert resumed.ledger()["missing"] <= 2 * 64 + 71
 
 
@@ -427,13 +503,19 @@ def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     b.hub.publish_weights(bundle(6), 6)
     assert b.ledger()["missing"] == 1
     durable = b.rollouts.durable()
-    assert b.send(1, version=6)["outcome"] == "accepted"  # overtaken by 2 and 3, and lost with this learner
+    # Overtaken by 2 and 3, and lost with this learner
+    assert b.send(1, version=6)["outcome"] == "accepted"
     assert b.ledger()["missing"] == 0
     resumed = bench(version=6, batch=2, durable=durable)
     assert resumed.send(0, version=6)["outcome"] == "stale"  # as before
     assert resumed.send(4, version=6)["outcome"] == "accepted"
     ledger = resumed.ledger()
-    assert (ledger["consumed"], ledger["queued"], ledger["stale"], ledger["missing"]) == (2, 1, 1, 1)
+    assert (ledger["consumed"], ledger["queued"], ledger["stale"], ledger["missing"]) == (
+        2,
+        1,
+        1,
+        1,
+    )
 
 
 def _header(sequence):
@@ -461,7 +543,8 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
     b.hub.publish_weights(bundle(4), 4)
     assert b.send(4, version=4)["outcome"] == "accepted"
     b.hub.publish_weights(bundle(5), 5)
-    assert b.send(5, version=5)["outcome"] == "accepted"  # two versions from the checkpoint: of no use to a resume
+    # Two versions from the checkpoint: of no use to a resume
+    assert b.send(5, version=5)["outcome"] == "accepted"
     assert on_disk(b.rollouts._log) == [0, 1, 2, 3, 4]
 
     resumed = bench(batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
@@ -472,7 +555,12 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
     for version in (8, 9, 10):
         batches.append(sequences(resumed.rollouts.next_batch(2, 5 if version < 10 else 0.05) or []))
         resumed.hub.publish_weights(bundle(version), version)
-    assert batches == [[1, 3], [0, 2], []]  # of 2 and 4, one update away from 3, only one batch could be used
+    # Of 2 and 4, one update away from 3, only one batch could be used
+    assert batches == [
+        [1, 3],
+        [0, 2],
+        [],
+    ]
     assert resumed.ledger()["dropped"] == 1 and resumed.ticket()["granted"]
 
 
@@ -499,7 +587,9 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
 
 
 def test_nothing_is_acknowledged_before_it_is_written(bench, log):
-    """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was noted."""
+    """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was
+    noted.
+    """
     written, slow = threading.Event(), log()
     b = bench(version=0, log=slow)
     add = slow.add
@@ -513,7 +603,8 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     written.set()
     first.join(60)
     assert answers == ["accepted"] and b.send(0)["outcome"] == "duplicate" and on_disk(slow) == [0]
-    slow.add = lambda header, message: b.rollouts.close()  # the disk refuses it, and the learner stops
+    # The disk refuses it, and the learner stops
+    slow.add = lambda header, message: b.rollouts.close()
     assert b.send(1)["outcome"] == "retry"
 
 
@@ -534,8 +625,11 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     damaged, renamed = sorted(folder.iterdir())[1:3]
     damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
     renamed.rename(folder / renamed.name.replace("~2.", "~9."))
-    (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(b"torn, and so never acknowledged")
-    os.mkfifo(folder / "000000000008~a~01~7.safetensors")  # which would keep a reader waiting for ever
+    (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(
+        b"torn, and so never acknowledged"
+    )
+    # Which would keep a reader waiting for ever
+    os.mkfifo(folder / "000000000008~a~01~7.safetensors")
     (folder / "notes.txt").write_text("not ours")
     resumed = bench(version=1, log=log(), on_event=lambda *event: said.append(event))
     assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 3]
@@ -552,13 +646,17 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
     b.send(0)
     resumed = bench(version=1, log=log(write=False))
     assert resumed.send(1, version=1)["outcome"] == "accepted"
-    assert on_disk(resumed.rollouts._log) == [0] and sequences(resumed.rollouts.next_batch(2, 1)) == [0, 1]
+    assert on_disk(resumed.rollouts._log) == [0] and sequences(
+        resumed.rollouts.next_batch(2, 1)
+    ) == [0, 1]
 
 
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
     said = []
     (tmp_path / "file").touch()
-    b = bench(version=0, batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append))
+    b = bench(
+        version=0, batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append)
+    )
     assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
     assert len(said) == 1 and "they do not survive the learner" in said[0]
     (tmp_path / "file").unlink()

@@ -16,7 +16,8 @@ def test_useless_requests_empty_a_certificates_bucket_and_time_fills_it():
     limit = RateLimit(per_second=2.0, most=5.0, unit=100, clock=clock)
     for name in ("0.a", "0.b", "0.c"):
         assert limit.admits(f"congrasp/r/rollout/{name}")
-        limit.charge(f"congrasp/r/rollout/{name}", 100)  # two each: one for itself, one for its size
+        # Two each: one for itself, one for its size
+        limit.charge(f"congrasp/r/rollout/{name}", 100)
     assert not limit.admits(A) and not limit.admits("congrasp/r/ticket/0.z") and limit.admits(B)
     assert limit.rejected == 2
     clock.now = 0.5  # -1 + 1: still nothing

@@ -27,7 +27,9 @@ def changed(**settings) -> PPO:
     return PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, **settings))
 
 
-def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: float = 1.0) -> dict[str, np.ndarray]:
+def rollout(
+    bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: float = 1.0
+) -> dict[str, np.ndarray]:
     return toy.sampled(bundle, jax.random.PRNGKey(seed), worlds, np.random.default_rng(seed), reach)
 
 
@@ -37,7 +39,9 @@ def leaves(state: TrainState) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("lag", [0, 2])
 def test_it_learns_to_reach(lag):
-    """From hardly moving to better than halving the distance at every step, also from stale rollouts."""
+    """From hardly moving to better than halving the distance at every step, also from stale
+    rollouts.
+    """
     state = fresh()
     published = [toy.bundle_of(state)]
     assert toy.mean_return(published[0]) < toy.STANDING_STILL / 2
@@ -62,7 +66,9 @@ def test_counters_and_normalisers_follow_the_batch():
 
 
 def test_the_normaliser_moves_after_the_epochs():
-    """The log probability that the learner recomputes is the behaviour's, though the batch is unlike all before."""
+    """The log probability that the learner recomputes is the behaviour's, though the batch is
+    unlike all before.
+    """
     state = fresh()
     for seed in range(5):
         state, _ = step(state, rollout(toy.bundle_of(state), seed))
@@ -76,17 +82,22 @@ def test_the_normaliser_moves_after_the_epochs():
 
 
 def test_moving_the_value_statistics_does_not_move_the_values():
-    """In rewards' units the critic says the same before and after its normaliser took the batch in."""
+    """In rewards' units the critic says the same before and after its normaliser took the batch
+    in.
+    """
     frozen = changed(learning_rate=0.0, learning_rate_range=(0.0, 0.0))
     state = frozen.init(0)
     batch = rollout(toy.bundle_of(state), 0)
     probe = normalizer.apply(
-        normalizer.observation_affine(normalizer.empty((11,)), toy.LAYOUT), batch["last_observation"]
+        normalizer.observation_affine(normalizer.empty((11,)), toy.LAYOUT),
+        batch["last_observation"],
     )
 
     def values(state):
         affine = normalizer.value_affine(state.value)
-        return np.asarray(network.value(state.params, toy.LAYOUT, probe)) / affine.scale + affine.shift
+        return (
+            np.asarray(network.value(state.params, toy.LAYOUT, probe)) / affine.scale + affine.shift
+        )
 
     before = values(state)
     after, _ = frozen.update(state, batch)
@@ -95,10 +106,15 @@ def test_moving_the_value_statistics_does_not_move_the_values():
 
 
 def test_rounding_between_actor_and_learner_is_told_apart_from_lag():
-    """Rollouts of the same version with log probabilities .01 off show as a gap of .01, older ones not at all."""
-    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 1))  # the first update normalises by its own batch
+    """Rollouts of the same version with log probabilities .01 off show as a gap of .01, older ones
+    not at all.
+    """
+    # The first update normalises by its own batch
+    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 1))
     batch = rollout(toy.bundle_of(state), 0)
-    batch["log_probability"] = batch["log_probability"] + np.where(np.arange(64) < 32, 0.01, 0.5).astype(np.float32)
+    batch["log_probability"] = batch["log_probability"] + np.where(
+        np.arange(64) < 32, 0.01, 0.5
+    ).astype(np.float32)
     batch["lag"] = (np.arange(64) >= 32).astype(np.int32)
     _, metrics = step(state, batch)
     assert metrics["log_probability_gap"] == pytest.approx(0.01, rel=1e-2)
@@ -113,12 +129,19 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
     state = state._replace(params={**state.params, "critic": critic})
     batch = rollout(toy.bundle_of(state), 0)
     _, none = step(state, batch)
-    assert none["truncated"] == none["td_error_truncated"] == none["td_error_truncated_as_terminal"] == 0.0
+    assert (
+        none["truncated"]
+        == none["td_error_truncated"]
+        == none["td_error_truncated_as_terminal"]
+        == 0.0
+    )
     batch["truncated"][-1, :16] = True
     reward, ended = batch["reward"], batch["reward"][-1, :16].mean()
     errors = {}
     for bootstrap in (True, False):
-        _, metrics = changed(bootstrap_truncated=bootstrap).update(fresh()._replace(params=state.params), batch)
+        _, metrics = changed(bootstrap_truncated=bootstrap).update(
+            fresh()._replace(params=state.params), batch
+        )
         # Episodes of ten steps, a quarter of which were truncated: one step of forty.
         assert metrics["truncated"] == pytest.approx(1 / 40)
         assert metrics["td_error_truncated"] == pytest.approx(ended + 0.9 * 0.7 - 0.7, abs=1e-5)
@@ -144,26 +167,43 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
 )
 def test_learning_rate_follows_the_divergence_within_its_range(kl, before, limits, rate):
     hyper = {"kl_target": 0.012, "learning_rate_range": limits}
-    np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6)
+    np.testing.assert_allclose(
+        ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6
+    )
 
 
 def test_a_trained_policy_begins_with_a_tenth_of_the_rate():
     policy = ALGORITHM.policy(fresh())
-    rates = [float(state.optimizer.hyperparams["learning_rate"]) for state in (fresh(), ALGORITHM.init(0, policy))]
+    rates = [
+        float(state.optimizer.hyperparams["learning_rate"])
+        for state in (fresh(), ALGORITHM.init(0, policy))
+    ]
     assert rates == pytest.approx([toy.SETTINGS.learning_rate, toy.SETTINGS.learning_rate / 10])
 
 
 def test_divergence_and_noise_are_bounded_as_the_run_settles():
-    """Over the last updates the target falls to a tenth, the noise's ceiling geometrically; before, it has a floor."""
+    """Over the last updates the target falls to a tenth, the noise's ceiling geometrically; before,
+    it has a floor.
+    """
     settings = PPOConfig(kl_target=0.01, settling=0.2)
     targets = [settings.kl_target_at(version, 1000) for version in (0, 800, 900, 1000, 1200)]
     np.testing.assert_allclose(targets, [0.01, 0.01, 0.0055, 0.001, 0.001], rtol=1e-9)
     settings = PPOConfig(settling=0.3, final_std=0.1, least_std=0.35)
     kept = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
     np.testing.assert_allclose(kept, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
-    assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [0.35, 0.35, 0.0, 0.0, 0.0]
+    assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [
+        0.35,
+        0.35,
+        0.0,
+        0.0,
+        0.0,
+    ]
     never = PPOConfig(kl_target=0.01, final_std=0.1, least_std=0.35)  # settles
-    assert (never.kl_target_at(9, 9), never.noise_kept_at(9, 9), never.least_std_at(9, 9)) == (0.01, np.inf, 0.35)
+    assert (never.kl_target_at(9, 9), never.noise_kept_at(9, 9), never.least_std_at(9, 9)) == (
+        0.01,
+        np.inf,
+        0.35,
+    )
     assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
 
 
@@ -173,21 +213,31 @@ def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_fin
     settings = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2, least_std=least)
     batch, stds = rollout(toy.bundle_of(fresh()), 0), {}
     for version in (3, 4, 7):
-        moved, metrics = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
+        moved, metrics = PPO(toy.SPEC, settings, updates=8).update(
+            fresh()._replace(version=version), batch
+        )
         stds[version] = metrics["action_std"]
-        np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
+        np.testing.assert_allclose(
+            np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6
+        )
     assert stds[3] == pytest.approx(0.7, rel=1e-6) if least else stds[3] > 0.5
-    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6) and stds[7] == pytest.approx(0.2, rel=1e-5)
+    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6) and stds[7] == pytest.approx(
+        0.2, rel=1e-5
+    )
 
 
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
     """By the divergence that the rate of the first update suits."""
     batch = rollout(toy.bundle_of(fresh()), 0)
     _, metrics = changed(minibatches=1, epochs=2).update(fresh(), batch)
-    settings = dataclasses.replace(toy.SETTINGS, minibatches=1, epochs=2, kl_target=metrics["kl"], settling=0.5)
+    settings = dataclasses.replace(
+        toy.SETTINGS, minibatches=1, epochs=2, kl_target=metrics["kl"], settling=0.5
+    )
     rates = {}
     for version in (0, 8):
-        moved, _ = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
+        moved, _ = PPO(toy.SPEC, settings, updates=8).update(
+            fresh()._replace(version=version), batch
+        )
         rates[version] = float(moved.optimizer.hyperparams["learning_rate"])
     np.testing.assert_allclose(rates[0] / rates[8], 1.5, rtol=1e-6)
 
@@ -198,7 +248,9 @@ def test_a_policy_that_left_its_trust_region_waits_while_the_critic_learns():
     moved = []
     for epochs, target in ((1, 1e-7), (2, 1e-7), (2, 1.0)):
         state, _ = changed(minibatches=1, epochs=epochs, kl_target=target).update(fresh(), batch)
-        moved.append({name: np.asarray(ravel_pytree(tree)[0]) for name, tree in state.params.items()})
+        moved.append(
+            {name: np.asarray(ravel_pytree(tree)[0]) for name, tree in state.params.items()}
+        )
     once, held, free = moved
     np.testing.assert_allclose(held["actor"], once["actor"], rtol=1e-4, atol=1e-7)
     assert np.abs(free["actor"] - once["actor"]).max() > 1e-5
@@ -206,9 +258,14 @@ def test_a_policy_that_left_its_trust_region_waits_while_the_critic_learns():
 
 
 def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
-    """Standard deviations of a hundredth; without the trust region the first update is too large."""
+    """Standard deviations of a hundredth; without the trust region the first update is too
+    large.
+    """
     algorithm, state = changed(learning_rate=1e-3, kl_target=0.012), fresh()
-    actor = {**state.params["actor"], "log_std": jnp.full_like(state.params["actor"]["log_std"], np.log(0.01))}
+    actor = {
+        **state.params["actor"],
+        "log_std": jnp.full_like(state.params["actor"]["log_std"], np.log(0.01)),
+    }
     state = state._replace(params={**state.params, "actor": actor})
     rates = []
     for seed in range(6):
@@ -218,7 +275,9 @@ def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
     assert rates[-1] < rates[0] / 2
 
 
-@pytest.mark.parametrize("field", ["observation", "last_observation", "action", "log_probability", "reward"])
+@pytest.mark.parametrize(
+    "field", ["observation", "last_observation", "action", "log_probability", "reward"]
+)
 def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
     state = fresh()
     batch = rollout(toy.bundle_of(state), 0)
@@ -234,11 +293,16 @@ def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
     ("wrong", "why"),
     [
         ({"reward_scale": 1e25}, "value loss"),
-        ({"learning_rate": 3.0, "learning_rate_range": (3.0, 3.0)}, "policy .the KL divergence is too large"),
+        (
+            {"learning_rate": 3.0, "learning_rate_range": (3.0, 3.0)},
+            "policy .the KL divergence is too large",
+        ),
     ],
 )
 def test_an_optimisation_that_breaks_is_named_and_changes_nothing(wrong, why):
-    """Neither weights nor the optimiser's moments: the next batch goes on from the update before."""
+    """Neither weights nor the optimiser's moments: the next batch goes on from the update
+    before.
+    """
     algorithm = changed(**wrong)
     state = algorithm.init(0)
     batch = rollout(toy.bundle_of(state), 0)
@@ -273,7 +337,9 @@ def test_same_seed_and_data_give_the_same_bits():
 
 
 def test_published_weights_outlive_the_next_update():
-    """In one process a bundle shares the learner's arrays, which the next update must not take away."""
+    """In one process a bundle shares the learner's arrays, which the next update must not take
+    away.
+    """
     state = fresh()
     bundle = toy.bundle_of(state)
     step(state, rollout(bundle, 0))
@@ -285,11 +351,18 @@ WIDE = dataclasses.replace(toy.SPEC, privileged=(("future", 1),))
 
 
 def with_future(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Rewards that no observation predicts, and a privileged input that tells which world has which."""
+    """Rewards that no observation predicts, and a privileged input that tells which world has
+    which.
+    """
     sign = np.where(np.arange(batch["reward"].shape[1]) % 2, 1.0, -1.0).astype(np.float32)
     inputs = np.broadcast_to(3.0 + 0.1 * sign, batch["reward"].shape)[..., None]
     rewards = batch["reward"] + 2.0 * sign
-    return {**batch, "reward": rewards, "privileged": inputs.astype(np.float16), "last_privileged": inputs[-1].copy()}
+    return {
+        **batch,
+        "reward": rewards,
+        "privileged": inputs.astype(np.float16),
+        "last_privileged": inputs[-1].copy(),
+    }
 
 
 def test_a_privileged_critic_explains_what_the_observation_does_not():
@@ -299,7 +372,9 @@ def test_a_privileged_critic_explains_what_the_observation_does_not():
         state = algorithm.init(0)
         for seed in range(15):
             batch = with_future(rollout(toy.bundle_of(state), seed))
-            state, metrics = algorithm.update(state, {name: batch[name] for name in algorithm.batch_schema})
+            state, metrics = algorithm.update(
+                state, {name: batch[name] for name in algorithm.batch_schema}
+            )
         explained[bool(spec.privileged)] = metrics["explained_variance"]
     assert explained[True] > 0.8 > 0.4 > explained[False]
     assert state.privileged.count == 15 * 64 * toy.STEPS
@@ -322,7 +397,9 @@ def test_a_policy_without_privileged_inputs_begins_with_the_same_values():
     narrow = toy.bundle_of(state)
     wide = bundles.with_inputs_of(WIDE, narrow.task, narrow)
     algorithm = PPO(WIDE, toy.SETTINGS)
-    begun = algorithm.init(0, LearnedPolicy(wide.params, wide.observation, wide.value, wide.privileged))
+    begun = algorithm.init(
+        0, LearnedPolicy(wide.params, wide.observation, wide.value, wide.privileged)
+    )
     assert begun.privileged.count == 0
     batch = with_future(rollout(wide, 1))
     _, wider = algorithm.update(begun, batch)

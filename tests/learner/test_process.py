@@ -54,7 +54,9 @@ def act(hub):
 
 def learn(run_dir, hub, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
     with MemoryTransport(hub) as transport:
-        return run_learner(run_dir, config, transport, stop_event=stop_event or threading.Event(), **options)
+        return run_learner(
+            run_dir, config, transport, stop_event=stop_event or threading.Event(), **options
+        )
 
 
 def test_a_run_from_beginning_to_end(tmp_path, hub, act):
@@ -80,10 +82,15 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     assert (shipped.version, shipped.run_id) == (3, last.run_id)
     jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
     assert open_run(tmp_path) == CONFIG
-    assert (tmp_path / "checkpoints" / "latest").resolve().name == "checkpoint_000000003.safetensors"
+    assert (
+        tmp_path / "checkpoints" / "latest"
+    ).resolve().name == "checkpoint_000000003.safetensors"
 
     received = list(iter(lambda: logs.receive(0.0), None))
-    kinds = {kind: [m.meta for k, m in received if k.split("/")[3] == kind] for kind in ("metrics", "version", "event")}
+    kinds = {
+        kind: [m.meta for k, m in received if k.split("/")[3] == kind]
+        for kind in ("metrics", "version", "event")
+    }
     assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
     values = kinds["metrics"][-1]["values"]
@@ -98,7 +105,9 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
     actor = act()
     stop = threading.Event()
     forever = dataclasses.replace(CONFIG, updates=10**6)
-    first = learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
+    first = learn(
+        tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set()
+    )
     assert first.version == 3
     assert actor.is_alive()
     compiled = ppo._optimise._cache_size()
@@ -120,12 +129,16 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, ac
 
 
 def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub, act):
-    """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the one before."""
+    """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the
+    one before.
+    """
     create_run(tmp_path, CONFIG)
     act()
     stop = threading.Event()
     forever = dataclasses.replace(CONFIG, updates=10**6)
-    learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set())
+    learn(
+        tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set()
+    )
     kept = tmp_path / "checkpoints"
     (kept / "latest").unlink()
     (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
@@ -135,32 +148,50 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
         learn(tmp_path, hub)
     seen, said = [], []
     learn(
-        tmp_path, hub, dataclasses.replace(CONFIG, updates=7), resume=True,
+        tmp_path,
+        hub,
+        dataclasses.replace(CONFIG, updates=7),
+        resume=True,
         on_update=lambda values: seen.append((values["update"], values["version"])),
         on_event=lambda level, text: said.append(text),
-    )  # fmt: skip
-    assert seen == [(5, 7), (6, 8), (7, 9)]  # versions up to 5 are out, and 6 is what the resume begins with
+    )
+    # Versions up to 5 are out, and 6 is what the resume begins with
+    assert seen == [
+        (5, 7),
+        (6, 8),
+        (7, 9),
+    ]
     assert f"Resuming from the checkpoint {kept}/checkpoint_000000004.safetensors." in said
     assert any("000000005.safetensors is damaged" in text for text in said)
     assert (kept / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
-def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(tmp_path, hub, act, monkeypatch):
+def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(
+    tmp_path, hub, act, monkeypatch
+):
     config = dataclasses.replace(CONFIG, updates=20)
     create_run(tmp_path, config)
-    monkeypatch.setattr(Admission, "check", lambda self, message: None)  # what is within the ranges breaks nothing
+    # What is within the ranges breaks nothing
+    monkeypatch.setattr(Admission, "check", lambda self, message: None)
     act(reward=1e37)
-    with pytest.raises(PhysicsError, match=r"update 5: .* 5th such batch in a row.*failure") as caught:
+    with pytest.raises(
+        PhysicsError, match=r"update 5: .* 5th such batch in a row.*failure"
+    ) as caught:
         learn(tmp_path, hub, config)
     assert "\n" not in str(caught.value)
-    assert {path.name for path in (tmp_path / "failure").iterdir()} == {"state.safetensors", "batch.safetensors"}
+    assert {path.name for path in (tmp_path / "failure").iterdir()} == {
+        "state.safetensors",
+        "batch.safetensors",
+    }
     # What waited is taken up by a resume, the batch itself is not.
     kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
     assert not kept & {0, 1}
 
 
-def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path, hub, act, monkeypatch):
+def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
+    tmp_path, hub, act, monkeypatch
+):
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
@@ -176,7 +207,10 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path,
     assert 1 <= len(said) == dropped[-1] < 5 and said[0][0] == "error"
     assert [values["update"] for values in seen] == list(range(1, 9)) and last.version == 8
     learnt = [values for values in seen if "policy_loss" in values]
-    assert len(learnt) == 8 - len(said) and np.isfinite([values["policy_loss"] for values in learnt]).all()
+    assert (
+        len(learnt) == 8 - len(said)
+        and np.isfinite([values["policy_loss"] for values in learnt]).all()
+    )
     assert np.isfinite(last.value.mean) and abs(last.value.mean) < 100
 
 
@@ -206,7 +240,9 @@ def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
     create_run(tmp_path, config)
     act(links=0.0)
     events = []
-    with pytest.raises(CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"):
+    with pytest.raises(
+        CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"
+    ):
         learn(tmp_path, hub, config, on_event=lambda level, text: events.append((level, text)))
     assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
 
@@ -242,4 +278,9 @@ def test_resuming_with_other_networks_is_refused(tmp_path, hub):
     stopped.set()
     learn(tmp_path, hub, CONFIG, stopped)
     with pytest.raises(CongraspError, match="does not match this run: 'params/actor"):
-        learn(tmp_path, hub, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)
+        learn(
+            tmp_path,
+            hub,
+            dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)),
+            resume=True,
+        )

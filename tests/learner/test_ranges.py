@@ -1,4 +1,6 @@
-"""Ranges of a task: wide enough for whatever an engine produces, narrow enough to be worth a check."""
+"""Ranges of a task: wide enough for whatever an engine produces, narrow enough to be worth a
+check.
+"""
 
 import jax
 import numpy as np
@@ -15,11 +17,15 @@ from congrasp.common.wire.messages import RECORDED
 from congrasp.learner.hub.admission import Admission, task_ranges
 from tests import task as suite
 
-TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)
+TASK = TaskConfig(
+    constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40
+)
 
 
 def _rollouts(*spreads):
-    """Rollouts of one step each of the native engine, of whole episodes, whose actions have these deviations."""
+    """Rollouts of one step each of the native engine, of whole episodes, whose actions have these
+    deviations.
+    """
     worker, masses = suite.worker(), np.array([obj.mass for obj in suite.OBJECTS], np.float32)
     privileged = jax.jit(worker.env.critic_inputs)
     for spread in spreads:
@@ -27,7 +33,9 @@ def _rollouts(*spreads):
         for _ in range(suite.TASK.approach_steps + suite.TASK.hold_steps):
             rollout = worker.collect(suite.command(noise=spread), 1)
             arrays = {name: np.asarray(getattr(rollout, name)) for name in RECORDED}
-            arrays["log_probability"] = arrays["log_probability"] - np.float32(each * rollout.action.shape[-1])
+            arrays["log_probability"] = arrays["log_probability"] - np.float32(
+                each * rollout.action.shape[-1]
+            )
             arrays["privileged"] = np.asarray(privileged(worker.state, masses))[None]
             yield Message(arrays | finished_episodes(rollout, suite.TASK))
     worker.physics.close()
@@ -41,7 +49,10 @@ def test_whatever_an_engine_produces_is_within_the_ranges():
         admission.check(rollout)
         ended += len(rollout.arrays["episode/return"])
     assert ended == 3 * suite.BATCH
-    for name, array in (("reward", rollout.arrays["reward"] * np.float32(1e15)), ("privileged", np.full((1, 1), 3e3))):
+    for name, array in (
+        ("reward", rollout.arrays["reward"] * np.float32(1e15)),
+        ("privileged", np.full((1, 1), 3e3)),
+    ):
         with pytest.raises(CongraspError, match=f"'{name}.*holds"):
             admission.check(Message({**rollout.arrays, name: array.astype(np.float32)}))
 
@@ -53,7 +64,11 @@ def ranges():
 
 def test_names_and_bounds_follow_from_the_task(ranges):
     assert set(ranges.episodes) == set(episode_fields(TASK))
-    assert ranges.episodes["episode/success"] == ranges.episodes["episode/mask_trajectory"] == (0.0, 1.0)
+    assert (
+        ranges.episodes["episode/success"]
+        == ranges.episodes["episode/mask_trajectory"]
+        == (0.0, 1.0)
+    )
     assert ranges.episodes["episode/length"] == (0.0, 90.0)
     # An action's contact earns at most 1, everywhere, and is given twice the room: 90 steps of 2.
     assert ranges.episodes["term/contact"][1] == pytest.approx(180.0, rel=1e-3)

@@ -1,4 +1,6 @@
-"""Ranks that talk, in threads; ranks that train and die, in processes; batches divided between two devices."""
+"""Ranks that talk, in threads; ranks that train and die, in processes; batches divided between two
+devices.
+"""
 
 import os
 import pathlib
@@ -44,7 +46,8 @@ class Party:
 
         self.everywhere(meet, count)
         self.ranks = [
-            Ranks(r, count, self.links[r], lambda text, r=r: self.said.update({r: text})) for r in range(count)
+            Ranks(r, count, self.links[r], lambda text, r=r: self.said.update({r: text}))
+            for r in range(count)
         ]
 
     @staticmethod
@@ -92,7 +95,8 @@ def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_la
     for rank in (second, third):
         assert ended_by(rank.poll(10.0).meta["entries"]) == (2, "a signal")
     assert first.poll(10.0).meta["entries"][0] is None
-    party.everywhere(lambda rank: party.ranks[rank].exchange({}))  # and the next round is whole again
+    # And the next round is whole again
+    party.everywhere(lambda rank: party.ranks[rank].exchange({}))
 
 
 def test_a_dead_rank_ends_the_others_who_are_told_why(party):
@@ -188,10 +192,22 @@ class Job:
         command = [sys.executable, "-m", "tests.learner.rank_process"]
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
         environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(self.run_dir / "compiled"))
-        environment |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+        environment |= {
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+            "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
+        }
         self.processes = [
             subprocess.Popen(
-                [*command, str(rank), str(count), str(self._port), str(self.run_dir), str(goal), mode, *doom],
+                [
+                    *command,
+                    str(rank),
+                    str(count),
+                    str(self._port),
+                    str(self.run_dir),
+                    str(goal),
+                    mode,
+                    *doom,
+                ],
                 env=environment,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -257,9 +273,11 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     first, second = job.finish()
     steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
     (said,), (other,) = (
-        [line.split()[1:] for line in text.splitlines() if "bundle" in line] for text in (first, second)
+        [line.split()[1:] for line in text.splitlines() if "bundle" in line]
+        for text in (first, second)
     )
-    assert said == other  # weights, normalisers and versions, bit for bit, though the rollouts were not the same
+    # Weights, normalisers and versions, bit for bit, though the rollouts were not the same
+    assert said == other
     assert int(said[1]) == steps * (kept + 3)
 
     job.start(kept + 5, "resume", count=1)
@@ -275,10 +293,16 @@ def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_re
     for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):
         victim = int(doom[0])
         job.start(kept + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
-        assert f"Rank {victim} ended. Rank {1 - victim} cannot continue alone" in job.last_words(victim), doom
+        assert f"Rank {victim} ended. Rank {1 - victim} cannot continue alone" in job.last_words(
+            victim
+        ), doom
         checkpoints = sorted((job.run_dir / "checkpoints").glob("checkpoint_*.safetensors"))
         assert bool(checkpoints) == (doom != "1:join")
-        kept, mode = (int(checkpoints[-1].stem.removeprefix("checkpoint_")), "resume") if checkpoints else (0, "fresh")
+        kept, mode = (
+            (int(checkpoints[-1].stem.removeprefix("checkpoint_")), "resume")
+            if checkpoints
+            else (0, "fresh")
+        )
     job.start(kept + 2, "resume", 3)
     (bundle,) = {text.split("bundle")[1] for text in job.finish()}
     steps = CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments

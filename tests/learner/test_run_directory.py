@@ -1,4 +1,6 @@
-"""A run's folder: its configuration, and checkpoints, which are exact, atomic, and left out where damaged."""
+"""A run's folder: its configuration, and checkpoints, which are exact, atomic, and left out where
+damaged.
+"""
 
 import dataclasses
 import os
@@ -45,10 +47,14 @@ def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
     assert open_run(folder) == changed
 
 
-@pytest.mark.parametrize("change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}, {"algorithm": "a2c"}])
+@pytest.mark.parametrize(
+    "change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}, {"algorithm": "a2c"}]
+)
 def test_what_actors_use_may_not(run, change):
     folder, config = run
-    with pytest.raises(CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"):
+    with pytest.raises(
+        CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"
+    ):
         continue_run(folder, dataclasses.replace(config, **change))
     assert open_run(folder) == config
 
@@ -60,7 +66,9 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
     assert defaults(["--run-dir", str(folder), "--preset=human"]) == {"config": get_preset("human")}
     with pytest.raises(CongraspError, match="a run of 'human', which --preset allegro is not for"):
         defaults(["--resume", "--run-dir", str(folder), "--preset", "allegro"])
-    assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset("quickstart")
+    assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset(
+        "quickstart"
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,13 +105,16 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
     folder, config = run
     assert not has_checkpoints(folder)
     (folder / "policy.safetensors").write_bytes(b"a policy")
-    with pytest.raises(CongraspError, match=r"no checkpoint to resume from, .*policy\..* another .* with --initial"):
+    with pytest.raises(
+        CongraspError, match=r"no checkpoint to resume from, .*policy\..* another .* with --initial"
+    ):
         has_checkpoints(folder)
     (folder / "policy.safetensors").unlink()
     (folder / "checkpoints").mkdir()
     (folder / "checkpoints" / "latest").symlink_to("gone")
     with pytest.raises(
-        CongraspError, match=r"although latest shows that it had one\. Start again in another --run-dir\."
+        CongraspError,
+        match=r"although latest shows that it had one\. Start again in another --run-dir\.",
     ):
         has_checkpoints(folder)
     (folder / "checkpoints" / "checkpoint_000000004.safetensors").touch()
@@ -113,7 +124,9 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
         create_run(folder, config)
 
 
-@pytest.mark.parametrize("damage", [b"", bytes(21), b"\xff\xfe", b"0" * 20 + b"\n", b"9" * 20 + b"\n", b"-5"])
+@pytest.mark.parametrize(
+    "damage", [b"", bytes(21), b"\xff\xfe", b"0" * 20 + b"\n", b"9" * 20 + b"\n", b"-5"]
+)
 def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run, damage):
     folder, _ = run
     assert published_version(folder) == -1
@@ -134,7 +147,9 @@ def test_one_learner_at_a_time_until_it_dies(run):
         "import pathlib, sys, time; from congrasp.learner.run_directory import exclusive\n"
         "with exclusive(pathlib.Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
-    with subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE) as other:
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE
+    ) as other:
         assert other.stdout.readline() == b"mine\n"
         with listening(folder, "tcp/127.0.0.1:7"), pytest.raises(CongraspError) as refused:
             continue_run(folder, dataclasses.replace(config, updates=9))
@@ -147,10 +162,14 @@ def test_one_learner_at_a_time_until_it_dies(run):
         assert (folder / "lock").read_text() == str(os.getpid())
         (folder / "lock").unlink()
         check()  # reading the file here would release its lock
-        with subprocess.Popen([sys.executable, "-c", script, str(folder)], stderr=subprocess.PIPE) as other:
+        with subprocess.Popen(
+            [sys.executable, "-c", script, str(folder)], stderr=subprocess.PIPE
+        ) as other:
             assert b"is in use by process" in other.stderr.read()
         (folder / "lock").unlink()
-        with subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE) as other:
+        with subprocess.Popen(
+            [sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE
+        ) as other:
             assert other.stdout.readline() == b"mine\n"
             with pytest.raises(CongraspError, match=f"in use by process {other.pid}"):
                 check()
@@ -162,7 +181,10 @@ def test_one_learner_at_a_time_until_it_dies(run):
 
 def tree(value: float) -> dict:
     return {
-        "device": {"half": jnp.full((2, 3), value, jnp.float16), "key": jax.random.PRNGKey(int(value))},
+        "device": {
+            "half": jnp.full((2, 3), value, jnp.float16),
+            "key": jax.random.PRNGKey(int(value)),
+        },
         "host": np.array([value, 2.0**60 + 512]),
         "steps": 2**40 + int(value),
     }
@@ -192,15 +214,21 @@ def test_a_full_disk_is_one_clear_error_and_the_previous_checkpoint_is_intact(tm
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(tree(1.0), {}, 1)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))  # the kernel refuses to write more than 100 bytes
+    # The kernel refuses to write more than 100 bytes
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
     try:
-        with pytest.raises(CongraspError, match=r"checkpoint_000000002\.safetensors could not be written") as caught:
+        with pytest.raises(
+            CongraspError, match=r"checkpoint_000000002\.safetensors could not be written"
+        ) as caught:
             checkpoints.save(tree(2.0), {}, 2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "\n" not in str(caught.value)
     assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint_000000001.safetensors", "latest"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint_000000001.safetensors",
+        "latest",
+    ]
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")
@@ -209,7 +237,8 @@ def test_a_process_that_dies_while_writing_leaves_the_previous_checkpoint(tmp_pa
     checkpoints.save({"host": np.ones(3)}, {}, 1)
     child = os.fork()
     if not child:
-        os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename
+        # Gone after the data were written, before the rename
+        os.fsync = lambda descriptor: os._exit(9)
         try:
             checkpoints.save({"host": np.zeros(3)}, {}, 2)
         finally:
@@ -262,7 +291,9 @@ def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
         name = "nothing" if link == "dangling" else "checkpoint_000000008.safetensors"
         (tmp_path / "latest").symlink_to(name)
     value, said = lines_of(checkpoints)
-    assert value == 10.0 and said == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
+    assert value == 10.0 and said == [
+        f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."
+    ]
 
 
 def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
@@ -272,7 +303,10 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     paths[1].write_bytes(b"")
     value, said = lines_of(checkpoints)
     assert value == 1.0 and len(said) == 3
-    assert "000000003.safetensors is damaged: The message" in said[0] and "000000002.safetensors is damaged" in said[1]
+    assert (
+        "000000003.safetensors is damaged: The message" in said[0]
+        and "000000002.safetensors is damaged" in said[1]
+    )
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0

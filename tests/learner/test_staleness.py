@@ -21,7 +21,9 @@ def manager(max_staleness=1, batch=2, **options):
 
 
 def test_tickets_worked_out_by_hand():
-    """Batch 2, eta 1: (1 + 0 + 1) * 2 = 4 may be under way at version 0, and 2 more with every version."""
+    """Batch 2, eta 1: (1 + 0 + 1) * 2 = 4 may be under way at version 0, and 2 more with every
+    version.
+    """
     staleness = manager()
     assert staleness.capacity == 4
     assert all(staleness.grant(owner, i) for owner in (A, B) for i in "xy")
@@ -34,9 +36,21 @@ def test_tickets_worked_out_by_hand():
     staleness.publish(1)
     assert staleness.capacity == 2
     assert staleness.counters() == {
-        "granted": 4, "redeemed": 2, "returned": 0, "expired": 0, "accepted": 2, "consumed": 2, "dropped": 0,
-        "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 2, "queued": 0, "capacity": 2,
-    }  # fmt: skip
+        "granted": 4,
+        "redeemed": 2,
+        "returned": 0,
+        "expired": 0,
+        "accepted": 2,
+        "consumed": 2,
+        "dropped": 0,
+        "stale": 0,
+        "duplicate": 0,
+        "damaged": 0,
+        "undone": 0,
+        "running": 2,
+        "queued": 0,
+        "capacity": 2,
+    }
 
 
 def test_without_staleness_nothing_starts_during_an_update():
@@ -50,7 +64,9 @@ def test_without_staleness_nothing_starts_during_an_update():
 
 
 def test_a_resumed_learner_measures_from_its_checkpoint():
-    """Checkpoint at version 3, killed at 6, resumed as 7: that is the policy of 3, so 3 lags by 0, 4 and 2 by 1."""
+    """Checkpoint at version 3, killed at 6, resumed as 7: that is the policy of 3, so 3 lags by 0,
+    4 and 2 by 1.
+    """
     staleness = manager(max_staleness=1)
     staleness.restore(manager().durable(), 3)
     staleness.publish(7)
@@ -63,7 +79,9 @@ def test_a_resumed_learner_measures_from_its_checkpoint():
 
 
 def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_owner():
-    """An actor with one upload at a time would wait for the very place that its next ticket holds."""
+    """An actor with one upload at a time would wait for the very place that its next ticket
+    holds.
+    """
     staleness = manager(batch=1, max_staleness=0)  # room for 1
     assert staleness.grant(A, "new")
     assert staleness.arrive(B, "old", 0) == "full"
@@ -88,12 +106,24 @@ def test_checkpoint_keeps_what_is_settled():
     resumed.restore(durable, 7)
     assert resumed.version == 7 and resumed.capacity == 4  # (1 + 7 + 1) * 2 - 7 * 2
     counters = resumed.counters()
-    assert (counters["accepted"], counters["consumed"], counters["queued"], counters["running"]) == (1, 1, 0, 0)
-    assert (counters["granted"], counters["redeemed"], counters["duplicate"], counters["damaged"]) == (2, 2, 1, 2)
+    assert (
+        counters["accepted"],
+        counters["consumed"],
+        counters["queued"],
+        counters["running"],
+    ) == (1, 1, 0, 0)
+    assert (
+        counters["granted"],
+        counters["redeemed"],
+        counters["duplicate"],
+        counters["damaged"],
+    ) == (2, 2, 1, 2)
 
 
 class Admission(RuleBasedStateMachine):
-    """Actors, a learner and a clock in any order, checked against a model that keeps every rollout by name."""
+    """Actors, a learner and a clock in any order, checked against a model that keeps every rollout
+    by name.
+    """
 
     def __init__(self):
         super().__init__()
@@ -110,7 +140,8 @@ class Admission(RuleBasedStateMachine):
         self.next_id = 0
         self.delivered = []  # whose rollouts came in under a ticket
         self.granted = {}  # (owner, id) -> when
-        self.needed = {name: [] for name in "abc"}  # seconds of every rollout that came under a ticket
+        # Seconds of every rollout that came under a ticket
+        self.needed = {name: [] for name in "abc"}
         self.useful = []  # seconds of those that were accepted
         self.passed_over = set()  # tickets that were not waited for at some time
         self.late = set()  # whose tickets have expired: they may be put off
@@ -132,7 +163,8 @@ class Admission(RuleBasedStateMachine):
             self.tickets[owner, ticket.id] = ticket.version
             self.deadlines[owner, ticket.id] = ticket.deadline
             self.granted[owner, ticket.id] = self.now
-            assert self.staleness.grant(owner, ticket.id) is ticket  # sent again, it is the same request
+            # Sent again, it is the same request
+            assert self.staleness.grant(owner, ticket.id) is ticket
 
     @precondition(lambda self: self.tickets)
     @rule(data=st.data())
@@ -164,7 +196,11 @@ class Admission(RuleBasedStateMachine):
             assert verdict == "stale"
             self.fates["stale"] += 1
             self.needed[key[0][0]] += [self.now - self.granted[key]] if must_fit else []
-        elif must_fit or capacity > 0 or (mine := [held for held in self.tickets if held[0] == key[0]]):
+        elif (
+            must_fit
+            or capacity > 0
+            or (mine := [held for held in self.tickets if held[0] == key[0]])
+        ):
             assert verdict == "accepted"
             if not must_fit and capacity <= 0:  # under the oldest of its owner's tickets
                 del self.tickets[mine[0]]
@@ -202,7 +238,9 @@ class Admission(RuleBasedStateMachine):
     def wait(self, seconds):
         self.now += seconds
         self.late |= {key[0] for key in self.tickets if self.deadlines[key] <= self.now}
-        self.tickets = {key: version for key, version in self.tickets.items() if self.deadlines[key] > self.now}
+        self.tickets = {
+            key: version for key, version in self.tickets.items() if self.deadlines[key] > self.now
+        }
 
     @rule()
     def restart(self):
@@ -213,7 +251,9 @@ class Admission(RuleBasedStateMachine):
         self.tickets, self.queue, self.in_update = {}, [], 0
 
     def awaited(self, key):
-        """Nobody waits for one that takes four times as long as usual, nor for an actor that needs twice as long."""
+        """Nobody waits for one that takes four times as long as usual, nor for an actor that needs
+        twice as long.
+        """
         usual = statistics.median(self.useful) if self.useful else math.inf
         own = statistics.median(self.needed[key[0][0]][-16:] or [0.0])
         return self.now - self.granted[key] <= 4 * usual and own <= 2 * usual
@@ -228,8 +268,14 @@ class Admission(RuleBasedStateMachine):
             self.eta + version + 1
         ) * self.batch + len(self.passed_over)
         assert counts["running"] == len(self.tickets) and counts["queued"] == len(self.queue)
-        assert counts["capacity"] == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - awaited
-        assert counts["granted"] == counts["running"] + counts["redeemed"] + counts["returned"] + counts["expired"]
+        assert (
+            counts["capacity"]
+            == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - awaited
+        )
+        assert (
+            counts["granted"]
+            == counts["running"] + counts["redeemed"] + counts["returned"] + counts["expired"]
+        )
         assert {name: counts[name] for name in self.fates} == self.fates
 
 
@@ -238,7 +284,9 @@ TestAdmission.settings = settings(max_examples=60, stateful_step_count=40, deadl
 
 
 def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
-    """Batch 2 and eta 1 make four tickets. One certificate asks for all it can get, under ever new names, for ever."""
+    """Batch 2 and eta 1 make four tickets. One certificate asks for all it can get, under ever new
+    names, for ever.
+    """
     now = [0.0]
     staleness = manager(clock=lambda: now[0])
     updates, waited, last = 0, [], 0.0
@@ -250,7 +298,10 @@ def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
             for i in range(2):
                 if staleness.grant(("0.a", "1"), f"{step}.{i}"):
                     now[0] += 0.01
-                    assert staleness.arrive(("0.a", "1"), f"{step}.{i}", staleness.version) == "accepted"
+                    assert (
+                        staleness.arrive(("0.a", "1"), f"{step}.{i}", staleness.version)
+                        == "accepted"
+                    )
         if staleness.queued >= 2:
             for _ in range(2):
                 assert staleness.take(staleness.version)
@@ -259,13 +310,15 @@ def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
             waited.append(now[0] - last)
             last = now[0]
     assert updates > 500 and max(waited) < 1.0
-    # Expired tickets put the certificate off, longer each time: it held few of what it asked 9,000 times for.
+    # Expired tickets put the certificate off, longer each time: it held few of what it asked 9,000
+    # times for.
     assert 4 < staleness.counters()["expired"] < 40
 
 
 def test_shares_follow_what_was_delivered_and_expiry_what_was_needed():
     now = [0.0]
-    staleness = manager(batch=4, ticket_seconds=120.0, tickets_per_owner=10, clock=lambda: now[0])  # eight tickets
+    # Eight tickets
+    staleness = manager(batch=4, ticket_seconds=120.0, tickets_per_owner=10, clock=lambda: now[0])
 
     def held(name):
         tickets = [staleness.grant((name, "1"), str(i)) for i in range(8)]
@@ -313,7 +366,9 @@ _RETRY = 0.05  # seconds until an actor that got no ticket asks again
 
 
 class Simulation:
-    """Actors that ask for tickets, make rollouts one after another and send them, at most two at a time."""
+    """Actors that ask for tickets, make rollouts one after another and send them, at most two at a
+    time.
+    """
 
     def __init__(self, eta, batch, update=0.01):
         """A learner that needs so many seconds for an update."""
@@ -339,9 +394,18 @@ class Simulation:
         heapq.heappush(self._events, (when, next(self._count), act, arguments))
 
     def _ask(self, name, make, send, sending):
-        ticket = self.staleness.grant((name, "1"), f"t{next(self._count)}") if sending[0] < 2 else None
+        ticket = (
+            self.staleness.grant((name, "1"), f"t{next(self._count)}") if sending[0] < 2 else None
+        )
         if ticket is None:
-            self._at(self.now + (_RETRY if sending[0] < 2 else 0.001), self._ask, name, make, send, sending)
+            self._at(
+                self.now + (_RETRY if sending[0] < 2 else 0.001),
+                self._ask,
+                name,
+                make,
+                send,
+                sending,
+            )
         else:
             self._at(self.now + make, self._made, ticket, name, make, send, sending)
 
@@ -377,7 +441,9 @@ FAST = {"make": 0.05, "send": 0.01}  # 20 rollouts a second
 
 
 def among(eta, batch, *others, seconds=20.0):
-    """A simulation with a fast actor that has been there for some seconds, and others; and the paces of all."""
+    """A simulation with a fast actor that has been there for some seconds, and others; and the
+    paces of all.
+    """
     simulation = Simulation(eta, batch)
     simulation.actor("fast", **FAST)
     simulation.run(5.0)
@@ -389,18 +455,22 @@ def among(eta, batch, *others, seconds=20.0):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("send", [0.1, 10.0, *(pytest.param(send, marks=pytest.mark.slow) for send in (0.3, 2.0))])
+@pytest.mark.parametrize(
+    "send", [0.1, 10.0, *(pytest.param(send, marks=pytest.mark.slow) for send in (0.3, 2.0))]
+)
 @pytest.mark.parametrize(("eta", "batch"), [(0, 2), (0, 8), (1, 1), (1, 2), (1, 4), (2, 2)])
 def test_an_actor_keeps_its_pace_beside_slow_links(eta, batch, send, count):
-    """0.8 MB over links of 8 MB/s to 80 kB/s. Where an update waited for every ticket, the least of these was 0.03."""
+    """0.8 MB over links of 8 MB/s to 80 kB/s. Where an update waited for every ticket, the least of
+    these was 0.03.
+    """
     (alone,) = among(eta, batch)
     assert among(eta, batch, *[{"make": 0.05, "send": send}] * count)[0] > 0.9 * alone
 
 
 @pytest.mark.parametrize(("batch", "least"), [(2, 1.0), (8, 6.0)])
 def test_what_a_slower_actor_makes_in_time_is_learnt_from(batch, least):
-    """Nobody waits for a rollout of 0.15 s, which is three times as slow; all of them are fresh enough where updates
-    of eight take 0.4 s, and some where those of two take 0.1 s."""
+    """Nobody waits for a rollout of 0.15 s, which is three times as slow; all of them are fresh
+    enough where updates of eight take 0.4 s, and some where those of two take 0.1 s."""
     _, *others = among(1, batch, *[{"make": 0.15, "send": 0.01}] * 2)
     assert min(others) > least
 

@@ -6,23 +6,33 @@ from congrasp.learner.statistics import CollapseWatch, Pace, overall, summary
 
 
 def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Message:
-    arrays = {name.replace("_", "/", 1): np.array(values, np.float32) for name, values in episodes.items()}
+    arrays = {
+        name.replace("_", "/", 1): np.array(values, np.float32) for name, values in episodes.items()
+    }
     return Message({**arrays, "reward": np.zeros((1, steps))}, {"version": version, "steps": steps})
 
 
 def figures(*batches: list[Message]) -> dict[str, float]:
     return overall(
-        [summary(messages, [9 - int(message.meta["version"]) for message in messages]) for messages in batches]
+        [
+            summary(messages, [9 - int(message.meta["version"]) for message in messages])
+            for messages in batches
+        ]
     )
 
 
 def episode_means(messages: list[Message]) -> dict[str, float]:
-    return {name: value for name, value in figures(messages).items() if not name.startswith("staleness")}
+    return {
+        name: value for name, value in figures(messages).items() if not name.startswith("staleness")
+    }
 
 
 def test_means_are_over_episodes_and_not_over_rollouts():
     means = episode_means(
-        [rollout(episode_return=[1, 0, 0], term_drop=[-1, -2, -3]), rollout(episode_return=[1], term_drop=[0])]
+        [
+            rollout(episode_return=[1, 0, 0], term_drop=[-1, -2, -3]),
+            rollout(episode_return=[1], term_drop=[0]),
+        ]
     )
     assert means == {"episode/return": 0.5, "term/drop": -1.5, "episodes": 4.0}
 
@@ -100,7 +110,12 @@ def test_the_batches_of_several_ranks_count_as_one():
     ]
     means, joint = figures(first, second), figures([*first, *second])
     assert means == pytest.approx(joint)
-    expected = {"episode/success": 0.5, "episode/pose_rad": 0.25, "success/pose": 0.5, "episodes": 4.0}
+    expected = {
+        "episode/success": 0.5,
+        "episode/pose_rad": 0.25,
+        "success/pose": 0.5,
+        "episodes": 4.0,
+    }
     expected |= {"staleness_mean": 1.0, "staleness_max": 2.0}
     assert {name: means[name] for name in expected} == pytest.approx(expected)
 
@@ -122,7 +137,8 @@ def first_alarm(success, links, patience=20):
 
 
 def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
-    # Ten updates at 80 % and then none: the mean of ten is below 40 % from the sixth on, so the twentieth is the 25th.
+    # Ten updates at 80 % and then none: the mean of ten is below 40 % from the sixth on, so the
+    # twentieth is the 25th.
     update, said = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
     assert update == 10 + 6 + 19
     assert "fell from 80% to 0%" in said

@@ -35,7 +35,9 @@ congrasp = functools.partial(python, "-m", "congrasp")
 
 
 def is_one_line(code: int, said: str, words: str) -> None:
-    """What was said on the standard error is one line with these words, and the exit code tells of bad input."""
+    """What was said on the standard error is one line with these words, and the exit code tells of
+    bad input.
+    """
     assert code not in (0, 1), said
     (line,) = errors(said)
     assert line.startswith("congrasp: error: ")
@@ -54,44 +56,89 @@ def test_help_names_every_command_and_every_command_exists():
     ("arguments", "words"),
     [
         (["levitate"], "no command 'levitate'"),
-        (["train", "--ppo.learningrate", "1"], "Unrecognized options: --ppo.learningrate.*meant --ppo.learning-rate"),
+        (
+            ["train", "--ppo.learningrate", "1"],
+            "Unrecognized options: --ppo.learningrate.*meant --ppo.learning-rate",
+        ),
         (["train", "--updates", "many"], "--updates.*'many'"),
         (["train", "--physics", "abacus"], "'abacus'.*'native'"),
         (["render", "hnad"], "hnad.*--help"),
-        (["render", "episode", "/dev/null", "--moments", "0"], "--frames is 0. It must be at least 1"),
+        (
+            ["render", "episode", "/dev/null", "--moments", "0"],
+            "--frames is 0. It must be at least 1",
+        ),
         (["warmup", "--preset", "nonsense"], "no preset 'nonsense'"),
         (["train", "--method", "pd"], "'pd' does not learn.*evaluate --method pd"),
-        (["evaluate", "--method", "graspxl"], "has the method 'ours', not 'graspxl'.*train --method graspxl"),
+        (
+            ["evaluate", "--method", "graspxl"],
+            "has the method 'ours', not 'graspxl'.*train --method graspxl",
+        ),
         (["train", "--task.hand", "paw"], "no hand 'paw'"),
         (["train", "--resume", "--run-dir", "/nonexistent-run"], "is not a run directory"),
-        (["evaluate", "--policy", "/nonexistent.safetensors"], "--policy: there is no file /nonexistent.safetensors"),
-        (["evaluate", "--json", "/dev/null/x.json"], "--json is /dev/null/x.json, but /dev/null is a file"),
-        (["grasp", "mug:7", "--out", "/dev/null/x"], "--out is /dev/null/x, but /dev/null is a file"),
-        (["objects", "generate", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
+        (
+            ["evaluate", "--policy", "/nonexistent.safetensors"],
+            "--policy: there is no file /nonexistent.safetensors",
+        ),
+        (
+            ["evaluate", "--json", "/dev/null/x.json"],
+            "--json is /dev/null/x.json, but /dev/null is a file",
+        ),
+        (
+            ["grasp", "mug:7", "--out", "/dev/null/x"],
+            "--out is /dev/null/x, but /dev/null is a file",
+        ),
+        (
+            ["objects", "generate", "--out", "/dev/null"],
+            "--out is the file /dev/null. Pass a folder",
+        ),
         (["reproduce", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["report", "--out", "/"], "--out is the folder /. Pass a file"),
-        (["render", "hand", "--out", "hand.pdf"], "--out is hand.pdf, but the picture is a PNG. End its name in .png"),
-        (["objects", "show", "mug:7", "--png", "x.jpg"], "--png is x.jpg, but the picture is a PNG"),
+        (
+            ["render", "hand", "--out", "hand.pdf"],
+            "--out is hand.pdf, but the picture is a PNG. End its name in .png",
+        ),
+        (
+            ["objects", "show", "mug:7", "--png", "x.jpg"],
+            "--png is x.jpg, but the picture is a PNG",
+        ),
         (["export", "policy", "--out", "/"], "--out is the folder /. Pass a file"),
         (["export", "motion", "/", "--out", "/dev/null/x.glb"], "--out is /dev/null/x.glb, but"),
-        (["plot", "/nonexistent-run", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
-        (["hands", "train", "no-hand", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
-        (["constraints", "import", "grab", "/", "--objects", "/dev/null"], "--objects is the file /dev/null. Pass a"),
+        (
+            ["plot", "/nonexistent-run", "--out", "/dev/null"],
+            "--out is the file /dev/null. Pass a folder",
+        ),
+        (
+            ["hands", "train", "no-hand", "--out", "/dev/null"],
+            "--out is the file /dev/null. Pass a folder",
+        ),
+        (
+            ["constraints", "import", "grab", "/", "--objects", "/dev/null"],
+            "--objects is the file /dev/null. Pass a",
+        ),
         (["grasp", "mug:7", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
-        (["serve", "--hand", str(URDF)], "claw.urdf is a robot description.*'congrasp hands import .*claw.urdf'"),
+        (
+            ["serve", "--hand", str(URDF)],
+            "claw.urdf is a robot description.*'congrasp hands import .*claw.urdf'",
+        ),
         (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
         (["serve", "--policy", "/nonexistent"], "cannot be read"),
         (["actor", "--connect", "nonsense"], "endpoint"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
         (["plot", "x" * 300], "x cannot be used: File name too long"),
         (["status", "/dev/null"], "/dev/null is not a run directory"),
-        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "there is no file /nonexistent.safetensors"),
+        (
+            ["grasp", "mug:7", "--policy", "/nonexistent.safetensors"],
+            "there is no file /nonexistent.safetensors",
+        ),
         (["grasp", "mug:7", "--policy", "/"], "/ is not a regular file"),
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
-        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 1 to 1024"),
+        (
+            ["grasp", "mug:7", "--attempts", "100000000"],
+            "--attempts is 100000000. It must be from 1 to 1024",
+        ),
         (["grasp"], "nothing to grasp"),
         (["grasp", ""], "An argument is empty"),
         (["grasp", "mug:7", "--out", ""], "--out is empty"),
@@ -103,27 +150,58 @@ def test_help_names_every_command_and_every_command_exists():
         (["objects", "import"], "nothing to import"),
         (["objects", "import", "nothing"], "no file or folder nothing. Check the path"),
         *(
-            (["objects", "import", MESH, f"--{key}", value], f"--{key} is .*It must be positive, and at most {end}[.]")
+            (
+                ["objects", "import", MESH, f"--{key}", value],
+                f"--{key} is .*It must be positive, and at most {end}[.]",
+            )
             for key, value, end in (
-                *(("mass", "0", "50 kg"), ("mass", "300", "50 kg. Give kilograms"), ("density", "-1", "25000 kg/m.3")),
-                *(("density", "25001", "25000 kg/m.3"), ("scale", "0", "1e9"), ("scale", "1e10", "1e9")),
-                *(("scale", "inf", "1e9"), ("time-limit", "nan", "1e6 s"), ("max-pieces", "0", "1e19")),
+                *(
+                    ("mass", "0", "50 kg"),
+                    ("mass", "300", "50 kg. Give kilograms"),
+                    ("density", "-1", "25000 kg/m.3"),
+                ),
+                *(
+                    ("density", "25001", "25000 kg/m.3"),
+                    ("scale", "0", "1e9"),
+                    ("scale", "1e10", "1e9"),
+                ),
+                *(
+                    ("scale", "inf", "1e9"),
+                    ("time-limit", "nan", "1e6 s"),
+                    ("max-pieces", "0", "1e19"),
+                ),
             )
         ),
-        (["objects", "import", MESH, "--material", "wood", "--density", "3"], "--material and --density both say"),
+        (
+            ["objects", "import", MESH, "--material", "wood", "--density", "3"],
+            "--material and --density both say",
+        ),
         (["objects", "list", "/nonexistent-folder"], "no folder"),
-        (["serve", "--metrics-port", "99999999"], "metrics cannot be served at .*:99999999.*--metrics-port"),
+        (
+            ["serve", "--metrics-port", "99999999"],
+            "metrics cannot be served at .*:99999999.*--metrics-port",
+        ),
         (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
-        (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
+        (
+            ["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"],
+            "other machines.*--certs",
+        ),
         (["serve", "--listen", "tcp/[::]:7457"], "other machines.*--certs.*--insecure"),
         (["train", "--listen", "tcp/10.0.0.5:7447"], "other machines.*--certs"),
-        (["actor", "--certs", "/nonexistent-certs"], "missing.*congrasp certs issue .*--role actor"),
-        (["certs", "issue", "/nonexistent-certs", "--role", "actor"], "no authority.*congrasp certs init"),
+        (
+            ["actor", "--certs", "/nonexistent-certs"],
+            "missing.*congrasp certs issue .*--role actor",
+        ),
+        (
+            ["certs", "issue", "/nonexistent-certs", "--role", "actor"],
+            "no authority.*congrasp certs init",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch, capfd):
     """In this process: starting one and importing JAX takes seconds each time."""
-    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])  # roles add one that stays
+    # Roles add one that stays
+    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
     with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
         cli.main(arguments)
     is_one_line(end.value.code, capfd.readouterr().err, words)
@@ -151,8 +229,10 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
 
 def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path):
     program = (
-        "import time; import congrasp.services.cli.main as cli; from congrasp.actors.physics import ENGINES; "
-        "ENGINES['native'] = ENGINES['native']._replace(prepare=lambda *_: time.sleep(3600)); cli.main()"
+        "import time; import congrasp.services.cli.main as cli; from congrasp.actors.physics "
+        "import ENGINES; "
+        "ENGINES['native'] = ENGINES['native']._replace(prepare=lambda *_: time.sleep(3600)); "
+        "cli.main()"
     )
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port, options = str(taken.getsockname()[1]), ["--physics", "native", "--actors", "0"]
@@ -167,7 +247,8 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
     [
         (
             OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/data/version"),
-            "/data/version could not be written: No space left on device. Free space and start again.",
+            "/data/version could not be written: No space left on device. Free space and start "
+            "again.",
         ),
         (
             OSError(errno.EIO, os.strerror(errno.EIO)),
@@ -179,7 +260,9 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         ),
     ],
 )
-def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, line, monkeypatch, capsys):
+def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(
+    error, line, monkeypatch, capsys
+):
     def fail(arguments):
         raise error
 
@@ -192,7 +275,8 @@ def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, lin
 
 @pytest.mark.parametrize("name", ["JAX_PLATFORMS", "MUJOCO_GL", ""])
 def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys):
-    error = RuntimeError(f"invalid value for {name}") if name else AssertionError()  # as JAX, without a platform
+    # As JAX, without a platform
+    error = RuntimeError(f"invalid value for {name}") if name else AssertionError()
     error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
     monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
     monkeypatch.delenv(name or "JAX_PLATFORMS", raising=False)
@@ -219,14 +303,19 @@ def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_pla
     ("said", "what"),
     [
         (
-            "NOT_FOUND: None.\nRESOURCE_EXHAUSTED: Out of memory while trying to allocate 40.02GiB. [error]",
+            "NOT_FOUND: None.\nRESOURCE_EXHAUSTED: Out of memory while trying to allocate "
+            "40.02GiB. [error]",
             "Out of memory while trying to allocate 40.02GiB",
         ),
         (
-            "RESOURCE_EXHAUSTED: Failed to allocate request for 16.00GiB (17179869184B) on device ordinal 0",
+            "RESOURCE_EXHAUSTED: Failed to allocate request for 16.00GiB (17179869184B) on device "
+            "ordinal 0",
             "Failed to allocate request for 16.00GiB (17179869184B) on device ordinal 0",
         ),
-        ("Failed to allocate 9000 bytes on device 'cuda:0'", "Failed to allocate 9000 bytes on device 'cuda:0'"),
+        (
+            "Failed to allocate 9000 bytes on device 'cuda:0'",
+            "Failed to allocate 9000 bytes on device 'cuda:0'",
+        ),
         ("INTERNAL: CUDA_ERROR_OUT_OF_MEMORY", "OUT_OF_MEMORY"),
     ],
 )
@@ -237,20 +326,31 @@ def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, m
     assert end.value.code == 1
     (line,) = errors(capsys.readouterr().err)
     assert line.startswith(
-        f"congrasp: error: The device's memory does not suffice: {what}. Choose fewer --environments"
+        f"congrasp: error: The device's memory does not suffice: {what}. Choose fewer "
+        f"--environments"
     )
 
 
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG])
-def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(number, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "number", [errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG]
+)
+def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(
+    number, monkeypatch, capsys
+):
     def refuse(arguments):
         raise OSError(number, os.strerror(number), *arguments)
 
     monkeypatch.setattr(cli, "run", refuse)
     with pytest.raises(SystemExit) as end:
         cli.main(["/data/grasps"])
-    is_one_line(end.value.code, capsys.readouterr().err, f"/data/grasps cannot be used: {os.strerror(number)}. Check")
-    with pytest.raises(OSError, match=os.strerror(number)):  # it names nothing that a user could mend
+    is_one_line(
+        end.value.code,
+        capsys.readouterr().err,
+        f"/data/grasps cannot be used: {os.strerror(number)}. Check",
+    )
+    with pytest.raises(
+        OSError, match=os.strerror(number)
+    ):  # it names nothing that a user could mend
         cli.main([])
 
 
@@ -258,7 +358,12 @@ def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(numbe
 def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
     """Only bad input ends a run's process for good; another code would start it again and again."""
     with open("/dev/full", "wb") as full:
-        assert congrasp("levitate", stdout=full, stderr=full, capture_output=False, timeout=60).returncode == 2
+        assert (
+            congrasp(
+                "levitate", stdout=full, stderr=full, capture_output=False, timeout=60
+            ).returncode
+            == 2
+        )
 
 
 def test_a_reader_that_is_gone_is_no_error():
@@ -280,13 +385,23 @@ def test_an_output_without_some_characters_gets_escapes():
     ("shell", "code", "words"),
     [
         ("exec {} -m congrasp objects list --families >&-", 0, ""),
-        ("mkdir a && cd a && rmdir ../a && exec {} -m congrasp objects generate --out b", 2, "working folder does not"),
+        (
+            "mkdir a && cd a && rmdir ../a && exec {} -m congrasp objects generate --out b",
+            2,
+            "working folder does not",
+        ),
     ],
 )
-def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(tmp_path, shell, code, words):
+def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(
+    tmp_path, shell, code, words
+):
     command = ["sh", "-c", shell.format(sys.executable)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr, done.stderr
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr, (
+        done.stderr
+    )
 
 
 @pytest.mark.parametrize("late", [True, False])
@@ -322,7 +437,9 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
         busy.bind(("127.0.0.1", port))
         busy.listen()
         with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
-            cli.main(["learner", "--run-dir", str(tmp_path / "run"), "--listen", f"tcp/127.0.0.1:{port}"])
+            cli.main(
+                ["learner", "--run-dir", str(tmp_path / "run"), "--listen", f"tcp/127.0.0.1:{port}"]
+            )
     is_one_line(end.value.code, capfd.readouterr().err, f"127.0.0.1:{port} is in use")
     assert not (tmp_path / "run").exists()
 
@@ -336,33 +453,57 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
 )
 def test_a_missing_package_is_named_before_the_work(package, arguments, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    with mock.patch.dict(os.environ), pytest.raises(MissingPackageError, match=rf"'{package}'.*congrasp\[viz\]"):
+    with (
+        mock.patch.dict(os.environ),
+        pytest.raises(MissingPackageError, match=rf"'{package}'.*congrasp\[viz\]"),
+    ):
         cli.run(arguments)
 
 
 def test_without_a_home_and_a_cache_everything_works(tmp_path):
     """One line says that nothing is cached."""
     trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "box.stl")
-    environment = {name: text for name, text in os.environ.items() if not name.startswith(("XDG_", "JAX_COMP"))}
+    environment = {
+        name: text for name, text in os.environ.items() if not name.startswith(("XDG_", "JAX_COMP"))
+    }
     done = subprocess.run(
-        [sys.executable, "-m", "congrasp", "objects", "import", tmp_path / "box.stl", "--out", tmp_path],
+        [
+            sys.executable,
+            "-m",
+            "congrasp",
+            "objects",
+            "import",
+            tmp_path / "box.stl",
+            "--out",
+            tmp_path,
+        ],
         env={**environment, "HOME": "/proc/nowhere", "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, timeout=180,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=180,
+    )
     assert done.returncode == 0 and (tmp_path / "box.safetensors").is_file(), done.stderr
     assert done.stderr.count("/proc/nowhere") == done.stderr.count("XDG_CACHE_HOME") == 1
 
 
-def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_misspelt_file_is_named_before_anything_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "mug.obj").touch()
     monkeypatch.setattr(cli, "load", lambda name: pytest.fail("the command's module was imported"))
-    with pytest.raises(CongraspError, match=r"There is no file .*mugg\.obj\. Did you mean .*mug\.obj\?"):
+    with pytest.raises(
+        CongraspError, match=r"There is no file .*mugg\.obj\. Did you mean .*mug\.obj\?"
+    ):
         cli.run(["grasp", str(tmp_path / "mugg.obj"), "--out", "new.obj"])
-    with pytest.raises(CongraspError, match=r"--pose: there is no file .*far\.npz\. Check the path\."):
+    with pytest.raises(
+        CongraspError, match=r"--pose: there is no file .*far\.npz\. Check the path\."
+    ):
         cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])
 
 
-def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(capsys: pytest.CaptureFixture) -> None:
+def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(
+    capsys: pytest.CaptureFixture,
+) -> None:
     with announced("Compiling", first=60.0):
         pass
     assert not capsys.readouterr().err

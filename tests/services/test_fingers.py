@@ -1,4 +1,6 @@
-"""Constraints beyond the paper's, requested of a policy that knows them and of one that does not, at every door."""
+"""Constraints beyond the paper's, requested of a policy that knows them and of one that does not,
+at every door.
+"""
 
 import dataclasses
 import pathlib
@@ -49,8 +51,17 @@ def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
     request, state = example.request, example.state
     given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
-    given |= {"q_target": request.q, "q_initial": request.q, "u_target": np.zeros(6), "time": np.float32(0)}
-    given |= {"base_position": request.wrist[0], "base_quaternion": request.wrist[1], "table": np.bool_(True)}
+    given |= {
+        "q_target": request.q,
+        "q_initial": request.q,
+        "u_target": np.zeros(6),
+        "time": np.float32(0),
+    }
+    given |= {
+        "base_position": request.wrist[0],
+        "base_quaternion": request.wrist[1],
+        "table": np.bool_(True),
+    }
     given |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
     return {**given, **state, "surface_points": request.surface}
 
@@ -58,15 +69,20 @@ def query(example: Example) -> dict[str, np.ndarray]:
 # A policy that does not know it.
 
 
-@pytest.mark.parametrize(("name", "option"), [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--gentle"])])
-def test_the_command_refuses_it_in_one_line(paper_policy, tmp_path, monkeypatch, capsys, quick_import, name, option):
+@pytest.mark.parametrize(
+    ("name", "option"), [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--gentle"])]
+)
+def test_the_command_refuses_it_in_one_line(
+    paper_policy, tmp_path, monkeypatch, capsys, quick_import, name, option
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
     assert load("grasp")([str(tmp_path / "block.stl"), *options, *option])() == 2
     (line,) = errors(capsys.readouterr().err)
     assert line.startswith(
-        f"congrasp: error: The policy does not support the constraint '{name}'. It supports heading, "
+        f"congrasp: error: The policy does not support the constraint '{name}'. It supports "
+        f"heading, "
     )
     assert not (tmp_path / "out" / "block" / RESULT).exists()
 
@@ -84,11 +100,17 @@ def test_the_studio_refuses_it_in_one_line() -> None:
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.choose("fingers", "allowed", PINCH.tolist())
-    assert studio.asked == set() and [row["name"] for row in describe_request(studio)["constraints"]] == list(PAPER)
+    assert studio.asked == set() and [
+        row["name"] for row in describe_request(studio)["constraints"]
+    ] == list(PAPER)
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
-    own = Experiment(untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))), [MUG], episodes=1)
+    own = Experiment(
+        untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))),
+        [MUG],
+        episodes=1,
+    )
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         own.run([Variation("fingers")])
 
@@ -96,11 +118,16 @@ def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
 # A policy that knows it.
 
 
-def test_a_grasp_with_two_fingers_and_a_force_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_with_two_fingers_and_a_force_limit(
+    policy: PolicyBundle, tmp_path: pathlib.Path
+) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert found.motion.constraints == ("heading", "fingers", "force") and "fingers_ratio" in found.facts()
+    assert (
+        found.motion.constraints == ("heading", "fingers", "force")
+        and "fingers_ratio" in found.facts()
+    )
     assert 0.0 <= found.facts()["force_ratio"] <= 1.0
     save_motion(tmp_path / "grasp.npz", found.motion)
     goal = load_motion(tmp_path / "grasp.npz").goal
@@ -134,7 +161,9 @@ def ask(policy, query):
 
 def test_queries_for_it_are_answered_and_checked(ask) -> None:
     pinch = ask(["heading", "fingers"], fingers_allowed=PINCH)
-    assert pinch.active == [["Only the named fingers may touch the object.", "The heading guides the wrist."]]
+    assert pinch.active == [
+        ["Only the named fingers may touch the object.", "The heading guides the wrist."]
+    ]
     free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
@@ -159,7 +188,9 @@ def test_the_studio_asks_for_what_is_allowed_alone() -> None:
     assert describe_request(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
     studio.choose("fingers", "allowed", [True, False, False, False, False])
-    assert studio.trouble == "The constraint 'fingers' needs the thumb and another finger. Allow both."
+    assert (
+        studio.trouble == "The constraint 'fingers' needs the thumb and another finger. Allow both."
+    )
     for values in ([True], "thumb"):
         with pytest.raises(CongraspError, match="'fingers' takes 5 flags"):
             studio.choose("fingers", "allowed", values)

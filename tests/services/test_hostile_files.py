@@ -1,4 +1,6 @@
-"""Files with names, values, sizes and depths that no file of ours has: one line each, in bounded memory and time."""
+"""Files with names, values, sizes and depths that no file of ours has: one line each, in bounded
+memory and time.
+"""
 
 import dataclasses
 import json
@@ -21,7 +23,13 @@ from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp import wrist_paths
-from congrasp.services.record.reader import metrics_of, pick_episode, read_episodes, read_metrics, read_records
+from congrasp.services.record.reader import (
+    metrics_of,
+    pick_episode,
+    read_episodes,
+    read_metrics,
+    read_records,
+)
 from congrasp.services.record.scene import EPISODE_SCHEMA
 from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel
 from tests.episodes import episode
@@ -52,10 +60,22 @@ OBJECT = _saved(lambda path: store.save(generate(0, "box"), path))
     ("kind", "data", "why"),
     [
         ("object", None, "There is no object file"),
-        ("object", OBJECT[:-5] + bytes([OBJECT[-5] ^ 1]) + OBJECT[-4:], "cannot be read as an object: .*checksum"),
+        (
+            "object",
+            OBJECT[:-5] + bytes([OBJECT[-5] ^ 1]) + OBJECT[-4:],
+            "cannot be read as an object: .*checksum",
+        ),
         ("object", OBJECT[: len(OBJECT) // 2], "cannot be read as an object"),
-        ("object", encode(Message({}, {"kind": "bundle", "format": 1})), "not an object of this version"),
-        ("object", encode(Message({}, {"kind": "object", "format": 1})), "lacks an array or a field"),
+        (
+            "object",
+            encode(Message({}, {"kind": "bundle", "format": 1})),
+            "not an object of this version",
+        ),
+        (
+            "object",
+            encode(Message({}, {"kind": "object", "format": 1})),
+            "lacks an array or a field",
+        ),
         ("set", None, "cannot be read"),
         ("set", b"not a set", "cannot be read as a constraint set"),
         ("set", OBJECT, "not a constraint set"),
@@ -64,7 +84,11 @@ OBJECT = _saved(lambda path: store.save(generate(0, "box"), path))
         ("motion", None, "cannot be read: No such file"),
         ("motion", b"PK nothing", r"not a grasp motion \(it is not an NPZ file, or was cut\)"),
         ("motion", _saved(np.savez, np.zeros(3)), "not a grasp motion"),
-        ("motion", _saved(lambda path: np.savez(path, meta=np.array({"a": 1}, object))), "not a grasp motion"),
+        (
+            "motion",
+            _saved(lambda path: np.savez(path, meta=np.array({"a": 1}, object))),
+            "not a grasp motion",
+        ),
         ("policy", None, "cannot be read"),
         ("policy", policy_file(None).read_bytes()[:-5], "is damaged"),
     ],
@@ -86,7 +110,24 @@ def test_names_are_names(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["", ".", "..", "../../x", "/etc/x", "a/b", "a\\b", ".x", "-x", "a\n", "a\0", "x" * 101, None, 3, ["a"]]
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        "../../x",
+        "/etc/x",
+        "a/b",
+        "a\\b",
+        ".x",
+        "-x",
+        "a\n",
+        "a\0",
+        "x" * 101,
+        None,
+        3,
+        ["a"],
+    ],
 )
 def test_paths_and_anything_else_are_not(name):
     with pytest.raises(CongraspError, match="cannot name an object"):
@@ -94,12 +135,23 @@ def test_paths_and_anything_else_are_not(name):
 
 
 def test_letters_of_any_script_stay_in_names_and_equal_names_become_distinct():
-    for text, name in (("कटोरी 1/2", "कटोरी_1_2"), ("e\u0301", "é"), ("..\x1b[1m", "1m"), ("☕", "object")):
+    for text, name in (
+        ("कटोरी 1/2", "कटोरी_1_2"),
+        ("e\u0301", "é"),
+        ("..\x1b[1m", "1m"),
+        ("☕", "object"),
+    ):
         assert safe_name(text) == name
         file_name(name, "an object")
     long = [safe_name(letter * 150 + end) for letter in "x碗" for end in "ab"]
     assert len({file_name(name, "an object") for name in long}) == 4
-    assert distinct_names(["mug", "Mug", "mug", "mug-2", "cup"]) == ["mug", "Mug-3", "mug-4", "mug-2", "cup"]
+    assert distinct_names(["mug", "Mug", "mug", "mug-2", "cup"]) == [
+        "mug",
+        "Mug-3",
+        "mug-4",
+        "mug-2",
+        "cup",
+    ]
 
 
 def test_an_object_that_names_another_folder_is_not_read(tmp_path):
@@ -134,7 +186,10 @@ def _with(values, index, value):
     [
         (lambda o: {"mass": -1.0}, "mass is -1.0"),
         (lambda o: {"mass": 1e300}, r"mass is 1e\+300"),
-        (lambda o: {"points": _with(o.points, (3, 1), NAN)}, "points holds numbers that are not finite"),
+        (
+            lambda o: {"points": _with(o.points, (3, 1), NAN)},
+            "points holds numbers that are not finite",
+        ),
         (lambda o: {"points": _with(o.points, 3, 1e9)}, r"points goes up to 1e\+09"),
         (lambda o: {"points": o.points[:7]}, "points has the shape"),
         (lambda o: {"normals": 0 * o.normals}, "normals are not normalised"),
@@ -147,8 +202,14 @@ def _with(values, index, value):
         (lambda o: {"rest_poses": 2 * o.rest_poses}, "quaternions"),
         (lambda o: {"visual_faces": o.visual_faces + 10**6}, "visual_faces"),
         (lambda o: {"pieces": o.pieces * 200}, "pieces"),
-        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], size=(-1.0, 1.0, 1.0)),)}, "piece 0 has the size"),
-        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)}, "numbers that are not finite"),
+        (
+            lambda o: {"pieces": (dataclasses.replace(o.pieces[0], size=(-1.0, 1.0, 1.0)),)},
+            "piece 0 has the size",
+        ),
+        (
+            lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)},
+            "numbers that are not finite",
+        ),
         (lambda o: {"file_scale": 0.0}, "file_scale"),
     ],
 )
@@ -196,7 +257,10 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
         (lambda h: h.update(links=h["links"] * 1000), "the limit is"),
         (lambda h: h.update(name="../../x"), "the name"),
         (lambda h: h.update(object_scale=INF), "not a finite number"),
-        (lambda h: h.update(links=h["links"][:1], open_pose={}, closed_pose={}), "it has no joints"),
+        (
+            lambda h: h.update(links=h["links"][:1], open_pose={}, closed_pose={}),
+            "it has no joints",
+        ),
         (
             lambda h: h.update(couplings=[{"joint": "a", "leader": "b", "ratio": 1.0}] * 20_000),
             "more than 64 couplings",
@@ -209,7 +273,10 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
         (lambda h: h.update(links=3), "not a hand"),
         (lambda h: h.update(thumb="palm"), "the thumb must be a link with a tip"),
         (lambda h: h.update(open_pose={"elbow": 1.0}), "is not a joint"),
-        (lambda h: h.update(closed_pose={"left_root": 3.0}), "outside its limits in the closed pose"),
+        (
+            lambda h: h.update(closed_pose={"left_root": 3.0}),
+            "outside its limits in the closed pose",
+        ),
         (lambda h: h.update(format=2), "format 2"),
         (lambda h: h.update(wings=2), "'wings'|wings"),
         (lambda h: h.clear(), "has the format None"),
@@ -238,16 +305,28 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
     [
         (lambda m: {"object": "../../x"}, "cannot name the object"),
         (lambda m: {"control_dt": 0.0}, "control_dt"),
-        (lambda m: {"joint_position": m.joint_position * NAN}, "joint_position holds numbers that are not finite"),
-        (lambda m: {"joint_limits": m.joint_limits[:, ::-1]}, "joint_limits are in the wrong order"),
+        (
+            lambda m: {"joint_position": m.joint_position * NAN},
+            "joint_position holds numbers that are not finite",
+        ),
+        (
+            lambda m: {"joint_limits": m.joint_limits[:, ::-1]},
+            "joint_limits are in the wrong order",
+        ),
         (lambda m: {"link_parent": m.link_parent + 100}, "link_parent names links"),
         (lambda m: {"capsule_radius": -m.capsule_radius}, "capsule_radius"),
         (lambda m: {"table": m.table.astype(float)}, "table has the type"),
         (lambda m: {"time": m.time[:3]}, r"table has shape \(12,\), but \(T,\) requires \(3,\)"),
         (lambda m: {"object_vertices": m.object_vertices[:0]}, "object_vertices is empty"),
         (lambda m: {"object_faces": m.object_faces + 1000}, "names vertices that do not exist"),
-        (lambda m: {"wrist_quaternion": 0 * m.wrist_quaternion}, r"a\.npz's wrist_quaternion has .* not normalised"),
-        (lambda m: {"wrist_quaternion": m.wrist_quaternion[:, :3]}, r"has shape \(12, 3\), but \(T, 4\) requires"),
+        (
+            lambda m: {"wrist_quaternion": 0 * m.wrist_quaternion},
+            r"a\.npz's wrist_quaternion has .* not normalised",
+        ),
+        (
+            lambda m: {"wrist_quaternion": m.wrist_quaternion[:, :3]},
+            r"has shape \(12, 3\), but \(T, 4\) requires",
+        ),
     ],
 )
 def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
@@ -258,7 +337,13 @@ def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
 
 
 def constraint_set():
-    made = {"object": "mug", "hand": "human", "object_scale": 1.0, "object_digest": "0" * 16, "kind": "constraints"}
+    made = {
+        "object": "mug",
+        "hand": "human",
+        "object_scale": 1.0,
+        "object_digest": "0" * 16,
+        "kind": "constraints",
+    }
     made |= {"format": 2, "variants": list(stored_sets.REGIONS), "finger_joints": ["a", "b"]}
     sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
     arrays = {}
@@ -274,7 +359,10 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
     for change, why in (
         (Message(made.arrays, {**made.meta, "object": "../../x"}), "cannot name the object"),
         (Message(made.arrays, {**made.meta, "object_scale": -1}), "object_scale"),
-        (Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta), "pose/q holds"),
+        (
+            Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta),
+            "pose/q holds",
+        ),
         (
             Message({**made.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, made.meta),
             r"pose/q has shape \(2, 3, 9\), but",
@@ -368,19 +456,32 @@ def _recording(folder, *entries):
 
 def test_recordings_of_others_are_one_line(tmp_path):
     channel = JsonChannels().entry("/metrics/learner/0", 1, {"values": {"x": 1.0}}).channel
-    for number, data in enumerate((b"{", b"[" * 10**5, b"[]", b"{}", b'{"values": 7}', b'{"values": {"x": "y"}}',
-                                   b'{"values": {}, "update": "z"}')):  # fmt: skip
+    for number, data in enumerate(
+        (
+            b"{",
+            b"[" * 10**5,
+            b"[]",
+            b"{}",
+            (b'{"values": 7}'),
+            b'{"values": {"x": "y"}}',
+            b'{"values": {}, "update": "z"}',
+        )
+    ):
         path = _recording(tmp_path / str(number), Entry(channel, 1, data))
         refused(read_metrics, path, "is not JSON|has no metrics")
         (record,) = read_records(path)
-        refused(lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'")
+        refused(
+            lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'"
+        )
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
     whole = episode()
-    for number, (change, why) in enumerate((
-        ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
-        ({"success": None}, "'success' is None"),
-        ({"metrics": []}, r"'metrics' is \[\]"),
-    )):  # fmt: skip
+    for number, (change, why) in enumerate(
+        (
+            ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
+            ({"success": None}, "'success' is None"),
+            ({"metrics": []}, r"'metrics' is \[\]"),
+        )
+    ):
         data = encode(Message(whole.arrays, {**whole.meta, **change}))
         path = _recording(tmp_path / f"e{number}", Entry(raw, 1, data))
         refused(read_episodes, path, why)

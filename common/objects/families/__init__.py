@@ -1,8 +1,8 @@
 """Families of the procedural generator: the pieces of a mug, a knife or a ring.
 
-A family is a function of a random generator that returns a `Draft`, listed in the table of its module. The generator
-(`common.objects.procedural`) computes mass and inertia, recentres and checks each draft, and draws again if it is
-rejected.
+A family is a function of a random generator that returns a `Draft`, listed in the table of its
+module. The generator (`common.objects.procedural`) computes mass and inertia, recentres and checks
+each draft, and draws again if it is rejected.
 """
 
 from congrasp.common.objects.families import basic, scans, solids, tools, vessels

@@ -58,7 +58,9 @@ def bottle(rng: Rng) -> Draft:
     pieces = (
         draft.cylinder((0, 0, -half), (0, 0, half), radius),
         draft.ellipsoid((radius, radius, shoulder), (0, 0, half)),
-        draft.cylinder((0, 0, half), (0, 0, half + shoulder + neck), radius * rng.uniform(0.35, 0.55), part=1),
+        draft.cylinder(
+            (0, 0, half), (0, 0, half + shoulder + neck), radius * rng.uniform(0.35, 0.55), part=1
+        ),
     )
     grasp_body = bool(rng.random() < 0.75)
     return Draft(pieces, ("body", "neck"), (grasp_body, not grasp_body))
@@ -67,7 +69,11 @@ def bottle(rng: Rng) -> Draft:
 @_family
 def mug(rng: Rng) -> Draft:
     """A body with a handle of three rods at its side."""
-    radius, half, thick = rng.uniform(0.028, 0.04), rng.uniform(0.035, 0.055), rng.uniform(0.006, 0.009)
+    radius, half, thick = (
+        rng.uniform(0.028, 0.04),
+        rng.uniform(0.035, 0.055),
+        rng.uniform(0.006, 0.009),
+    )
     high, reach = half * rng.uniform(0.5, 0.75), radius + rng.uniform(0.024, 0.038)
     pieces = (
         draft.cylinder((0, 0, -half), (0, 0, half), radius),
@@ -81,7 +87,11 @@ def mug(rng: Rng) -> Draft:
 @_family
 def teapot(rng: Rng) -> Draft:
     """A round body with a spout and a handle of two rods."""
-    radius, height, thick = rng.uniform(0.034, 0.043), rng.uniform(0.03, 0.042), rng.uniform(0.007, 0.009)
+    radius, height, thick = (
+        rng.uniform(0.034, 0.043),
+        rng.uniform(0.03, 0.042),
+        rng.uniform(0.007, 0.009),
+    )
     ear, rise = radius + rng.uniform(0.028, 0.04), height * rng.uniform(0.5, 0.75)
     tip = (-radius - rng.uniform(0.015, 0.035), 0, height * rng.uniform(0.2, 0.8))
     pieces = (
@@ -96,7 +106,11 @@ def teapot(rng: Rng) -> Draft:
 @_family
 def wineglass(rng: Rng) -> Draft:
     """A bowl on a stem on a foot."""
-    radius, high, stem = rng.uniform(0.026, 0.036), rng.uniform(0.032, 0.045), rng.uniform(0.06, 0.09)
+    radius, high, stem = (
+        rng.uniform(0.026, 0.036),
+        rng.uniform(0.032, 0.045),
+        rng.uniform(0.06, 0.09),
+    )
     pieces = (
         draft.ellipsoid((radius, radius, high), (0, 0, stem + 0.9 * high)),
         draft.capsule((0, 0, 0), (0, 0, stem), rng.uniform(0.006, 0.009), part=1),
@@ -112,7 +126,12 @@ def knife(rng: Rng) -> Draft:
     half = (grip, rng.uniform(0.012, 0.017), rng.uniform(0.009, 0.014))
     edge = (blade, half[1] * rng.uniform(0.8, 1.4), rng.uniform(0.002, 0.0035))
     offset = (grip + blade, half[1] * rng.uniform(-0.3, 0.3), 0)
-    return Draft((draft.box(half), draft.box(edge, offset, part=1)), ("handle", "blade"), (True, False), (1, 3))
+    return Draft(
+        (draft.box(half), draft.box(edge, offset, part=1)),
+        ("handle", "blade"),
+        (True, False),
+        (1, 3),
+    )
 
 
 @_family
@@ -152,10 +171,16 @@ def flashlight(rng: Rng) -> Draft:
 @_family
 def lightbulb(rng: Rng) -> Draft:
     """A round head and a socket."""
-    radius, high, socket = rng.uniform(0.026, 0.037), rng.uniform(0.03, 0.042), rng.uniform(0.025, 0.04)
+    radius, high, socket = (
+        rng.uniform(0.026, 0.037),
+        rng.uniform(0.03, 0.042),
+        rng.uniform(0.025, 0.04),
+    )
     pieces = (
         draft.ellipsoid((radius, radius, high)),
-        draft.cylinder((0, 0, -high - socket), (0, 0, -0.8 * high), radius * rng.uniform(0.38, 0.5), part=1),
+        draft.cylinder(
+            (0, 0, -high - socket), (0, 0, -0.8 * high), radius * rng.uniform(0.38, 0.5), part=1
+        ),
     )
     return Draft(pieces, ("head", "socket"), (True, False))
 
@@ -172,7 +197,9 @@ def dumbbell(rng: Rng) -> Draft:
         if shape == 0:
             ends.append(draft.ellipsoid((end, end, 1.5 * thick), center, part=1))
         elif shape == 1:
-            ends.append(draft.cylinder((0, 0, side * half), (0, 0, side * (half + 2 * thick)), end, part=1))
+            ends.append(
+                draft.cylinder((0, 0, side * half), (0, 0, side * (half + 2 * thick)), end, part=1)
+            )
         else:
             ends.append(draft.box((end, end, thick), center, part=1))
     bar = draft.capsule((0, 0, -half - thick), (0, 0, half + thick), radius)
@@ -182,7 +209,11 @@ def dumbbell(rng: Rng) -> Draft:
 @_family
 def pan(rng: Rng) -> Draft:
     """A flat disc with a handle."""
-    radius, half, handle = rng.uniform(0.035, 0.055), rng.uniform(0.009, 0.016), rng.uniform(0.07, 0.11)
+    radius, half, handle = (
+        rng.uniform(0.035, 0.055),
+        rng.uniform(0.009, 0.016),
+        rng.uniform(0.07, 0.11),
+    )
     grip, rise = rng.uniform(0.009, 0.013), rng.uniform(0.0, 0.02)
     pieces = (
         draft.capsule((0.9 * radius, 0, 0), (radius + handle, 0, rise), grip),
@@ -209,7 +240,11 @@ def brush(rng: Rng) -> Draft:
     length, half = rng.uniform(0.08, 0.12), rng.uniform(0.03, 0.045)
     pieces = (
         draft.capsule((0, 0, 0), (length, 0, 0), rng.uniform(0.009, 0.014)),
-        draft.box((half, rng.uniform(0.018, 0.03), rng.uniform(0.01, 0.016)), (length + half, 0, 0), part=1),
+        draft.box(
+            (half, rng.uniform(0.018, 0.03), rng.uniform(0.01, 0.016)),
+            (length + half, 0, 0),
+            part=1,
+        ),
     )
     return Draft(pieces, ("handle", "head"), (True, False))
 
@@ -221,7 +256,9 @@ def camera(rng: Rng) -> Draft:
     lens, side = rng.uniform(0.02, 0.04), rng.uniform(-0.3, 0.3) * half[0]
     pieces = (
         draft.box(half),
-        draft.cylinder((side, half[1], 0), (side, half[1] + lens, 0), half[2] * rng.uniform(0.6, 0.85), part=1),
+        draft.cylinder(
+            (side, half[1], 0), (side, half[1] + lens, 0), half[2] * rng.uniform(0.6, 0.85), part=1
+        ),
     )
     return Draft(pieces, ("body", "lens"), (True, False))
 
@@ -234,7 +271,10 @@ def cross(rng: Rng) -> Draft:
     axes = np.eye(3)[rng.permutation(3)]
     pieces = []
     for i in range(count):
-        half, thick = rng.uniform(0.06, 0.09) if i == 0 else rng.uniform(0.03, 0.055), rng.uniform(0.01, 0.016)
+        half, thick = (
+            rng.uniform(0.06, 0.09) if i == 0 else rng.uniform(0.03, 0.055),
+            rng.uniform(0.01, 0.016),
+        )
         center = axes[0] * rng.uniform(-0.02, 0.02) * (i > 0)
         if as_box:
             size = tuple(np.where(axes[i] > 0, half, thick))
@@ -248,22 +288,34 @@ def cross(rng: Rng) -> Draft:
 @_family
 def compound(rng: Rng) -> Draft:
     """Two or three random pieces, the others attached to the first."""
-    kinds = rng.choice(["box", "box", "cylinder", "capsule", "capsule", "ellipsoid"], rng.integers(2, 4), replace=False)
+    kinds = rng.choice(
+        ["box", "box", "cylinder", "capsule", "capsule", "ellipsoid"],
+        rng.integers(2, 4),
+        replace=False,
+    )
     pieces: list[Piece] = []
     for i, kind in enumerate(kinds):
         a, b, c = rng.uniform(0.014, 0.036, 3)
         size = {"box": (a, b, c), "ellipsoid": (a, b, c)}.get(kind, (min(a, b), c, 0.0))
         q = rng.normal(size=4) if i else np.array([1.0, 0.0, 0.0, 0.0])
         direction = rng.normal(size=3)
-        center = direction / np.linalg.norm(direction) * rng.uniform(0.03, 0.045) if i else np.zeros(3)
-        pieces.append(Piece(kind, size, tuple(center), tuple(q / np.linalg.norm(q)), part=min(i, 1)))
+        center = (
+            direction / np.linalg.norm(direction) * rng.uniform(0.03, 0.045) if i else np.zeros(3)
+        )
+        pieces.append(
+            Piece(kind, size, tuple(center), tuple(q / np.linalg.norm(q)), part=min(i, 1))
+        )
     return Draft(tuple(pieces), ("core", "growths"), draft.either(rng))
 
 
 @_family
 def ring(rng: Rng) -> Draft:
     """Eight wedges in a circle."""
-    major, thick, high = rng.uniform(0.028, 0.048), rng.uniform(0.009, 0.014), rng.uniform(0.009, 0.016)
+    major, thick, high = (
+        rng.uniform(0.028, 0.048),
+        rng.uniform(0.009, 0.014),
+        rng.uniform(0.009, 0.016),
+    )
     rim = np.pi / 4 * (np.arange(8) + 0.5)
     profile = np.stack([major + thick * np.cos(rim), high * np.sin(rim)], -1)
     turns = 2 * np.pi / 8 * np.arange(9)
@@ -275,14 +327,18 @@ def ring(rng: Rng) -> Draft:
 def bowl(rng: Rng) -> Draft:
     """A flat floor and seven sloping staves."""
     top = rng.uniform(0.036, 0.046)
-    return _vessel(top * rng.uniform(0.5, 0.75), top, rng.uniform(0.03, 0.05), rng.uniform(0.006, 0.009))
+    return _vessel(
+        top * rng.uniform(0.5, 0.75), top, rng.uniform(0.03, 0.05), rng.uniform(0.006, 0.009)
+    )
 
 
 @_family
 def cup(rng: Rng) -> Draft:
     """A tall vessel without a handle."""
     top = rng.uniform(0.028, 0.042)
-    return _vessel(top * rng.uniform(0.75, 1.0), top, rng.uniform(0.06, 0.1), rng.uniform(0.005, 0.008))
+    return _vessel(
+        top * rng.uniform(0.75, 1.0), top, rng.uniform(0.06, 0.1), rng.uniform(0.005, 0.008)
+    )
 
 
 def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
@@ -292,5 +348,7 @@ def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
     pieces = [draft.mesh(floor)]
     for pair in itertools.pairwise(turns):
         corners = [(bottom - wall, wall), (bottom, wall), (top - wall, height), (top, height)]
-        pieces.append(draft.mesh(np.array([draft.polar(r, turn, z) for turn in pair for r, z in corners])))
+        pieces.append(
+            draft.mesh(np.array([draft.polar(r, turn, z) for turn in pair for r, z in corners]))
+        )
     return Draft(tuple(pieces), heavier=2.0)

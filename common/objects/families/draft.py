@@ -1,7 +1,7 @@
 """Draft of an object, returned by families of the procedural generator, and its pieces.
 
-Mesh pieces of lathed, hollow, extruded and swept shapes are convex and gapless by construction: neighbours share the
-face between them, so that their union has no cracks, and volumes add up.
+Mesh pieces of lathed, hollow, extruded and swept shapes are convex and gapless by construction:
+neighbours share the face between them, so that their union has no cracks, and volumes add up.
 """
 
 import dataclasses
@@ -31,16 +31,22 @@ class Draft(NamedTuple):
     density: tuple[float, float] = (300.0, 1000.0)
     """Range of the density, kg/m^3."""
     heavier: float = 1.0
-    """Factor on the mass. It leaves the shape bitwise unchanged, which another density would not."""
+    """Factor on the mass. It leaves the shape bitwise unchanged, which another density would
+    not.
+    """
     thin: bool = False
-    """The graspable region may be less than a tenth of the surface; half of the surface points lie on it."""
+    """The graspable region may be less than a tenth of the surface; half of the surface points lie
+    on it.
+    """
 
 
 Builder = Callable[[Rng], Draft]
 
 
 def enter(table: dict[str, Builder], builder: Builder) -> Builder:
-    """Registers a family in its module's table under the function's name without trailing underscores."""
+    """Registers a family in its module's table under the function's name without trailing
+    underscores.
+    """
     table[builder.__name__.rstrip("_")] = builder
     return builder
 
@@ -99,15 +105,22 @@ _STATIONS = 3  # outer corners of a wall's segment around the axis
 
 
 def hull(*parts: Sequence[Sequence[float]] | np.ndarray, part: int = 0) -> Piece:
-    """A mesh piece from the corners of the convex hull of points (V, 3), given in any number of arrays."""
+    """A mesh piece from the corners of the convex hull of points (V, 3), given in any number of
+    arrays.
+    """
     points = np.concatenate([np.asarray(points, float) for points in parts])
     return mesh(points[np.sort(ConvexHull(points).vertices)], part)
 
 
 def lathe(
-    profile: Sequence[tuple[float, float]], *, part: int = 0, squash: float = 1.0, sides: int = _SIDES
+    profile: Sequence[tuple[float, float]],
+    *,
+    part: int = 0,
+    squash: float = 1.0,
+    sides: int = _SIDES,
 ) -> list[Piece]:
-    """A solid of revolution around z, with one piece for each stretch of the profile that is convex.
+    """A solid of revolution around z, with one piece for each stretch of the profile that is
+    convex.
 
     Args:
       profile: (height, radius) in ascending order of heights, m; straight between.
@@ -119,7 +132,11 @@ def lathe(
     pieces, first = [], 0
     while first < len(profile) - 1:
         last = first + 1
-        while last + 1 < len(profile) and last + 1 - first < most and _bulges(profile[first : last + 2]):
+        while (
+            last + 1 < len(profile)
+            and last + 1 - first < most
+            and _bulges(profile[first : last + 2])
+        ):
             last += 1
         rings = [ring(radius, z, sides, squash) for z, radius in profile[first : last + 1]]
         pieces.append(hull(*rings, part=part))
@@ -133,8 +150,8 @@ def shell(
     """A wall of revolution around z: `sides` pieces for each step of the profile.
 
     Args:
-      profile: (height, outer radius, inner radius) in ascending order of heights, m; straight between.
-      sides: pieces around the axis; the outside of each has two facets, the inside one.
+      profile: (height, outer radius, inner radius) in ascending order of heights, m; straight
+      between. sides: pieces around the axis; the outside of each has two facets, the inside one.
       part: part of the pieces.
       squash: factor on y.
     """
@@ -143,20 +160,29 @@ def shell(
     for pair in itertools.pairwise(profile):
         for start, end in itertools.pairwise(turns):
             outside = np.linspace(start, end, _STATIONS)
-            corners = [_around(radius, turn, z, squash) for z, radius, _ in pair for turn in outside]
-            corners += [_around(radius, turn, z, squash) for z, _, radius in pair for turn in (start, end)]
+            corners = [
+                _around(radius, turn, z, squash) for z, radius, _ in pair for turn in outside
+            ]
+            corners += [
+                _around(radius, turn, z, squash) for z, _, radius in pair for turn in (start, end)
+            ]
             pieces.append(hull(corners, part=part))
     return pieces
 
 
 def vessel(
-    profile: Sequence[tuple[float, float]], wall: float, sides: int, *, part: int = 0, squash: float = 1.0
+    profile: Sequence[tuple[float, float]],
+    wall: float,
+    sides: int,
+    *,
+    part: int = 0,
+    squash: float = 1.0,
 ) -> list[Piece]:
     """An open vessel: a floor, and a wall of the same thickness.
 
     Args:
-      profile: (height, outer radius) in ascending order of heights from 0, m; the first step holds the floor.
-      wall: thickness, m.
+      profile: (height, outer radius) in ascending order of heights from 0, m; the first step holds
+      the floor. wall: thickness, m.
       sides: pieces around the axis.
       part: part of the pieces.
       squash: factor on y.
@@ -164,17 +190,21 @@ def vessel(
     heights, radii = np.array(profile).T
     corners = (_STATIONS - 1) * sides
     inside = np.interp(wall, heights, radii)
-    floor = hull(ring(radii[0], heights[0], corners, squash), ring(inside, wall, corners, squash), part=part)
+    floor = hull(
+        ring(radii[0], heights[0], corners, squash), ring(inside, wall, corners, squash), part=part
+    )
     rest = [(wall, inside), *((z, radius) for z, radius in profile if z > wall)]
     return [floor, *shell([(z, r, r - wall) for z, r in rest], sides, part=part, squash=squash)]
 
 
-def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0, part: int = 0) -> list[Piece]:
+def extrude(
+    outline: np.ndarray, low: float, high: float, *, taper: float = 1.0, part: int = 0
+) -> list[Piece]:
     """A prism over a star-shaped outline, with one piece for each convex sector.
 
     Args:
-      outline: (V, 2) corners, counterclockwise around the origin, from which all of the border is visible, m.
-      low: height of the bottom, m.
+      outline: (V, 2) corners, counterclockwise around the origin, from which all of the border is
+      visible, m. low: height of the bottom, m.
       high: height of the top, m.
       taper: factor on the outline at the top.
       part: part of the pieces.
@@ -189,9 +219,18 @@ def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0,
     closed, first, pieces = np.concatenate([outline, outline[:1]]), 0, []
     while first < count:
         last = first + 1
-        while last < count and last - first < most - 2 and convex[last] and _sector(closed[first : last + 2]):
+        while (
+            last < count
+            and last - first < most - 2
+            and convex[last]
+            and _sector(closed[first : last + 2])
+        ):
             last += 1
-        pieces.append(_prism(np.concatenate([np.zeros((1, 2)), closed[first : last + 1]]), low, high, taper, part))
+        pieces.append(
+            _prism(
+                np.concatenate([np.zeros((1, 2)), closed[first : last + 1]]), low, high, taper, part
+            )
+        )
         first = last
     return pieces
 
@@ -227,8 +266,11 @@ def sweep(
         before = np.concatenate([ways[:1], ways[:-1]])
     side = np.cross(up, before + ways)
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)  # a mitre is longer than the bar's width
-    turns = np.pi / 4 * np.arange(8) + np.pi / 8 if rounded else np.pi / 2 * np.arange(4) + np.pi / 4
+    # A mitre is longer than the bar's width
+    side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)
+    turns = (
+        np.pi / 4 * np.arange(8) + np.pi / 8 if rounded else np.pi / 2 * np.arange(4) + np.pi / 4
+    )
     corners = np.stack([np.cos(turns), np.sin(turns)], -1) / np.cos(turns[0])
     across = np.broadcast_to(width, count)[:, None] / 2 * side
     along = np.broadcast_to(thickness, count)[:, None] / 2 * up
@@ -237,15 +279,20 @@ def sweep(
     return [hull(*pair, part=part) for pair in pairs]
 
 
-def slab(half: Sequence[float], corner: float, center: Sequence[float] = (0, 0, 0), *, part: int = 0) -> Piece:
+def slab(
+    half: Sequence[float], corner: float, center: Sequence[float] = (0, 0, 0), *, part: int = 0
+) -> Piece:
     """A plate of half extents (3,) along z whose upright edges are rounded with a radius, m."""
     x, y, z = half
     turns = np.linspace(0, np.pi / 2, 4)
     arc = corner * np.stack([np.cos(turns), np.sin(turns)], -1)
     quarters = [
-        (arc + np.array([x - corner, y - corner])) * [sx, sy] for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        (arc + np.array([x - corner, y - corner])) * [sx, sy]
+        for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))
     ]
-    return _prism(np.concatenate(quarters) + np.array(center[:2]), center[2] - z, center[2] + z, 1.0, part)
+    return _prism(
+        np.concatenate(quarters) + np.array(center[:2]), center[2] - z, center[2] + z, 1.0, part
+    )
 
 
 def moved(piece: Piece, shift: Sequence[float]) -> Piece:
@@ -256,20 +303,30 @@ def moved(piece: Piece, shift: Sequence[float]) -> Piece:
 
 def ring(radius: float, z: float, sides: int = _SIDES, squash: float = 1.0) -> np.ndarray:
     """Corners (sides, 3) of a polygon around z."""
-    return np.array([_around(radius, turn, z, squash) for turn in 2 * np.pi / sides * np.arange(sides)])
+    return np.array(
+        [_around(radius, turn, z, squash) for turn in 2 * np.pi / sides * np.arange(sides)]
+    )
 
 
-def arc(start: float, end: float, count: int, radii: tuple[float, float], center: Sequence[float]) -> np.ndarray:
-    """Points (count, 3) on an ellipse in the x-z plane between two angles, rad, with radii along x and z."""
+def arc(
+    start: float, end: float, count: int, radii: tuple[float, float], center: Sequence[float]
+) -> np.ndarray:
+    """Points (count, 3) on an ellipse in the x-z plane between two angles, rad, with radii along x
+    and z.
+    """
     turns = np.linspace(start, end, count)
-    return np.array(center) + np.stack([radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1)
+    return np.array(center) + np.stack(
+        [radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1
+    )
 
 
 def smooth(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
     """Values (count,) of a random smooth curve that reaches both bounds."""
     at = np.linspace(0, 1, count)[:, None]
     waves = rng.normal(size=3) / np.array([1.0, 1.5, 2.5])
-    values = (waves * np.cos(np.pi * np.array([1, 2, 3]) * at + rng.uniform(0, 2 * np.pi, 3))).sum(-1)
+    values = (waves * np.cos(np.pi * np.array([1, 2, 3]) * at + rng.uniform(0, 2 * np.pi, 3))).sum(
+        -1
+    )
     return low + (high - low) * (values - values.min()) / np.ptp(values)
 
 
@@ -279,7 +336,9 @@ def _around(radius: float, turn: float, z: float, squash: float) -> tuple[float,
 
 
 def _bulges(profile: Sequence[tuple[float, float]]) -> bool:
-    """True if a profile of (height, radius) is convex: nowhere below the chords between its points."""
+    """True if a profile of (height, radius) is convex: nowhere below the chords between its
+    points.
+    """
     z, radius = np.array(profile).T
     return all(
         radius[j] > np.interp(z[j], z[[i, k]], radius[[i, k]]) - _FLAT
@@ -302,5 +361,9 @@ def _sector(corners: np.ndarray) -> bool:
 def _prism(outline: np.ndarray, low: float, high: float, taper: float, part: int) -> Piece:
     """The hull of an outline (V, 2) at the bottom and, scaled about the origin, at the top."""
     return hull(
-        *(np.column_stack([s * outline, np.full(len(outline), z)]) for s, z in ((1, low), (taper, high))), part=part
+        *(
+            np.column_stack([s * outline, np.full(len(outline), z)])
+            for s, z in ((1, low), (taper, high))
+        ),
+        part=part,
     )

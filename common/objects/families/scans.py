@@ -1,4 +1,6 @@
-"""Shapes found in scans that other families lack: wire frames, wide bodies, thin boards, and thin handles and knobs."""
+"""Shapes found in scans that other families lack: wire frames, wide bodies, thin boards, and thin
+handles and knobs.
+"""
 
 import functools
 
@@ -18,8 +20,12 @@ def wire_frame(rng: Rng) -> Draft:
     x, y, height = rng.uniform(0.03, 0.07), rng.uniform(0.03, 0.09), rng.uniform(0.04, 0.14)
     wire, flare = rng.uniform(0.004, 0.008), rng.uniform(0.8, 1.0)
     corners = np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
-    low, high = (np.c_[scale * corners, np.full(4, z)] for scale, z in ((flare, 0.0), (1.0, height)))
-    pieces = [piece for loop in (low, high) for piece in sweep(loop, (0, 0, 1), wire, wire, closed=True)]
+    low, high = (
+        np.c_[scale * corners, np.full(4, z)] for scale, z in ((flare, 0.0), (1.0, height))
+    )
+    pieces = [
+        piece for loop in (low, high) for piece in sweep(loop, (0, 0, 1), wire, wire, closed=True)
+    ]
     for bottom, top in zip(low, high, strict=True):
         normal = np.cross(top - bottom, (1.0, 0, 0))
         pieces += sweep(np.array([bottom, top]), normal / np.linalg.norm(normal), wire, wire)
@@ -29,11 +35,20 @@ def wire_frame(rng: Rng) -> Draft:
 @_family
 def bucket(rng: Rng) -> Draft:
     """A vessel wider than a hand, under a bow of three bars."""
-    radius, height, wall = rng.uniform(0.06, 0.085), rng.uniform(0.09, 0.16), rng.uniform(0.004, 0.006)
+    radius, height, wall = (
+        rng.uniform(0.06, 0.085),
+        rng.uniform(0.09, 0.16),
+        rng.uniform(0.004, 0.006),
+    )
     body = vessel([(0, radius * rng.uniform(0.7, 1.0)), (height, radius)], wall, 9)
     reach, rise, bar = radius - wall, rng.uniform(0.05, 0.08), rng.uniform(0.008, 0.014)
     bow = np.array(
-        [(-reach, height - 0.02), (-0.7 * reach, height + rise), (0.7 * reach, height + rise), (reach, height - 0.02)]
+        [
+            (-reach, height - 0.02),
+            (-0.7 * reach, height + rise),
+            (0.7 * reach, height + rise),
+            (reach, height - 0.02),
+        ]
     )
     path = np.c_[bow[:, 0], np.zeros(4), bow[:, 1]]
     handle = sweep(path, (0, 1, 0), bar, bar, rounded=True, part=1)
@@ -57,19 +72,35 @@ def board(rng: Rng) -> Draft:
 @_family
 def teacup(rng: Rng) -> Draft:
     """A vessel held by a thin handle at its side, as wide as one or two fingers."""
-    radius, height, wall = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.12), rng.uniform(0.003, 0.005)
+    radius, height, wall = (
+        rng.uniform(0.03, 0.05),
+        rng.uniform(0.05, 0.12),
+        rng.uniform(0.003, 0.005),
+    )
     bottom = radius * rng.uniform(0.6, 1.0)
     body = vessel([(0, bottom), (height, radius)], wall, 7)
-    thick, breadth, half = rng.uniform(0.004, 0.009), rng.uniform(0.006, 0.018), rng.uniform(0.018, 0.4 * height)
-    path = arc(-0.5 * np.pi, 0.5 * np.pi, 5, (rng.uniform(0.02, 0.035), half), (radius, 0, 0.55 * height))
+    thick, breadth, half = (
+        rng.uniform(0.004, 0.009),
+        rng.uniform(0.006, 0.018),
+        rng.uniform(0.018, 0.4 * height),
+    )
+    path = arc(
+        -0.5 * np.pi, 0.5 * np.pi, 5, (rng.uniform(0.02, 0.035), half), (radius, 0, 0.55 * height)
+    )
     path[[0, -1], 0] = np.interp(path[[0, -1], 2], (0, height), (bottom, radius)) - wall / 2
-    return _held((*body, *sweep(path, (0, 1, 0), thick, breadth, rounded=True, part=1)), (400.0, 1500.0))
+    return _held(
+        (*body, *sweep(path, (0, 1, 0), thick, breadth, rounded=True, part=1)), (400.0, 1500.0)
+    )
 
 
 @_family
 def basket(rng: Rng) -> Draft:
     """A body of any width under a thin bow: a basket, a lunch box, a kettle."""
-    width, depth, height = rng.uniform(0.035, 0.085), rng.uniform(0.03, 0.06), rng.uniform(0.02, 0.045)
+    width, depth, height = (
+        rng.uniform(0.035, 0.085),
+        rng.uniform(0.03, 0.06),
+        rng.uniform(0.02, 0.045),
+    )
     thick, rise = rng.uniform(0.005, 0.011), rng.uniform(0.04, 0.09)
     path = arc(np.pi, 0, 6, (0.9 * width, rise), (0, 0, height))
     handle = sweep(path, (0, 1, 0), thick, thick * rng.uniform(1.0, 2.0), rounded=True, part=1)
@@ -81,7 +112,11 @@ def basket(rng: Rng) -> Draft:
 def lidded(rng: Rng) -> Draft:
     """A wide round body with a knob on its top: a lid, a jar, a sugar bowl."""
     radius, height = rng.uniform(0.04, 0.09), rng.uniform(0.01, 0.09)
-    neck, knob, length = rng.uniform(0.006, 0.012), rng.uniform(0.012, 0.02), rng.uniform(0.02, 0.04)
+    neck, knob, length = (
+        rng.uniform(0.006, 0.012),
+        rng.uniform(0.012, 0.02),
+        rng.uniform(0.02, 0.04),
+    )
     top = (0, 0, height + length)
     pieces = (
         draft.cylinder((0, 0, 0), (0, 0, height), radius),
@@ -94,7 +129,11 @@ def lidded(rng: Rng) -> Draft:
 @_family
 def sieve(rng: Rng) -> Draft:
     """A ball, a disc or a block at the end of a thin rod: a lollipop, a sieve, a broom."""
-    half, thick, length = rng.uniform(0.02, 0.055, 3), rng.uniform(0.003, 0.006), rng.uniform(0.08, 0.16)
+    half, thick, length = (
+        rng.uniform(0.02, 0.055, 3),
+        rng.uniform(0.003, 0.006),
+        rng.uniform(0.08, 0.16),
+    )
     start = np.array((0.95 * half[0], 0, 0))
     rise = rng.uniform(-0.3, 0.6)
     end = start + length * np.array((np.cos(rise), 0, np.sin(rise)))

@@ -1,11 +1,24 @@
-"""Flat and solid household objects: cartons, books, frames; lathed and extruded profiles, blobs, animals, clusters."""
+"""Flat and solid household objects: cartons, books, frames; lathed and extruded profiles, blobs,
+animals, clusters.
+"""
 
 import functools
 
 import numpy as np
 
 from congrasp.common.objects.families import draft
-from congrasp.common.objects.families.draft import Builder, Draft, Rng, extrude, hull, lathe, ring, slab, smooth, sweep
+from congrasp.common.objects.families.draft import (
+    Builder,
+    Draft,
+    Rng,
+    extrude,
+    hull,
+    lathe,
+    ring,
+    slab,
+    smooth,
+    sweep,
+)
 from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}
@@ -41,7 +54,9 @@ def phone(rng: Rng) -> Draft:
     half = rng.uniform(0.032, 0.041), rng.uniform(0.065, 0.085), rng.uniform(0.0055, 0.0075)
     block = rng.uniform(0.01, 0.02), rng.uniform(0.01, 0.02), rng.uniform(0.001, 0.002)
     place = half[0] - block[0] - 0.005, half[1] - block[1] - 0.005, half[2] + block[2]
-    return Draft((slab(half, rng.uniform(0.006, 0.012)), slab(block, 0.004, place)), density=(1000.0, 2000.0))
+    return Draft(
+        (slab(half, rng.uniform(0.006, 0.012)), slab(block, 0.004, place)), density=(1000.0, 2000.0)
+    )
 
 
 @_family
@@ -66,7 +81,11 @@ def remote_control(rng: Rng) -> Draft:
 @_family
 def eyeglasses(rng: Rng) -> Draft:
     """Two lenses, a bridge and two temples, folded or not."""
-    wide, high, gap = rng.uniform(0.021, 0.028), rng.uniform(0.015, 0.023), rng.uniform(0.007, 0.011)
+    wide, high, gap = (
+        rng.uniform(0.021, 0.028),
+        rng.uniform(0.015, 0.023),
+        rng.uniform(0.007, 0.011),
+    )
     temple, thick = rng.uniform(0.1, 0.14), rng.uniform(0.0025, 0.004)
     middle, open_ = gap + wide, rng.uniform(0.05, 1.0) * np.pi / 2
     solid, rim = bool(rng.random() < 0.5), rng.uniform(0.003, 0.005)
@@ -84,7 +103,9 @@ def eyeglasses(rng: Rng) -> Draft:
         way = np.array((-side * np.cos(open_), -np.sin(open_), 0))
         ear, tip = hinge + 0.75 * temple * way, hinge + temple * way - [0, 0, 0.015]
         pieces.append(draft.capsule(tuple(hinge), tuple(ear), thick, part=1))
-        pieces += sweep(np.array([ear, tip]), np.cross(way, [0, 0, 1]), 2 * thick, 2 * thick, part=1)
+        pieces += sweep(
+            np.array([ear, tip]), np.cross(way, [0, 0, 1]), 2 * thick, 2 * thick, part=1
+        )
     pieces.append(draft.capsule((-gap, 0, 0), (gap, 0, 0), 0.0025))
     return Draft(tuple(pieces), ("front", "temples"), draft.either(rng), (), (1200.0, 2500.0))
 
@@ -147,7 +168,9 @@ def extruded(rng: Rng) -> Draft:
     count = rng.integers(5, 13)
     turns = 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.3, 0.3, count))
     radii = rng.uniform(0.02, 0.045) * (1 + rng.uniform(0, 0.8) * rng.uniform(-0.7, 1, count))
-    outline = radii[:, None] * np.stack([np.cos(turns), np.sin(turns)], -1) * [1, rng.uniform(0.5, 1)]
+    outline = (
+        radii[:, None] * np.stack([np.cos(turns), np.sin(turns)], -1) * [1, rng.uniform(0.5, 1)]
+    )
     taper = rng.choice([1.0, rng.uniform(0.5, 1.0)])
     return Draft(tuple(extrude(outline, 0.0, rng.uniform(0.02, 0.18), taper=taper)))
 
@@ -224,13 +247,21 @@ def piggy(rng: Rng) -> Draft:
         for y in (-0.5, 0.5):
             foot = np.array([x * length, y * wide, -0.8 * high])
             pieces.append(
-                hull(ring(thick, -leg - 0.2 * high, 8) + foot, ring(1.2 * thick, 0.3 * high, 8) + foot, part=1)
+                hull(
+                    ring(thick, -leg - 0.2 * high, 8) + foot,
+                    ring(1.2 * thick, 0.3 * high, 8) + foot,
+                    part=1,
+                )
             )
-    snout = draft.cylinder((0.85 * length, 0, 0), (length + rng.uniform(0.006, 0.02), 0, 0), 0.4 * high, part=1)
+    snout = draft.cylinder(
+        (0.85 * length, 0, 0), (length + rng.uniform(0.006, 0.02), 0, 0), 0.4 * high, part=1
+    )
     for y in (-1, 1):
         root = np.array([0.55 * length, 0.45 * y * wide, 0.6 * high])
         base = root + np.array([(0.0, -0.008, 0), (0.0, 0.008, 0), (-0.01, 0, 0)])
-        pieces.append(hull(base, [np.add(root, (0.006, 0.006 * y, rng.uniform(0.02, 0.03)))], part=1))
+        pieces.append(
+            hull(base, [np.add(root, (0.006, 0.006 * y, rng.uniform(0.02, 0.03)))], part=1)
+        )
     return Draft((*pieces, snout), ("body", "limbs"), (True, False))
 
 
@@ -246,9 +277,16 @@ def animal(rng: Rng) -> Draft:
         draft.ellipsoid(body),
         draft.ellipsoid((1.1 * head, head, head), tuple(crown), part=1),
         draft.capsule((0.6 * body[0], 0, 0.3 * body[2]), tuple(crown), 0.55 * head, part=1),
-        hull([(crown[0], y, crown[2] + z) for y in (-half, half) for z in (-half, half)], [nose], part=1),
+        hull(
+            [(crown[0], y, crown[2] + z) for y in (-half, half) for z in (-half, half)],
+            [nose],
+            part=1,
+        ),
         draft.capsule(
-            (-0.7 * body[0], 0, 0.3 * body[2]), (-body[0] - 0.02, 0, body[2] * rng.uniform(0, 1.2)), 0.007, part=1
+            (-0.7 * body[0], 0, 0.3 * body[2]),
+            (-body[0] - 0.02, 0, body[2] * rng.uniform(0, 1.2)),
+            0.007,
+            part=1,
         ),
     ]
     if rng.random() < 0.6:
@@ -258,7 +296,9 @@ def animal(rng: Rng) -> Draft:
                 foot = np.array([x * body[0], y * body[1], -0.4 * body[2]])
                 pieces.append(hull(ring(thick, -leg, 6) + foot, ring(thick, 0.0, 6) + foot, part=1))
     else:
-        pieces.append(hull(ring(0.7 * body[1], -body[2], 12), ring(0.9 * body[1], -0.3 * body[2], 12)))
+        pieces.append(
+            hull(ring(0.7 * body[1], -body[2], 12), ring(0.9 * body[1], -0.3 * body[2], 12))
+        )
     return Draft(tuple(pieces), ("body", "limbs"), draft.either(rng))
 
 
@@ -272,7 +312,13 @@ def car(rng: Rng) -> Draft:
     for s in (-0.6, 0.6):
         for side in (-1, 1):
             disc = ring(wheel, 0, 12)[:, [0, 2, 1]] + [s * x, 0, -z]
-            pieces.append(hull(np.add(disc, (0, side * 0.8 * y, 0)), np.add(disc, (0, side * (y + 0.006), 0)), part=1))
+            pieces.append(
+                hull(
+                    np.add(disc, (0, side * 0.8 * y, 0)),
+                    np.add(disc, (0, side * (y + 0.006), 0)),
+                    part=1,
+                )
+            )
     return Draft(tuple(pieces), ("body", "wheels"), (True, False))
 
 
@@ -295,7 +341,10 @@ def figure(rng: Rng) -> Draft:
         start = shoulder * [1, side * 0.8, 1]
         pieces.append(
             draft.capsule(
-                tuple(start), tuple(start + hand * np.array([0.3, side * np.cos(t), np.sin(t)])), 0.008, part=1
+                tuple(start),
+                tuple(start + hand * np.array([0.3, side * np.cos(t), np.sin(t)])),
+                0.008,
+                part=1,
             )
         )
     if rng.random() < 0.5:
@@ -322,13 +371,18 @@ def cluster(rng: Rng) -> Draft:
 
 
 def _chunk(rng: Rng, radius: float, center: np.ndarray, part: int = 0) -> Piece:
-    """A random convex piece of about this radius: a block, a prism or a stone, with a random orientation."""
+    """A random convex piece of about this radius: a block, a prism or a stone, with a random
+    orientation.
+    """
     stretch = rng.uniform(0.7, 1.5, 3)
     if rng.random() < 0.4:
         return _blob(rng, tuple(radius * stretch), tuple(center), part)
     outline = ring(radius, 0.0, int(rng.integers(3, 8)))
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    corners = np.concatenate([outline - [0, 0, radius], rng.uniform(0.4, 1.0) * outline + [0, 0, radius]]) * stretch
+    corners = (
+        np.concatenate([outline - [0, 0, radius], rng.uniform(0.4, 1.0) * outline + [0, 0, radius]])
+        * stretch
+    )
     return hull(corners @ turn.T + center, part=part)
 
 
@@ -336,7 +390,9 @@ def _blob(rng: Rng, radii: tuple[float, ...], center: tuple[float, ...], part: i
     """The hull of an egg whose surface is dented by waves."""
     i = np.arange(_CORNERS) + 0.5
     z = 1 - 2 * i / _CORNERS
-    unit = np.stack([np.sqrt(1 - z**2) * np.cos(_GOLDEN * i), np.sqrt(1 - z**2) * np.sin(_GOLDEN * i), z], -1)
+    unit = np.stack(
+        [np.sqrt(1 - z**2) * np.cos(_GOLDEN * i), np.sqrt(1 - z**2) * np.sin(_GOLDEN * i), z], -1
+    )
     waves, phases = rng.normal(size=(4, 3)) * 1.5, rng.uniform(0, 2 * np.pi, 4)
     dented = unit * (1 + 0.07 * np.sin(unit @ waves.T + phases).sum(-1))[:, None]
     return hull(dented * radii + center, part=part)

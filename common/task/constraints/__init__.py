@@ -19,7 +19,14 @@ from congrasp.common.task.constraints.trajectory import Trajectory
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal
 
-CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
+CONSTRAINTS: tuple[Constraint, ...] = (
+    Heading(),
+    Affordance(),
+    Pose(),
+    Trajectory(),
+    Fingers(),
+    Force(),
+)
 PAPER = ("heading", "affordance", "pose", "trajectory")
 """Names of the paper's constraints."""
 OURS = (*PAPER, "fingers", "force")
@@ -67,7 +74,9 @@ def blocks(task: TaskSettings) -> tuple[str, ...]:
 
 
 def center_fingers(task: TaskSettings, goal: Goal) -> Array | None:
-    """(B, G) bool: fingers that define the hand centre and the distance reward; None if no constraint selects them."""
+    """(B, G) bool: fingers that define the hand centre and the distance reward; None if no
+    constraint selects them.
+    """
     chosen = [fingers for c in known(task) if (fingers := c.center_fingers(goal)) is not None]
     return functools.reduce(operator.and_, chosen) if chosen else None
 
@@ -78,25 +87,33 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
 
 
 def goal_of(hand: Hand, task: TaskSettings, request: GraspRequest) -> Goal:
-    """Goal arrays of a request, without batch axis, before the priority rules; neutral where the request has none."""
+    """Goal arrays of a request, without batch axis, before the priority rules; neutral where the
+    request has none.
+    """
     values = {}
     for constraint in known(task):
         given = request.constraints.get(constraint.name, {})
         neutral = constraint.neutral(hand, task)
         values[constraint.name] = neutral._replace(
-            **{name: np.asarray(value, getattr(neutral, name).dtype) for name, value in given.items()}
+            **{
+                name: np.asarray(value, getattr(neutral, name).dtype)
+                for name, value in given.items()
+            }
         )
     return Goal(values, {})
 
 
 def require_known(names: Iterable[str], task: TaskSettings) -> None:
-    """Raises an `UnknownConstraintError` if a requested constraint is not supported by the task's policy."""
+    """Raises an `UnknownConstraintError` if a requested constraint is not supported by the task's
+    policy.
+    """
     for name in names:
         get_constraint(name)
         if name not in task.constraints:
             raise UnknownConstraintError(
                 f"The policy does not support the constraint '{name}'.",
-                f"It supports {', '.join(task.constraints)}; train one with --task.constraints … {name}.",
+                f"It supports {', '.join(task.constraints)}; train one with --task.constraints … "
+                f"{name}.",
             )
 
 

@@ -1,4 +1,6 @@
-"""Affordance: the region of the object that may be grasped (O+ in the paper), and the one to avoid (O-)."""
+"""Affordance: the region of the object that may be grasped (O+ in the paper), and the one to avoid
+(O-).
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,14 +25,23 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.constraints.heading import HeadingGoal
-from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
+from congrasp.common.task.geometry import (
+    FAR,
+    flat,
+    least_distance_to_segment,
+    nearest_index,
+    share,
+    squash,
+)
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Contacts, Features, Goal, Surface
 
 REACH = 0.15
-"""Length of the approach before the heading position that is checked against the avoid region, m."""
+"""Length of the approach before the heading position that is checked against the avoid region,
+m.
+"""
 MARGIN = 0.01
 """Distance that the fingers should keep from the avoid region (m in the paper), m."""
 SHARPNESS = 0.002
@@ -44,7 +55,9 @@ _AS_A_RADIAN = 0.1
 _WORST = 100.0
 """Greater than the cost of any change of a heading."""
 _TUBE, _BREADTH, _BEYOND = 0.01, 0.03, 0.01
-"""Lengths of `common.task.sampling.headings` in m: of the approach, and of the slab in which the width is measured."""
+"""Lengths of `common.task.sampling.headings` in m: of the approach, and of the slab in which the
+width is measured.
+"""
 
 
 class AffordanceGoal(NamedTuple):
@@ -55,9 +68,13 @@ class AffordanceFeatures(NamedTuple):
     """Geometry between the hand and the avoid region, in the wrist frame."""
 
     nearest: Array
-    """(B, P, 3) d-: from each keypoint to the nearest point of the avoid region; zero if the object has none."""
+    """(B, P, 3) d-: from each keypoint to the nearest point of the avoid region; zero if the object
+    has none.
+    """
     distance: Array
-    """(B,) least distance from the fingers' skin to the avoid region, m; `FAR` if the object has none."""
+    """(B,) least distance from the fingers' skin to the avoid region, m; `FAR` if the object has
+    none.
+    """
     touching: Array
     """(B, L) bool: the link touches the avoid region."""
     touching_graspable: Array
@@ -73,18 +90,28 @@ class Affordance(Constraint):
     blocks = ("affordance",)
     region = 1
     weights = (
-        Weight("affordance_distance", 0.05, "w_d: for each unit of softplus((m - d)/tau) near the avoid region."),
+        Weight(
+            "affordance_distance",
+            0.05,
+            "w_d: for each unit of softplus((m - d)/tau) near the avoid region.",
+        ),
         Weight(
             "affordance_force",
             0.1,
-            "w_f of the affordance term: per newton on the avoid region (clipped at 10 N per link).",
+            "w_f of the affordance term: per newton on the avoid region (clipped at 10 N per "
+            "link).",
         ),
     )
-    errors = (ErrorSpec("affordance_ratio", "", "hold", 0.0, 0.05, "share of touching links on the avoid region"),)
+    errors = (
+        ErrorSpec(
+            "affordance_ratio", "", "hold", 0.0, 0.05, "share of touching links on the avoid region"
+        ),
+    )
     options = (
         Option(
             "affordance",
-            "Part to grasp: a mesh of it in the coordinates of the object's file, or names of its parts.",
+            "Part to grasp: a mesh of it in the coordinates of the object's file, or names of its "
+            "parts.",
             "part",
         ),
         Option("avoid", "Part not to touch: a mesh or names of parts, likewise.", "part"),
@@ -98,34 +125,51 @@ class Affordance(Constraint):
         vectors, forces = 3 * len(hand.keypoints), 3 * len(hand.links)
         block = (
             ObservationField(
-                "nearest_minus", vectors, "m, from each keypoint to the nearest point of the avoid region"
+                "nearest_minus",
+                vectors,
+                "m, from each keypoint to the nearest point of the avoid region",
             ),
-            ObservationField("force_minus", forces, "as force, of contacts on the avoid region", privileged=True),
+            ObservationField(
+                "force_minus", forces, "as force, of contacts on the avoid region", privileged=True
+            ),
         )
         return (block,)
 
     def available(self, draw: Draw) -> Array:
-        """True where the object has both regions, and its graspable one can be approached in the resting pose."""
+        """True where the object has both regions, and its graspable one can be approached in the
+        resting pose.
+        """
         return draw.bank.has_affordance[draw.objects, draw.rests]
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> AffordanceGoal:
         """Regions of the object."""
         return AffordanceGoal()
 
-    def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
+    def override(
+        self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal
+    ) -> Goal:
         """Redirects a heading that passes nearer to the avoid region than to the graspable one.
 
-        The new heading ends at a graspable surface point and is the smallest change that satisfies the rules of heading
-        sets, see `redirected`. The cross-finger direction follows by the smallest rotation.
+        The new heading ends at a graspable surface point and is the smallest change that satisfies
+        the rules of heading sets, see `redirected`. The cross-finger direction follows by the
+        smallest rotation.
         """
-        turned = asked["affordance"] & _contradicts_heading(_apart_from_heading(hand, surface, goal))
+        turned = asked["affordance"] & _contradicts_heading(
+            _apart_from_heading(hand, surface, goal)
+        )
         return goal.where(turned, "heading", **redirected(hand, surface, goal["heading"])._asdict())
 
-    def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> AffordanceFeatures:
-        """Distances, contacts and forces by region; the label of a contact is that of the nearest surface point."""
+    def features(
+        self, hand: Hand, contacts: Contacts, features: Features, goal: Goal
+    ) -> AffordanceFeatures:
+        """Distances, contacts and forces by region; the label of a contact is that of the nearest
+        surface point.
+        """
         surface = contacts.surface
         index = nearest_index(jnp.where(surface.avoid[..., None], contacts.squared, jnp.inf))
-        avoided = jnp.take_along_axis(surface.avoid, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
+        avoided = jnp.take_along_axis(surface.avoid, flat(contacts.nearest), -1).reshape(
+            contacts.nearest.shape
+        )
         has_any = jnp.any(surface.avoid, -1)
         nearest = jnp.take_along_axis(surface.points, index[..., None], -2) - contacts.keypoints
         nearest = jnp.where(has_any[..., None, None], nearest, 0.0)
@@ -166,25 +210,36 @@ class Affordance(Constraint):
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Links that touch the avoid region, as a share of all touching links (a link on both counts once)."""
-        return {"affordance_ratio": share(scene.features.of["affordance"].touching, scene.features.touching)}
+        """Links that touch the avoid region, as a share of all touching links (a link on both
+        counts once).
+        """
+        return {
+            "affordance_ratio": share(
+                scene.features.of["affordance"].touching, scene.features.touching
+            )
+        }
 
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """True if both regions have points."""
         return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
 
-    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+    def parse(
+        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+    ) -> dict[str, np.ndarray] | None:
         """Returns no arrays: an affordance consists of its avoid region."""
         return {} if given["affordance"] or given["avoid"] else None
 
     def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
-        """Region of --avoid, or the complement of that of --affordance; points of both belong to the nearer part."""
+        """Region of --avoid, or the complement of that of --affordance; points of both belong to
+        the nearer part.
+        """
         grasped, avoided = given["affordance"], given["avoid"]
         if grasped and avoided:
             region = avoided.distance < grasped.distance
             if not (grasped.distance < avoided.distance).any():
                 raise CongraspError(
-                    f"--affordance '{grasped.text}' and --avoid '{avoided.text}' contradict each other: all that "
+                    f"--affordance '{grasped.text}' and --avoid '{avoided.text}' contradict each "
+                    f"other: all that "
                     f"may be grasped of '{obj.name}' must not be touched.",
                     "Leave one of them out, or name different parts.",
                 )
@@ -194,12 +249,14 @@ class Affordance(Constraint):
             region = grasped.distance >= _NEAR
         if region.all() and not grasped:
             raise CongraspError(
-                f"'{avoided.text}' covers all of '{obj.name}', so nothing may be touched.", "Avoid a part of it."
+                f"'{avoided.text}' covers all of '{obj.name}', so nothing may be touched.",
+                "Avoid a part of it.",
             )
         if region.all():
             raise CongraspError(
                 f"Nothing of '{grasped.text}' lies on the surface of '{obj.name}'.",
-                "The part must be in the coordinates of the object's file. Pass it with --affordance.",
+                "The part must be in the coordinates of the object's file. Pass it with "
+                "--affordance.",
             )
         if not region.any():
             named = (grasped or avoided).text
@@ -211,24 +268,36 @@ class Affordance(Constraint):
         return (Paint(),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Effect of the affordance: it protects its avoid region unless a reference pose defines the contacts."""
+        """Effect of the affordance: it protects its avoid region unless a reference pose defines
+        the contacts.
+        """
         if overridden:
-            return ["The affordance is overridden by the reference pose, which defines the contacts."]
-        turned = "The heading passed nearer to the avoid region and was redirected to the graspable region."
-        return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
+            return [
+                "The affordance is overridden by the reference pose, which defines the contacts."
+            ]
+        turned = (
+            "The heading passed nearer to the avoid region and was redirected to the graspable "
+            "region."
+        )
+        return [
+            "The affordance keeps the fingers off the avoid region.",
+            *([turned] if redirected else []),
+        ]
 
 
 def redirected(hand: Hand, surface: Surface, heading: HeadingGoal) -> HeadingGoal:
     """Redirects headings (B, ...) to graspable surface points.
 
-    The candidates are surface points of the graspable region, each approached along the heading's direction and along
-    the direction from the heading's start. The heading's position is 2 cm behind the point, times the hand's factor on
-    objects. The result is the candidate that violates the fewest rules of `common.task.sampling.headings`, and among
-    equals the one with the smallest change: a rotation by 1 rad counts as much as 10 cm between the positions. Rules:
+    The candidates are surface points of the graspable region, each approached along the heading's
+    direction and along the direction from the heading's start. The heading's position is 2 cm
+    behind the point, times the hand's factor on objects. The result is the candidate that violates
+    the fewest rules of `common.task.sampling.headings`, and among equals the one with the smallest
+    change: a rotation by 1 rad counts as much as 10 cm between the positions. Rules:
 
     * No obstacle is in front of the point within 1 cm of the approach.
     * The approach stays 1 cm away from the avoid region, and ends nearer to the graspable one.
-    * The object is no wider than 12 cm, times the same factor, along the cross-finger direction where fingers close.
+    * The object is no wider than 12 cm, times the same factor, along the cross-finger direction
+      where fingers close.
 
     Args:
       hand: the hand.
@@ -243,7 +312,10 @@ def redirected(hand: Hand, surface: Surface, heading: HeadingGoal) -> HeadingGoa
     straight = straight / jnp.maximum(jnp.linalg.norm(straight, axis=-1, keepdims=True), 1e-6)
     direction = jnp.concatenate([own, straight], 1)
     position = jnp.concatenate([targets, targets], 1) + hand.object_scale * INWARD * direction
-    given, across = (jnp.broadcast_to(axis[:, None], direction.shape) for axis in (heading.direction, heading.cross))
+    given, across = (
+        jnp.broadcast_to(axis[:, None], direction.shape)
+        for axis in (heading.direction, heading.cross)
+    )
     cross = rotations.rotate(rotations.shortest(given, direction, across), across)
     candidates = HeadingGoal(position, direction, cross)
     angle = jnp.arccos(jnp.clip(jnp.sum(direction * given, -1), -1.0, 1.0))
@@ -261,7 +333,8 @@ def _spread(which: Array) -> Array:
 
 def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
     """Number (B, n) of rules that headings (B, n, 3) violate, see `redirected`."""
-    # By coordinates, so that the loops over the surface points, the longest of a reset, run along memory.
+    # By coordinates, so that the loops over the surface points, the longest of a reset, run along
+    # memory.
     offset = [
         point[:, None] - position[..., None]
         for point, position in zip(
@@ -269,7 +342,10 @@ def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
         )
     ]
     depth, along = (
-        sum(way * axis[..., None] for way, axis in zip(offset, jnp.moveaxis(axes, -1, 0), strict=True))
+        sum(
+            way * axis[..., None]
+            for way, axis in zip(offset, jnp.moveaxis(axes, -1, 0), strict=True)
+        )
         for axes in (headings.direction, headings.cross)
     )
     squared = sum(way * way for way in offset)
@@ -279,7 +355,9 @@ def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
     hidden = jnp.any(before & (from_line < _TUBE**2), -1)
     past = depth - jnp.clip(depth, -REACH, 0.0)
     near = jnp.min(jnp.where(avoid, from_line + past**2, jnp.inf), -1) < MARGIN**2
-    to_avoid, to_graspable = (jnp.min(jnp.where(which, squared, jnp.inf), -1) for which in (avoid, ~avoid))
+    to_avoid, to_graspable = (
+        jnp.min(jnp.where(which, squared, jnp.inf), -1) for which in (avoid, ~avoid)
+    )
     slab = (from_line - along**2 < _BREADTH**2) & (depth < _BEYOND)
     low = jnp.min(jnp.where(slab, along, jnp.inf), -1)
     wide = jnp.max(jnp.where(slab, along, -jnp.inf), -1) - low > hand.object_scale * MAX_WIDTH
@@ -292,7 +370,9 @@ def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
     start = heading.position - REACH * heading.direction
     return {
         "avoid": least_distance_to_segment(surface.points, surface.avoid, start, heading.position),
-        "graspable": least_distance_to_segment(surface.points, ~surface.avoid, start, heading.position),
+        "graspable": least_distance_to_segment(
+            surface.points, ~surface.avoid, start, heading.position
+        ),
     }
 
 
@@ -304,9 +384,12 @@ def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
 def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     return (
         f"The approach passes {100 * apart['avoid']:.1f} cm from the avoid region, and "
-        f"{100 * apart['graspable']:.1f} cm from the graspable region. The affordance redirects the heading to "
+        f"{100 * apart['graspable']:.1f} cm from the graspable region. The affordance redirects "
+        f"the heading to "
         "the graspable region."
     )
 
 
-Affordance.relations = (Relation("heading", "redirected", _apart_from_heading, _contradicts_heading, _heading_message),)
+Affordance.relations = (
+    Relation("heading", "redirected", _apart_from_heading, _contradicts_heading, _heading_message),
+)

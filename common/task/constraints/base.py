@@ -1,7 +1,8 @@
 """Interface of a constraint: everything that the rest of the project derives from its file.
 
-A constraint's module defines a subclass of `Constraint`, and `common.task.constraints.CONSTRAINTS` contains an
-instance. All methods are pure functions of batched arrays (leading axis B) that may be traced; the defaults do nothing.
+A constraint's module defines a subclass of `Constraint`, and `common.task.constraints.CONSTRAINTS`
+contains an instance. All methods are pure functions of batched arrays (leading axis B) that may be
+traced; the defaults do nothing.
 
 Its markers are drawn in pictures, recordings and the studio; all of them are in the object frame.
 """
@@ -58,7 +59,9 @@ class Paint(NamedTuple):
 Marker = Arrow | Polyline | Ghost | Paint
 
 Window = Literal["approach", "hold"]
-"""Steps over which an error is averaged: before the table's removal, or in the `hold_steps` after it."""
+"""Steps over which an error is averaged: before the table's removal, or in the `hold_steps` after
+it.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +73,8 @@ class GoalArray:
     meaning: str
     """Unit, frame and meaning."""
     kind: Literal["real", "position", "direction", "quaternion", "flag"] = "real"
-    """Kind of value: positions, directions and quaternions are in the object frame, and the latter two must be unit
-    vectors; flags are booleans."""
+    """Kind of value: positions, directions and quaternions are in the object frame, and the latter
+    two must be unit vectors; flags are booleans."""
     neutral: tuple[float, ...] = ()
     """Last axis of the value used where no request gives one; zeros by default."""
     required: bool = True
@@ -89,7 +92,9 @@ class Weight(NamedTuple):
 
 
 class ErrorSpec(NamedTuple):
-    """Definition of an error of a constraint; the paper's definitions are in its section Metrics."""
+    """Definition of an error of a constraint; the paper's definitions are in its section
+    Metrics.
+    """
 
     name: str
     """Name of the episode's metric, such as `heading_rad`."""
@@ -105,7 +110,9 @@ class ErrorSpec(NamedTuple):
     column: str = ""
     """Name in tables and their JSON; `name` if empty."""
     block: str = ""
-    """Block of the constraint without which the error is undefined, if its other blocks can be active alone."""
+    """Block of the constraint without which the error is undefined, if its other blocks can be
+    active alone.
+    """
 
 
 class ObservationField(NamedTuple):
@@ -131,7 +138,9 @@ class Relation(NamedTuple):
     contradicts: Any
     """measured -> (B,) bool."""
     message: Any
-    """(hand, measurements of one environment, as NumPy) -> one or two sentences with the numbers."""
+    """(hand, measurements of one environment, as NumPy) -> one or two sentences with the
+    numbers.
+    """
 
 
 class Scene(NamedTuple):
@@ -158,9 +167,10 @@ class Option(NamedTuple):
     name: str
     help: str
     kind: Literal["text", "direction", "place", "part", "pose", "path"] = "text"
-    """Kind of the parsed value: a text; three numbers in the axes of the object's file, normalised; three numbers in
-    the coordinates of the file, converted to a position (3,) in the object frame; a `Part`; a wrist pose with finger
-    angles, or a wrist path of K waypoints, from a file: dicts of `q`, `position` and `quaternion`, object frame."""
+    """Kind of the parsed value: a text; three numbers in the axes of the object's file, normalised;
+    three numbers in the coordinates of the file, converted to a position (3,) in the object frame;
+    a `Part`; a wrist pose with finger angles, or a wrist path of K waypoints, from a file: dicts of
+    `q`, `position` and `quaternion`, object frame."""
     words: tuple[str, ...] = ()
     """Literal values accepted for any kind."""
     many: bool = False
@@ -182,21 +192,31 @@ class Constraint:
     """A constraint; subclasses set the attributes and override methods as needed."""
 
     name: ClassVar[str]
-    """Name in training (`--task.p-NAME`, metric `success/NAME`), rows of evaluations, queries, files and the studio."""
+    """Name in training (`--task.p-NAME`, metric `success/NAME`), rows of evaluations, queries,
+    files and the studio.
+    """
     title: ClassVar[str]
     """Display name, in lower case."""
     goal: ClassVar[type]
-    """NamedTuple of the goal arrays, whose fields are annotated with `GoalArray`; `NAME_FIELD` in queries and files."""
+    """NamedTuple of the goal arrays, whose fields are annotated with `GoalArray`; `NAME_FIELD` in
+    queries and files.
+    """
     blocks: ClassVar[tuple[str, ...]] = ()
-    """Blocks of the observation that it gates, each with its mask bit; the heading, always active, has none."""
+    """Blocks of the observation that it gates, each with its mask bit; the heading, always active,
+    has none.
+    """
     overrides: ClassVar[tuple[str, ...]] = ()
     """Weaker constraints, or blocks of them, that are inactive when this one is requested."""
     overridden_by: ClassVar[tuple[str, ...]] = ()
     """Stronger constraints that make this one inactive without listing it in their `overrides`."""
     guides: ClassVar[str] = ""
-    """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide the wrist."""
+    """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide
+    the wrist.
+    """
     region: ClassVar[int] = 0
-    """Region of the constraint bank from which its episodes are drawn (0 the whole surface, 1 the graspable region)."""
+    """Region of the constraint bank from which its episodes are drawn (0 the whole surface, 1 the
+    graspable region).
+    """
     from_reference: ClassVar[bool] = False
     """True if it is drawn from reference grasps."""
     harvested: ClassVar[bool] = True
@@ -219,21 +239,28 @@ class Constraint:
         return ()
 
     def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
-        """Names of the elements of flag arrays by field, for pages and command lines; those of fingers by default."""
+        """Names of the elements of flag arrays by field, for pages and command lines; those of
+        fingers by default.
+        """
         return {
-            name: hand.fingers for name, array in self.arrays.items() if array.kind == "flag" and array.shape == ("G",)
+            name: hand.fingers
+            for name, array in self.arrays.items()
+            if array.kind == "flag" and array.shape == ("G",)
         }
 
     # Sampling and the start of an episode.
 
     def columns(self, hand: Hand, bank: ConstraintBank) -> Any:
-        """Pytree of arrays (N, ...) that `sample` needs of each object (`Draw.own`), computed once; None for nothing.
+        """Pytree of arrays (N, ...) that `sample` needs of each object (`Draw.own`), computed once;
+        None for nothing.
 
         Headings, reference poses and trajectories, which constraints share, belong to the bank.
         """
         return None
 
-    def joined(self, task: TaskSettings, active: Mapping[str, Array], uniform: Array) -> Array | None:
+    def joined(
+        self, task: TaskSettings, active: Mapping[str, Array], uniform: Array
+    ) -> Array | None:
         """(B,) bool: training episodes that request it because of others; None for none.
 
         Args:
@@ -246,12 +273,18 @@ class Constraint:
     def available(self, draw: Draw) -> Array:
         """(B,) bool: the drawn objects allow it, in their resting poses and regions.
 
-        The default is True where a reference allows it if it is drawn from references, and True everywhere otherwise.
+        The default is True where a reference allows it if it is drawn from references, and True
+        everywhere otherwise.
         """
-        return jnp.any(self.allowed(draw), -1) if self.from_reference else jnp.ones(draw.objects.shape, bool)
+        return (
+            jnp.any(self.allowed(draw), -1)
+            if self.from_reference
+            else jnp.ones(draw.objects.shape, bool)
+        )
 
     def allowed(self, draw: Draw) -> Array:
-        """(B, M) bool: references of the drawn objects from which it may be drawn; by default those clear of the table.
+        """(B, M) bool: references of the drawn objects from which it may be drawn; by default those
+        clear of the table.
 
         `draw` has no `reference` at this point.
         """
@@ -271,21 +304,30 @@ class Constraint:
         """
         raise NotImplementedError
 
-    def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """Returns the goal with the arrays of weaker constraints that this one replaces, where it is requested."""
+    def override(
+        self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal
+    ) -> Goal:
+        """Returns the goal with the arrays of weaker constraints that this one replaces, where it
+        is requested.
+        """
         return goal
 
     def initial_fingers(self, goal: Goal) -> tuple[Array, Array] | None:
-        """(B,) bool where an episode begins with other finger angles than the open hand's, and these angles (B, F)."""
+        """(B,) bool where an episode begins with other finger angles than the open hand's, and
+        these angles (B, F).
+        """
         return None
 
-    def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array] | None:
-        """(B,) bool where it sets the initial wrist pose of an episode, and the pose (B, 3), (B, 4), object frame.
+    def initial_wrist(
+        self, hand: Hand, back_off: Array, goal: Goal, q: Array
+    ) -> tuple[Array, Array, Array] | None:
+        """(B,) bool where it sets the initial wrist pose of an episode, and the pose (B, 3), (B,
+        4), object frame.
 
         Args:
           hand: the hand.
-          back_off: (B,) distance back from the aligned wrist, used where no constraint sets the initial pose, m.
-          goal: goal after the priority rules.
+          back_off: (B,) distance back from the aligned wrist, used where no constraint sets the
+          initial pose, m. goal: goal after the priority rules.
           q: (B, F) initial finger angles.
         """
         return None
@@ -295,21 +337,29 @@ class Constraint:
         return self.neutral(hand, task)._asdict()
 
     def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-        """Prescribed wrist positions (n, 3), object frame, and last orientation (4,); None if it prescribes none."""
+        """Prescribed wrist positions (n, 3), object frame, and last orientation (4,); None if it
+        prescribes none.
+        """
         return None
 
     # One control step.
 
     def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> Any:
-        """Geometry specific to the constraint that observation, reward and errors share, as a pytree."""
+        """Geometry specific to the constraint that observation, reward and errors share, as a
+        pytree.
+        """
         return ()
 
     def center_fingers(self, goal: Goal) -> Array | None:
-        """(B, G) bool: fingers that define the hand centre and the distance reward; None for all."""
+        """(B, G) bool: fingers that define the hand centre and the distance reward; None for
+        all.
+        """
         return None
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """World wrist pose (B, 3), (B, 4) to which it guides, relative to the object's current or initial pose."""
+        """World wrist pose (B, 3), (B, 4) to which it guides, relative to the object's current or
+        initial pose.
+        """
         raise NotImplementedError
 
     def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
@@ -317,15 +367,20 @@ class Constraint:
         return ()
 
     def cloud_labels(self, scene: Scene) -> Array | None:
-        """(B, N) labels of the points of a camera's cloud in the observation; None if it labels none."""
+        """(B, N) labels of the points of a camera's cloud in the observation; None if it labels
+        none.
+        """
         return None
 
     def forbidden(self, scene: Scene) -> Array | None:
-        """(B, L) bool: links that must not touch the object, whether or not it is active; None for no restriction."""
+        """(B, L) bool: links that must not touch the object, whether or not it is active; None for
+        no restriction.
+        """
         return None
 
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
-        """Filters the contacts that earn the grasp reward: flags (B, L) and forces (B, L, 3) of the links.
+        """Filters the contacts that earn the grasp reward: flags (B, L) and forces (B, L, 3) of the
+        links.
 
         By default those of all links that it does not forbid.
         """
@@ -339,7 +394,9 @@ class Constraint:
         return most
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """Terms (B,) by the names of `weights`, signed, before the weight; zero where it is inactive."""
+        """Terms (B,) by the names of `weights`, signed, before the weight; zero where it is
+        inactive.
+        """
         return {}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
@@ -368,13 +425,16 @@ class Constraint:
         """Describes the effect of the priority rules on it when it is requested, in sentences.
 
         Args:
-          overridden: names of the requested stronger constraints that override it or one of its blocks.
-          redirected: True if it changed the heading.
+          overridden: names of the requested stronger constraints that override it or one of its
+          blocks. redirected: True if it changed the heading.
         """
         return []
 
-    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """Parses the values of `options` into goal arrays by field, without batch axis; None if no option is given.
+    def parse(
+        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+    ) -> dict[str, np.ndarray] | None:
+        """Parses the values of `options` into goal arrays by field, without batch axis; None if no
+        option is given.
 
         Args:
           given: values by option name, parsed by `kind`; None for an absent option.
@@ -395,7 +455,9 @@ class Constraint:
         return None
 
     @staticmethod
-    def named_flags(option: str, words: Sequence[str], names: Sequence[str], lacks: str) -> np.ndarray:
+    def named_flags(
+        option: str, words: Sequence[str], names: Sequence[str], lacks: str
+    ) -> np.ndarray:
         """(len(names),) bool: names that are among the words of an option.
 
         Args:
@@ -432,7 +494,9 @@ class Constraint:
         for name, array in self.arrays.items():
             shape = tuple(symbols[n] if isinstance(n, str) else n for n in array.shape)
             fill = np.asarray(array.neutral or 0.0, np.float32)
-            made[name] = np.broadcast_to(fill, shape).astype(bool if array.kind == "flag" else np.float32)
+            made[name] = np.broadcast_to(fill, shape).astype(
+                bool if array.kind == "flag" else np.float32
+            )
         return self.goal(**made)
 
     def active(self, goal: Goal) -> Array:
@@ -454,4 +518,6 @@ def symbol_sizes(hand: Hand, task: TaskSettings) -> dict[str, int]:
 
 def unknown_constraint(name: str, known: Sequence[str]) -> UnknownConstraintError:
     """Error for a request of an unknown constraint."""
-    return UnknownConstraintError(f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}.")
+    return UnknownConstraintError(
+        f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}."
+    )

@@ -1,4 +1,6 @@
-"""Fingers that may touch the object (ours). Thumb and index finger form a pinch, adding the middle finger a tripod."""
+"""Fingers that may touch the object (ours). Thumb and index finger form a pinch, adding the middle
+finger a tripod.
+"""
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
@@ -27,11 +29,15 @@ from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
 
 MARGIN, SHARPNESS = 0.01, 0.003
-"""Distance that the skin of the other fingers should keep from the object, and sharpness of the barrier, m."""
+"""Distance that the skin of the other fingers should keep from the object, and sharpness of the
+barrier, m.
+"""
 
 
 _FAVOURED = 0.5
-"""Probability that an episode draws pinch, tripod or all fingers; otherwise all sets are equally likely."""
+"""Probability that an episode draws pinch, tripod or all fingers; otherwise all sets are equally
+likely.
+"""
 _NEEDED = "The constraint 'fingers' needs the thumb and another finger."
 
 
@@ -52,12 +58,24 @@ class Fingers(Constraint):
     overridden_by = ("pose",)
     harvested = False
     weights = (
-        Weight("fingers_distance", 0.02, "For each unit of softplus((margin - d)/sharpness), finger by finger."),
+        Weight(
+            "fingers_distance",
+            0.02,
+            "For each unit of softplus((margin - d)/sharpness), finger by finger.",
+        ),
         Weight("fingers_contact", 0.3, "For each link of another finger that touches the object."),
     )
-    errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers"),)
+    errors = (
+        ErrorSpec(
+            "fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers"
+        ),
+    )
     options = (
-        Option("fingers", "Fingers that may touch the object, such as: thumb index. All by default.", many=True),
+        Option(
+            "fingers",
+            "Fingers that may touch the object, such as: thumb index. All by default.",
+            many=True,
+        ),
     )
     invalid = (_NEEDED, "Allow both.")
 
@@ -65,14 +83,24 @@ class Fingers(Constraint):
         """Fields for the set, the clearance of each other finger, and the forces on their links."""
         fingers, links = len(hand.fingers), len(hand.links)
         block = (
-            ObservationField("fingers_allowed", fingers, "1 for each finger that may touch the object, thumb first"),
-            ObservationField("fingers_room", fingers, "m, between the object and each other finger, at most 0.1"),
-            ObservationField("force_other", 3 * links, "as force, on links of the other fingers", privileged=True),
+            ObservationField(
+                "fingers_allowed",
+                fingers,
+                "1 for each finger that may touch the object, thumb first",
+            ),
+            ObservationField(
+                "fingers_room", fingers, "m, between the object and each other finger, at most 0.1"
+            ),
+            ObservationField(
+                "force_other", 3 * links, "as force, on links of the other fingers", privileged=True
+            ),
         )
         return (block,)
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> FingersGoal:
-        """Samples any set with the thumb; pinch, tripod and all fingers are more likely than others."""
+        """Samples any set with the thumb; pinch, tripod and all fingers are more likely than
+        others.
+        """
         sets, shares = finger_sets(hand)
         return FingersGoal(jnp.array(sets)[chance.weighted(uniform[:, 0], shares)])
 
@@ -81,10 +109,18 @@ class Fingers(Constraint):
         return {"allowed": np.arange(len(hand.fingers)) < 2}
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """The set, the clipped distance of each finger outside it, and squashed forces on those fingers' links."""
+        """The set, the clipped distance of each finger outside it, and squashed forces on those
+        fingers' links.
+        """
         allowed, other = scene.goal["fingers"].allowed, self.forbidden(scene)
         room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
-        return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
+        return (
+            [
+                allowed.astype(jnp.float32),
+                room,
+                flat(squash(scene.features.force * other[..., None])),
+            ],
+        )
 
     def center_fingers(self, goal: Goal) -> Array | None:
         """The allowed fingers, where it is active."""
@@ -98,10 +134,13 @@ class Fingers(Constraint):
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Terms for a barrier around the object for the other fingers, and for their contacts."""
         active = scene.gate("fingers")
-        near = jnp.where(scene.goal["fingers"].allowed, 0.0, jax.nn.softplus((MARGIN - _room(scene)) / SHARPNESS))
+        near = jnp.where(
+            scene.goal["fingers"].allowed, 0.0, jax.nn.softplus((MARGIN - _room(scene)) / SHARPNESS)
+        )
         return {
             "fingers_distance": -active * jnp.sum(near, -1),
-            "fingers_contact": -active * jnp.sum(scene.features.touching & self.forbidden(scene), -1),
+            "fingers_contact": -active
+            * jnp.sum(scene.features.touching & self.forbidden(scene), -1),
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
@@ -114,27 +153,42 @@ class Fingers(Constraint):
         return own.allowed[:, 0] & jnp.any(own.allowed[:, 1:], -1)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Effect of the choice: it keeps the other fingers away, unless a reference pose defines the contacts."""
+        """Effect of the choice: it keeps the other fingers away, unless a reference pose defines
+        the contacts.
+        """
         if overridden:
-            return ["The choice of fingers is overridden by the reference pose, which defines the contacts."]
+            return [
+                "The choice of fingers is overridden by the reference pose, which defines the "
+                "contacts."
+            ]
         return ["Only the named fingers may touch the object."]
 
-    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+    def parse(
+        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+    ) -> dict[str, np.ndarray] | None:
         """Parses names of fingers."""
         if not given["fingers"]:
             return None
-        allowed = self.named_flags("fingers", given["fingers"], hand.fingers, f"the hand '{hand.name}' has no finger")
+        allowed = self.named_flags(
+            "fingers", given["fingers"], hand.fingers, f"the hand '{hand.name}' has no finger"
+        )
         if allowed.sum() < 2:
-            raise CongraspError("--fingers names only one finger, which cannot hold an object.", "Name two or more.")
+            raise CongraspError(
+                "--fingers names only one finger, which cannot hold an object.", "Name two or more."
+            )
         if not allowed[0]:
             thumb = hand.fingers[0]
-            raise CongraspError(f"--fingers lacks the {thumb}, which every grasp needs.", f"Add {thumb}.")
+            raise CongraspError(
+                f"--fingers lacks the {thumb}, which every grasp needs.", f"Add {thumb}."
+            )
         return {"allowed": allowed}
 
 
 @functools.cache
 def finger_sets(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """All sets (S, G) bool of the thumb with one or more of the other fingers, and their probabilities (S,)."""
+    """All sets (S, G) bool of the thumb with one or more of the other fingers, and their
+    probabilities (S,).
+    """
     count = len(hand.fingers) - 1
     others = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1 == 1
     favoured = np.isin(np.arange(1, 2**count), (0b1, 0b11 & (2**count - 1), 2**count - 1))
@@ -143,7 +197,8 @@ def finger_sets(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
 
 
 def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
-    """(B, G) bool: fingers that define the hand centre, all where no set is active; None without the constraint.
+    """(B, G) bool: fingers that define the hand centre, all where no set is active; None without
+    the constraint.
 
     Args:
       known: names of the constraints supported by the task or the request.
@@ -159,5 +214,8 @@ def _room(scene: Scene) -> Array:
     hand = scene.hand
     skin = jnp.linalg.norm(scene.features.nearest, axis=-1) - jnp.array(hand.keypoint_radii)
     owner = hand.link_fingers[hand.keypoint_links]
-    nearest = [jnp.min(jnp.where(owner == finger, skin, jnp.inf), -1) for finger in range(len(hand.fingers))]
+    nearest = [
+        jnp.min(jnp.where(owner == finger, skin, jnp.inf), -1)
+        for finger in range(len(hand.fingers))
+    ]
     return jnp.stack(nearest, -1)

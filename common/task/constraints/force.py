@@ -41,20 +41,38 @@ class Force(Constraint):
 
     name, title, goal = "force", "force limit", ForceGoal
     blocks = ("force_limit",)
-    weights = (Weight("force_over", 0.05, "Per newton beyond the limit, per link (at most 10 N each)."),)
-    errors = (ErrorSpec("force_ratio", "", "hold", 0.0, 0.1, "share of steps in which a link presses too hard"),)
-    options = (
-        Option("force", "Upper limit of each link's force in newtons, such as: 3. No limit by default."),
-        Option("gentle", "Uses the lowest force limit that suits the object's weight.", switch=True),
+    weights = (
+        Weight("force_over", 0.05, "Per newton beyond the limit, per link (at most 10 N each)."),
     )
-    invalid = (f"The constraint 'force' takes a limit between {_LOWEST:g} and {_HIGHEST:g} N.", "Set 'force_limit'.")
+    errors = (
+        ErrorSpec(
+            "force_ratio", "", "hold", 0.0, 0.1, "share of steps in which a link presses too hard"
+        ),
+    )
+    options = (
+        Option(
+            "force", "Upper limit of each link's force in newtons, such as: 3. No limit by default."
+        ),
+        Option(
+            "gentle", "Uses the lowest force limit that suits the object's weight.", switch=True
+        ),
+    )
+    invalid = (
+        f"The constraint 'force' takes a limit between {_LOWEST:g} and {_HIGHEST:g} N.",
+        "Set 'force_limit'.",
+    )
 
     def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for the limit and each link's excess."""
         return (
             (
                 ObservationField("force_limit", 1, f"the limit divided by {MOST:g} N"),
-                ObservationField("force_over", len(hand.links), "e / (e + 5 N) for each link's excess e in N", True),
+                ObservationField(
+                    "force_over",
+                    len(hand.links),
+                    "e / (e + 5 N) for each link's excess e in N",
+                    True,
+                ),
             ),
         )
 
@@ -79,10 +97,15 @@ class Force(Constraint):
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Cost of each newton beyond the limit."""
-        return {"force_over": -scene.gate("force_limit") * jnp.sum(jnp.minimum(_excess(scene), _FAR), -1)}
+        return {
+            "force_over": -scene.gate("force_limit")
+            * jnp.sum(jnp.minimum(_excess(scene), _FAR), -1)
+        }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Steps in which at least one link presses harder than the limit, as a share of all steps."""
+        """Steps in which at least one link presses harder than the limit, as a share of all
+        steps.
+        """
         beyond = jnp.any(_excess(scene) > 0.0, -1).astype(jnp.float32)
         return {"force_ratio": (beyond, jnp.ones_like(beyond))}
 
@@ -94,7 +117,9 @@ class Force(Constraint):
         """The limit is compatible with every other constraint."""
         return ["No link may press harder than the force limit."]
 
-    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+    def parse(
+        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+    ) -> dict[str, np.ndarray] | None:
         """Parses a number, or computes the least limit for the object's weight."""
         text = given["force"]
         if text and given["gentle"]:
@@ -109,15 +134,18 @@ class Force(Constraint):
             limit = np.nan
         if not _LOWEST <= limit <= _HIGHEST:
             span = f"{_LOWEST:g} and {_HIGHEST:g}"
-            raise CongraspError(f"--force is '{text}', not a number between {span}.", "Write --force 3.")
+            raise CongraspError(
+                f"--force is '{text}', not a number between {span}.", "Write --force 3."
+            )
         return {"limit": np.array(limit, np.float32)}
 
 
 def least_force(mass: Array, friction: Array) -> Array:
-    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), between 1 and 20 N.
+    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu),
+    between 1 and 20 N.
 
-    Thumb and fingers press on opposite sides, each of which carries half of the weight by friction. The fingers share
-    their side; the thumb carries the other.
+    Thumb and fingers press on opposite sides, each of which carries half of the weight by friction.
+    The fingers share their side; the thumb carries the other.
     """
     return jnp.clip(mass * GRAVITY / (2.0 * friction), LEAST, MOST)
 

@@ -1,7 +1,8 @@
-"""Resolves which constraints are active: the paper's priority rules (figure "Priority among constraints").
+"""Resolves which constraints are active: the paper's priority rules (figure "Priority among
+constraints").
 
-Each constraint declares what it overrides and its relations to weaker ones; this module combines them. Actors, servers
-and viewers all call `resolve`.
+Each constraint declares what it overrides and its relations to weaker ones; this module combines
+them. Actors, servers and viewers all call `resolve`.
 """
 
 import functools
@@ -44,19 +45,28 @@ class Contradiction(NamedTuple):
 
 def _overrides(stronger: Constraint, weaker: str) -> bool:
     """True if it overrides a constraint or one of its blocks."""
-    return any(_hits(stronger, block, get_constraint(weaker)) for block in (weaker, *get_constraint(weaker).blocks))
+    return any(
+        _hits(stronger, block, get_constraint(weaker))
+        for block in (weaker, *get_constraint(weaker).blocks)
+    )
 
 
 def _hits(stronger: Constraint, block: str, owner: Constraint) -> bool:
     """True if it overrides this block."""
-    return not {block, owner.name}.isdisjoint(stronger.overrides) or stronger.name in owner.overridden_by
+    return (
+        not {block, owner.name}.isdisjoint(stronger.overrides)
+        or stronger.name in owner.overridden_by
+    )
 
 
 def active_blocks(asked: Mapping[str, Array]) -> dict[str, Array]:
     """Active blocks for the requested constraints, (B,) bool each."""
     return {
         block: asked[owner.name]
-        & ~_any((asked[c.name] for c in CONSTRAINTS if c.name in asked and _hits(c, block, owner)), asked[owner.name])
+        & ~_any(
+            (asked[c.name] for c in CONSTRAINTS if c.name in asked and _hits(c, block, owner)),
+            asked[owner.name],
+        )
         for owner in CONSTRAINTS
         if owner.name in asked
         for block in owner.blocks
@@ -70,16 +80,28 @@ def _any(flags: Iterable[Array], like: Array) -> Array:
 
 def _moot(relation: Relation, stronger: Constraint, asked: Mapping[str, Array]) -> Array:
     """(B,) bool: another requested constraint overrides the weaker one anyway."""
-    others = [c for c in CONSTRAINTS if c.name in asked and c is not stronger and _overrides(c, relation.weaker)]
+    others = [
+        c
+        for c in CONSTRAINTS
+        if c.name in asked and c is not stronger and _overrides(c, relation.weaker)
+    ]
     if _overrides(stronger, relation.weaker):
         others = [c for c in others if CONSTRAINTS.index(c) > CONSTRAINTS.index(stronger)]
     return _any((asked[c.name] for c in others), asked[stronger.name])
 
 
 def _relations(asked: Iterable[str]) -> list[tuple[Constraint, Relation]]:
-    """Relations between constraints that may be requested together, those of the strongest first."""
+    """Relations between constraints that may be requested together, those of the strongest
+    first.
+    """
     names = {*asked, "heading"}
-    return [(c, r) for c in reversed(CONSTRAINTS) if c.name in names for r in c.relations if r.weaker in names]
+    return [
+        (c, r)
+        for c in reversed(CONSTRAINTS)
+        if c.name in names
+        for r in c.relations
+        if r.weaker in names
+    ]
 
 
 def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]) -> Resolution:
@@ -88,8 +110,9 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
     Args:
       hand: the hand.
       surface: surface points of the objects.
-      goal: requested goal arrays; those of absent constraints may hold any finite values. Its active flags are ignored.
-      asked: (B,) bool by the name of each optional constraint of the goal.
+      goal: requested goal arrays; those of absent constraints may hold any finite values. Its
+      active flags are ignored. asked: (B,) bool by the name of each optional constraint of the
+      goal.
     """
     found: dict[str, list[Array]] = {"redirected": [], "refused": []}
     for stronger, relation in _relations(asked):
@@ -97,7 +120,9 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
             both = asked[stronger.name] & ~_moot(relation, stronger, asked)
             if relation.weaker in asked:
                 both = both & asked[relation.weaker]
-            found[relation.settled].append(both & relation.contradicts(relation.measure(hand, surface, goal)))
+            found[relation.settled].append(
+                both & relation.contradicts(relation.measure(hand, surface, goal))
+            )
     cross = orthogonal_cross(goal["heading"]).cross
     resolved = Goal(goal.values, active_blocks(asked)).replace("heading", cross=cross)
     for constraint in CONSTRAINTS:
@@ -113,7 +138,9 @@ def explain(asked: Iterable[str], redirected: bool = False) -> list[str]:
     words = []
     for constraint in reversed(CONSTRAINTS):
         if constraint.name in names:
-            others = [c.name for c in CONSTRAINTS if c.name in names and _overrides(c, constraint.name)]
+            others = [
+                c.name for c in CONSTRAINTS if c.name in names and _overrides(c, constraint.name)
+            ]
             words += constraint.explain(others, redirected)
     return words
 
@@ -128,7 +155,8 @@ def contradictions(
       points: (N, 3) surface points.
       avoid: (N,) bool, those of the avoid region.
       goal: requested goal arrays without batch axis.
-      asked: names of the explicitly requested constraints, including the heading if it was requested.
+      asked: names of the explicitly requested constraints, including the heading if it was
+      requested.
     """
     names = set(asked)
     flags = {name: np.ones(1, bool) for name in names}
@@ -142,5 +170,7 @@ def contradictions(
         if relation.contradicts(measured).any():
             one = {name: np.asarray(value)[0] for name, value in measured.items()}
             refused = relation.settled == "refused"
-            result.append(Contradiction(relation.weaker, stronger.name, relation.message(hand, one), refused))
+            result.append(
+                Contradiction(relation.weaker, stronger.name, relation.message(hand, one), refused)
+            )
     return result

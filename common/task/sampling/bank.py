@@ -12,10 +12,11 @@ from congrasp.common.task.types import Array, Surface
 
 
 class ConstraintBank(NamedTuple):
-    """N objects with R resting poses, H headings and M reference poses each; object frame unless stated otherwise.
+    """N objects with R resting poses, H headings and M reference poses each; object frame unless
+    stated otherwise.
 
-    A compiled reset gathers from it by object index. The axis V has two regions: 0 for the whole surface, 1 for the
-    graspable region of an affordance.
+    A compiled reset gathers from it by object index. The axis V has two regions: 0 for the whole
+    surface, 1 for the graspable region of an affordance.
     """
 
     points: Array
@@ -35,7 +36,9 @@ class ConstraintBank(NamedTuple):
     heading_index: Array
     """(N, V, R, H) feasible headings of each resting pose, repeated to fill the row."""
     heading_back: Array
-    """(N, V, R, H) distances by which the position of `heading_index` moves back to clear the table, m."""
+    """(N, V, R, H) distances by which the position of `heading_index` moves back to clear the
+    table, m.
+    """
     pose_q: Array
     """(N, V, M, F)."""
     pose_position: Array
@@ -49,7 +52,9 @@ class ConstraintBank(NamedTuple):
     pose_valid: Array
     """(N, V, R, M) bool: pose and trajectory stay above the table in the resting pose."""
     has_affordance: Array
-    """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
+    """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the
+    resting pose.
+    """
     weight: Array
     """(N,) relative frequency of the object; 0 if it lies too flat to be grasped."""
     mass: Array
@@ -87,11 +92,15 @@ def surface_of(task: TaskSettings, bank: ConstraintBank, objects: Array) -> Surf
 def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
     """Splits a bank into objects, without the leading axis N and columns of single constraints."""
     shared = bank[: len(SHARED)]
-    return [ConstraintBank(*(np.asarray(field)[n] for field in shared)) for n in range(len(bank.points))]
+    return [
+        ConstraintBank(*(np.asarray(field)[n] for field in shared)) for n in range(len(bank.points))
+    ]
 
 
 def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
-    """Stacks the rows of objects into a bank; resting poses, headings and references are repeated up to the longest."""
+    """Stacks the rows of objects into a bank; resting poses, headings and references are repeated
+    up to the longest.
+    """
     most = {
         axis: max(getattr(row, name).shape[_AXES[name].index(axis)] for row in rows)
         for axis, name in (("R", "rest"), ("H", "heading_position"), ("M", "pose_q"))
@@ -104,7 +113,9 @@ def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
                 value = np.take(value, np.resize(np.arange(value.shape[place]), most[axis]), place)
         return value
 
-    return ConstraintBank(**{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in SHARED})
+    return ConstraintBank(
+        **{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in SHARED}
+    )
 
 
 class Draw(NamedTuple):
@@ -118,13 +129,17 @@ class Draw(NamedTuple):
     region: Array = 0
     """(B,) int, index along the axis V: the region of the constraints requested so far."""
     reference: Mapping[str, Array] = MappingProxyType({})
-    """(B,) int by constraint, for those drawn from references: index of an allowed reference, if there is any."""
+    """(B,) int by constraint, for those drawn from references: index of an allowed reference, if
+    there is any.
+    """
     mass: Array = 0.0
     """(B,) mass of the episode's object, kg."""
     friction: Array = 1.0
     """(B,) sliding friction between hand and object."""
     disturbance: Array | None = None
-    """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.pose`); None for no errors."""
+    """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.pose`); None for no
+    errors.
+    """
 
     def own(self, constraint: str) -> Any:
         """Columns (B, ...) of a constraint for the drawn objects (`Constraint.columns`)."""

@@ -1,4 +1,6 @@
-"""Builds constraint banks: resting poses, heading sets, reference poses and wrist trajectories of a pool of objects."""
+"""Builds constraint banks: resting poses, heading sets, reference poses and wrist trajectories of a
+pool of objects.
+"""
 
 import dataclasses
 import functools
@@ -28,7 +30,14 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import draws_references, known
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
-from congrasp.common.task.sampling.headings import INWARD, Headings, above, max_width, sample_headings, within_reach
+from congrasp.common.task.sampling.headings import (
+    INWARD,
+    Headings,
+    above,
+    max_width,
+    sample_headings,
+    within_reach,
+)
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 
@@ -44,11 +53,14 @@ _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
 
 
-def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
-    """Builds a bank for a pool of objects: headings by the paper's rules, procedural reference poses and trajectories.
+def build_bank(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int
+) -> ConstraintBank:
+    """Builds a bank for a pool of objects: headings by the paper's rules, procedural reference
+    poses and trajectories.
 
-    References are made only for tasks with a constraint that is drawn from them. Banks of large pools are cached on
-    disk.
+    References are made only for tasks with a constraint that is drawn from them. Banks of large
+    pools are cached on disk.
 
     Args:
       hand: the hand.
@@ -57,28 +69,36 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
       seed: random seed.
 
     Raises:
-      CongraspError: an object is too wide or cannot be approached in any resting pose, or all objects lie too flat.
+      CongraspError: an object is too wide or cannot be approached in any resting pose, or all
+      objects lie too flat.
     """
-    bank = kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
+    bank = kept_bank(
+        hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed)
+    )
     return with_columns(hand, task, bank)
 
 
 def bank_form(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> ConstraintBank:
     """Shapes and types of the bank of a pool, for programs that are compiled while it is built.
 
-    They are those of the object with the most resting poses. The bank of a pool in which none of these objects can be
-    approached in all of its poses has a shorter axis R.
+    They are those of the object with the most resting poses. The bank of a pool in which none of
+    these objects can be approached in all of its poses has a shorter axis R.
 
     Raises:
       CongraspError: the object is too wide, or cannot be approached in any resting pose.
     """
     example = max(objects, key=lambda obj: len(obj.rest_poses))
-    row = headings_of(task, example, (0, 0), scale=object_scale(hand, task))  # a hand's outline takes seconds
+    # A hand's outline takes seconds
+    row = headings_of(task, example, (0, 0), scale=object_scale(hand, task))
     bank = with_columns(hand, task, _bank_of(hand, task, [example], [row], 0, _no_references))
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((len(objects), *leaf.shape[1:]), leaf.dtype), bank)
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((len(objects), *leaf.shape[1:]), leaf.dtype), bank
+    )
 
 
-def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
+def _build(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int
+) -> ConstraintBank:
     """Builds the bank of `build_bank` without the cache."""
     count, scale = len(objects), object_scale(hand, task)
     seeds = [(seed, n) for n in range(count)]
@@ -93,10 +113,12 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     )
     if not any(row["weight"] for row in rows):
         raise CongraspError(
-            f"None of {count} objects can be grasped: in every resting pose they lie too flat on the table.",
+            f"None of {count} objects can be grasped: in every resting pose they lie too flat on "
+            f"the table.",
             "Add other objects.",
         )
-    make = _references if draws_references(task) else _no_references  # closing a hand around objects takes seconds
+    # Closing a hand around objects takes seconds
+    make = _references if draws_references(task) else _no_references
     return _bank_of(hand, task, objects, rows, seed, make)
 
 
@@ -113,10 +135,16 @@ def _bank_of(
     for row in rows:
         fill = np.resize(np.arange(len(row["rest"])), rests)
         row["rest"], row["has_affordance"] = row["rest"][fill], row["has_affordance"][fill]
-        row["heading_index"], row["heading_back"] = row["heading_index"][:, fill], row["heading_back"][:, fill]
+        row["heading_index"], row["heading_back"] = (
+            row["heading_index"][:, fill],
+            row["heading_back"][:, fill],
+        )
     columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
-    surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
+    surfaces = [
+        np.stack([getattr(obj, name) for obj in objects]).astype(np.float32)
+        for name in ("points", "normals")
+    ]
     key, waypoints = jax.random.key(seed), task.trajectory_points
     references = make(hand, *surfaces, *chosen, columns["rest"], key, waypoints=waypoints)
     own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
@@ -125,7 +153,7 @@ def _bank_of(
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
-def _references(
+def _references(  # noqa: PLR0913
     hand: Hand,
     points: Array,
     normals: Array,
@@ -137,12 +165,18 @@ def _references(
     *,
     waypoints: int,
 ) -> dict[str, Array]:
-    """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
-    return reference_columns(hand, _closed(hand, points, normals, position, direction, cross), rest, key, waypoints)
+    """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings
+    (N, V, M, 3).
+    """
+    return reference_columns(
+        hand, _closed(hand, points, normals, position, direction, cross), rest, key, waypoints
+    )
 
 
 def _no_references(hand: Hand, *arrays: Array, waypoints: int) -> dict[str, np.ndarray]:
-    """As many poses and trajectories as `_references` makes, none of them usable; same arguments."""
+    """As many poses and trajectories as `_references` makes, none of them usable; same
+    arguments.
+    """
     *_, direction, _, rest, _ = arrays
     shape = direction.shape[:-1]
     level = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
@@ -157,8 +191,12 @@ def _no_references(hand: Hand, *arrays: Array, waypoints: int) -> dict[str, np.n
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
-def reference_columns(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> dict[str, Array]:
-    """Columns of the bank of poses (N, V, M, ...) and of trajectories to them, for resting poses (N, R, 7)."""
+def reference_columns(
+    hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int
+) -> dict[str, Array]:
+    """Columns of the bank of poses (N, V, M, ...) and of trajectories to them, for resting poses
+    (N, R, 7).
+    """
     shape = poses.q.shape[:-1]
     flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
     rest = jnp.repeat(rest, shape[1] * shape[2], axis=0)
@@ -174,8 +212,11 @@ def reference_columns(hand: Hand, poses: Poses, rest: Array, key: Array, waypoin
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
-def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> tuple[Array, Array, Array]:
-    """Generates a trajectory to each of M reference poses, and checks in which resting poses they are usable.
+def make_references(
+    hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int
+) -> tuple[Array, Array, Array]:
+    """Generates a trajectory to each of M reference poses, and checks in which resting poses they
+    are usable.
 
     Args:
       hand: the hand.
@@ -187,13 +228,16 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
     Returns:
       Trajectories (M, K, 3) and (M, K, 4), and a mask (M, R) of usable resting poses.
     """
-    path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
+    path, turns = make_trajectories(
+        hand, poses.position, poses.quaternion, key, waypoints=waypoints
+    )
     room = height_over_table(hand, poses.q, path, turns, rest) > -SOFT
     return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
 
 
 def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
-    """Least height (M, R) in m of a hand's capsules over the table along the path to each of M reference poses.
+    """Least height (M, R) in m of a hand's capsules over the table along the path to each of M
+    reference poses.
 
     Args:
       hand: the hand.
@@ -202,7 +246,9 @@ def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Arr
       turns: (M, K, 4) wrist orientations of the waypoints.
       rest: (M, R, 7) resting poses of the objects.
     """
-    return jax.lax.map(lambda row: _height_on_the_way(hand, *row), (q, path, turns, rest), batch_size=2048)
+    return jax.lax.map(
+        lambda row: _height_on_the_way(hand, *row), (q, path, turns, rest), batch_size=2048
+    )
 
 
 def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
@@ -215,7 +261,8 @@ def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Ar
 
 
 def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
-    """(M, R) bool: the approach of a reference pose is from above or level, and the trajectory stays above the table.
+    """(M, R) bool: the approach of a reference pose is from above or level, and the trajectory
+    stays above the table.
 
     Args:
       hand: the hand, for its heading axis.
@@ -224,27 +271,34 @@ def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> A
       rest: (M, R, 7) resting poses of the objects.
     """
     heading = rotations.rotate(
-        quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (*quaternion.shape[:-1], 3))
+        quaternion,
+        jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (*quaternion.shape[:-1], 3)),
     )
     rising = jnp.einsum("mri,mi->mr", rotations.to_matrix(rest[..., 3:])[..., 2, :], heading)
     return above_table(path, rest) & (rising < _STEEPEST_UP)
 
 
 def above_table(path: Array, rest: Array) -> Array:
-    """(M, R) bool: all waypoints (M, K, 3) of a wrist are above the table, in resting poses (M, R, 7) of objects."""
+    """(M, R) bool: all waypoints (M, K, 3) of a wrist are above the table, in resting poses (M, R,
+    7) of objects.
+    """
     up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
     return jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2] > _CLEARANCE
 
 
 def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Poses:
-    """Reference poses (N, V, M, ...) at headings (N, V, M, 3), by closing the hand around the objects."""
+    """Reference poses (N, V, M, ...) at headings (N, V, M, 3), by closing the hand around the
+    objects.
+    """
 
     def of_object(row: tuple[Array, ...]) -> Poses:
         points, normals, *headings = row
         flat = closed_poses(hand, points, normals, *(field.reshape(-1, 3) for field in headings))
         return Poses(*(field.reshape(2, POSES, -1) for field in flat))
 
-    return jax.lax.map(of_object, (points, normals, *headings), batch_size=min(_CLOSED_TOGETHER, len(points)))
+    return jax.lax.map(
+        of_object, (points, normals, *headings), batch_size=min(_CLOSED_TOGETHER, len(points))
+    )
 
 
 def headings_of(
@@ -255,21 +309,25 @@ def headings_of(
     scale: float = 1.0,
     hand: Outline = CENTER,
 ) -> dict[str, np.ndarray]:
-    """Computes headings and resting poses of one object; resting poses without a reachable heading are dropped.
+    """Computes headings and resting poses of one object; resting poses without a reachable heading
+    are dropped.
 
-    An object that lies too flat in all of them, such as a wide board, is given weight 0: no episode draws it.
+    An object that lies too flat in all of them, such as a wide board, is given weight 0: no episode
+    draws it.
 
     Args:
       task: geometry of the approach.
       obj: the object.
       seed: seed of the headings.
       given: `HEADINGS` headings that replace sampled ones.
-      scale: scale of the object; the lengths of the rules scale with it, so that a larger hand gets the headings of the
+      scale: scale of the object; the lengths of the rules scale with it, so that a larger hand gets
+      the headings of the
         smaller object.
       hand: outline that must clear the table.
 
     Raises:
-      CongraspError: the object is too wide (`TooWideError`), or cannot be approached in any of its resting poses.
+      CongraspError: the object is too wide (`TooWideError`), or cannot be approached in any of its
+      resting poses.
     """
     rng = np.random.default_rng(seed)
     opposed = task.headings != "center" and given is None
@@ -281,13 +339,16 @@ def headings_of(
     usable = np.flatnonzero(reachable[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
-            f"The object '{obj.name}' cannot be approached in any of its resting poses.", "Scale it or remove it."
+            f"The object '{obj.name}' cannot be approached in any of its resting poses.",
+            "Scale it or remove it.",
         )
     reachable = reachable[:, usable]
     # (V, R, H, 3), the positions that the table leaves.
     positions = np.array([[region[rest].position for rest in usable] for region in cleared])
     index = np.array([[_repeated(row) for row in region] for region in reachable])
-    back = np.linalg.norm(positions - np.array([headings.position for headings in sets])[:, None], axis=-1)
+    back = np.linalg.norm(
+        positions - np.array([headings.position for headings in sets])[:, None], axis=-1
+    )
     references = _reference_headings(rng, sets, positions, reachable)
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
     avoided = obj.non_graspable_points[keep]
@@ -295,7 +356,10 @@ def headings_of(
         "points": obj.points[keep],
         "normals": obj.normals[keep],
         "rest": obj.rest_poses[usable],
-        **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
+        **{
+            f"heading_{name}": np.stack([getattr(s, name) for s in sets])
+            for name in Headings._fields
+        },
         "heading_back": np.take_along_axis(back, index, -1),
         **{f"chosen_{name}": value for name, value in references._asdict().items()},
     }
@@ -311,10 +375,20 @@ def headings_of(
 def _sampled(
     obj: GraspObject, rng: np.random.Generator, scale: float, hand: Outline, *, opposed: bool
 ) -> tuple[Headings, Headings | None]:
-    """Headings for the whole surface and for the graspable region, None if that is out of reach; see `headings_of`."""
+    """Headings for the whole surface and for the graspable region, None if that is out of reach;
+    see `headings_of`.
+    """
     inward, width = scale * INWARD, max_width(hand, scale)
     whole, graspable = (
-        sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed)
+        sample_headings(
+            obj,
+            rng,
+            count=HEADINGS,
+            use_affordance=use,
+            inward=inward,
+            max_width=width,
+            opposed=opposed,
+        )
         for use in (False, True)
     )
     assert whole is not None, "only the graspable region may be unreachable"
@@ -330,15 +404,16 @@ def _reachable(
     *,
     opposed: bool,
 ) -> tuple[list[list[Headings]], np.ndarray, bool]:
-    """Headings of V = 2 regions moved clear of the table, (V, R, H) bool where they are feasible, and "too flat".
+    """Headings of V = 2 regions moved clear of the table, (V, R, H) bool where they are feasible,
+    and "too flat".
 
     Args:
       task: kind of headings.
       obj: the object.
       sets: headings for the whole surface, and for the graspable region.
       hand: outline that must clear the table.
-      avoid: (P,) bool, avoid region of sampled headings; None for captured ones, or without a graspable region.
-      opposed: see `within_reach`.
+      avoid: (P,) bool, avoid region of sampled headings; None for captured ones, or without a
+      graspable region. opposed: see `within_reach`.
     """
     own = CENTER if task.headings == "center" else hand
     found = [
@@ -350,7 +425,9 @@ def _reachable(
     reachable = np.stack([fine for _, fine in found])
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
-        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+        reachable = np.where(
+            (reachable & steep).any(-1, keepdims=True), reachable & steep, reachable
+        )
     return [cleared for cleared, _ in found], reachable, too_flat
 
 
@@ -381,7 +458,8 @@ def _reference_headings(
 
 
 def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Draws resting poses (M,) and headings (M,) of references, evenly over resting poses with a heading (R, H).
+    """Draws resting poses (M,) and headings (M,) of references, evenly over resting poses with a
+    heading (R, H).
 
     If there is none, all headings are equally likely.
     """
@@ -394,7 +472,9 @@ def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, 
 def with_columns(hand: Hand, task: TaskConfig, bank: ConstraintBank) -> ConstraintBank:
     """Returns the bank with the columns of the task's constraints."""
     found = {constraint.name: constraint.columns(hand, bank) for constraint in known(task)}
-    return bank._replace(own={name: columns for name, columns in found.items() if columns is not None})
+    return bank._replace(
+        own={name: columns for name, columns in found.items() if columns is not None}
+    )
 
 
 LEAST_OBJECTS = 64
@@ -402,7 +482,16 @@ LEAST_OBJECTS = 64
 MOST_FILES = 8
 """Most banks in the cache; that of 800 objects takes about 50 MB."""
 _IRRELEVANT = (
-    *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
+    *(
+        "reward",
+        "control",
+        "mass_range",
+        "friction_range",
+        "gain_range",
+        "hold_steps",
+        "drop_height",
+        "disturbed",
+    ),
     "impratio",
     *("p_", "observation", "history", "sensing", "surface_normals"),
 )
@@ -410,11 +499,16 @@ _IRRELEVANT = (
 
 
 def kept_bank(
-    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, build: Callable[[], ConstraintBank]
+    hand: Hand,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    seed: int,
+    build: Callable[[], ConstraintBank],
 ) -> ConstraintBank:
     """Returns the bank built by `build` from these arguments, from the cache on disk if possible.
 
-    Only banks of large pools are cached: they depend on objects, hand and task, and take long to build.
+    Only banks of large pools are cached: they depend on objects, hand and task, and take long to
+    build.
     """
     if len(objects) < LEAST_OBJECTS:
         return build()
@@ -427,9 +521,15 @@ def kept_bank(
 
 
 def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
-    """File name from everything that a bank depends on, including the code and the device's arithmetic."""
+    """File name from everything that a bank depends on, including the code and the device's
+    arithmetic.
+    """
     code = source_digest(congrasp.common)
-    settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
+    settings = {
+        name: value
+        for name, value in dataclasses.asdict(task).items()
+        if not name.startswith(_IRRELEVANT)
+    }
     device = jax.local_devices()[0].device_kind
     digests = [store.digest(obj) for obj in objects]
     text = json.dumps([code, jax.__version__, device, hand.reference, settings, seed, digests])
@@ -449,11 +549,12 @@ _SETTLE_SECONDS = 0.25
 def make_trajectories(
     hand: Hand, position: Array, quaternion: Array, key: Array, *, waypoints: int
 ) -> tuple[Array, Array]:
-    """Generates one trajectory for each reference pose, backwards from it (paper, section Hand Morphology).
+    """Generates one trajectory for each reference pose, backwards from it (paper, section Hand
+    Morphology).
 
-    From the final pose the wrist moves out by 15-25 cm within 15 degrees of the heading, with a lateral sinusoid of 1-5
-    cm and up to 30 degrees of rotation. The wrist's PD controller then follows the path, and its motion is resampled to
-    K waypoints.
+    From the final pose the wrist moves out by 15-25 cm within 15 degrees of the heading, with a
+    lateral sinusoid of 1-5 cm and up to 30 degrees of rotation. The wrist's PD controller then
+    follows the path, and its motion is resampled to K waypoints.
 
     Args:
       hand: its heading axis and wrist gains are used.
@@ -463,23 +564,29 @@ def make_trajectories(
       waypoints: number K of waypoints.
 
     Returns:
-      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from the far end to the pose.
+      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from the far end to the
+      pose.
     """
     count = position.shape[0]
     uniform_key, normal_key = jax.random.split(key)
     random = jax.random.uniform(uniform_key, (4, count, 1))
     tilt, distance, amplitude, turn = (
         low + (high - low) * share
-        for (low, high), share in zip(((0.0, CONE), DISTANCE, AMPLITUDE, (0.0, ROTATION)), random, strict=True)
+        for (low, high), share in zip(
+            ((0.0, CONE), DISTANCE, AMPLITUDE, (0.0, ROTATION)), random, strict=True
+        )
     )
     aside, sideways, axis = jax.random.normal(normal_key, (3, count, 3))
-    heading = rotations.rotate(quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (count, 3)))
+    heading = rotations.rotate(
+        quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (count, 3))
+    )
     outward = -(jnp.cos(tilt) * heading + jnp.sin(tilt) * _perpendicular(aside, heading))
     lateral = _perpendicular(sideways, outward)
     axis = axis / jnp.linalg.norm(axis, axis=-1, keepdims=True)
 
     steps = int((_REPLAY_SECONDS + _SETTLE_SECONDS) / _REPLAY_DT)
-    s = jnp.clip(jnp.arange(steps) * _REPLAY_DT / _REPLAY_SECONDS, 0.0, 1.0)[:, None, None]  # 0: far, 1: at the pose
+    # 0: far, 1: at the pose
+    s = jnp.clip(jnp.arange(steps) * _REPLAY_DT / _REPLAY_SECONDS, 0.0, 1.0)[:, None, None]
     slides = (1 - s) * distance * outward + jnp.sin(jnp.pi * s) * amplitude * lateral
     reached = _replay(hand, jnp.concatenate([slides, (1 - s) * turn * axis], -1))
 
@@ -490,7 +597,8 @@ def make_trajectories(
     before = jnp.clip(when.astype(jnp.int32), 0, steps - 2)
     share = (when - before)[..., None]
     columns = jnp.arange(count)
-    joints = (1 - share) * reached[before, columns] + share * reached[before + 1, columns]  # (K, M, 6)
+    # (K, M, 6)
+    joints = (1 - share) * reached[before, columns] + share * reached[before + 1, columns]
     joints = jnp.swapaxes(joints, 0, 1)
     turns = rotations.from_rotation_vector(joints[..., 3:])
     return (
@@ -500,7 +608,9 @@ def make_trajectories(
 
 
 def _replay(hand: Hand, target: Array) -> Array:
-    """Motion of the wrist's PD controller for targets (T, M, 6): each axis is a damped mass, semi-implicit Euler."""
+    """Motion of the wrist's PD controller for targets (T, M, 6): each axis is a damped mass,
+    semi-implicit Euler.
+    """
     gains = hand.wrist
     mass, inertia = hand.wrist_inertia.tolist()
     kp = jnp.array([gains.slide_kp] * 3 + [gains.hinge_kp] * 3)

@@ -1,4 +1,6 @@
-"""Files of constraint sets: headings, reference poses and wrist trajectories of one object for one hand."""
+"""Files of constraint sets: headings, reference poses and wrist trajectories of one object for one
+hand.
+"""
 
 import dataclasses
 import pathlib
@@ -32,20 +34,32 @@ MEANING = {
     "surface/points": "(P, 3) m, object frame",
     "surface/normals": "(P, 3) outward unit normals at the points",
     "surface/avoid": "(P,) bool, the point belongs to the avoid region",
-    "rest": "(R, 7) resting poses in the world frame, position (m) and quaternion; the table's top is at z = 0",
+    "rest": (
+        "(R, 7) resting poses in the world frame, position (m) and quaternion; the table's top is "
+        "at z = 0"
+    ),
     "heading/position": "(V, H, 3) m, object frame: target of the hand's centre",
     "heading/direction": "(V, H, 3) unit, object frame: direction in which the hand moves",
     "heading/cross": "(V, H, 3) unit, object frame: along the hand's cross-finger axis",
     "heading/allowed": "(V, R, H) bool, the heading clears the table",
-    "heading/back": "(V, R, H) m by which the position moves back along the direction to clear the table",
+    "heading/back": (
+        "(V, R, H) m by which the position moves back along the direction to clear the table"
+    ),
     "pose/q": "(V, M, F) rad, finger joints",
     "pose/position": "(V, M, 3) m, wrist in the object frame",
     "pose/quaternion": "(V, M, 4) wrist frame to object frame",
-    "trajectory/position": "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m",
+    "trajectory/position": (
+        "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m"
+    ),
     "trajectory/quaternion": "(V, M, K, 4) wrist frame to object frame",
     "pose/allowed": "(V, R, M) bool, the pose and its trajectory clear the table",
-    "heading/training": "(V, H) bool, the heading is for training (80 % are); the others are held out",
-    "pose/training": "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of those of the data set)",
+    "heading/training": (
+        "(V, H) bool, the heading is for training (80 % are); the others are held out"
+    ),
+    "pose/training": (
+        "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of those of the data "
+        "set)"
+    ),
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
@@ -55,7 +69,8 @@ _TRAINING = 0.8
 def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
     """Builds the constraint bank of episodes from constraint sets of one hand.
 
-    Sets may differ in their numbers of resting poses, headings and references: shorter ones are repeated.
+    Sets may differ in their numbers of resting poses, headings and references: shorter ones are
+    repeated.
 
     Args:
       sets: N constraint sets.
@@ -69,7 +84,8 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
         for key in ("hand", "finger_joints"):
             if made.meta[key] != first.meta[key]:
                 raise CongraspError(
-                    f"The set of '{made.meta['object']}' is for the hand '{made.meta['hand']}', that of "
+                    f"The set of '{made.meta['object']}' is for the hand '{made.meta['hand']}', "
+                    f"that of "
                     f"'{first.meta['object']}' for '{first.meta['hand']}'.",
                     "Use sets of one hand together.",
                 )
@@ -77,7 +93,8 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
             size, wanted = (m.arrays[name].shape[-2] for m in (made, first))
             if size != wanted:
                 raise CongraspError(
-                    f"The sets of '{made.meta['object']}' and '{first.meta['object']}' differ in {name}: {size} and "
+                    f"The sets of '{made.meta['object']}' and '{first.meta['object']}' differ in "
+                    f"{name}: {size} and "
                     f"{wanted}.",
                     "Make them with the same settings.",
                 )
@@ -85,18 +102,26 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
 
 
 def _row(made: Message, split: Split) -> ConstraintBank:
-    """Converts a set to a row of a constraint bank: constraints of the split in resting poses with a heading."""
+    """Converts a set to a row of a constraint bank: constraints of the split in resting poses with
+    a heading.
+    """
     arrays = made.arrays
     heading, pose = (_allowed(made, kind, split) for kind in ("heading", "pose"))
     usable = np.flatnonzero(heading[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
-            f"The constraint set of '{made.meta['object']}' has no heading ({split}) in any resting pose.",
+            f"The constraint set of '{made.meta['object']}' has no heading ({split}) in any "
+            f"resting pose.",
             "Remove it or use another split.",
         )
     heading, back = heading[:, usable], arrays["heading/back"][:, usable]
     count = heading.shape[-1]
-    index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
+    index = np.array(
+        [
+            [np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v]
+            for v in heading
+        ]
+    )
     return ConstraintBank(
         points=arrays["surface/points"],
         avoid=arrays["surface/avoid"],
@@ -149,12 +174,16 @@ def load(path: pathlib.Path) -> Message:
     try:
         _check(message)
     except (CongraspError, ValueError) as error:
-        raise CongraspError(f"The constraint set {path} is damaged: {str(error).split('. ')[0]}.", remedy) from None
+        raise CongraspError(
+            f"The constraint set {path} is damaged: {str(error).split('. ')[0]}.", remedy
+        ) from None
     return message
 
 
 def _with_normals(message: Message) -> Message:
-    """Returns a set of an earlier version with estimated normals; unchanged if its points are not an array (P, 3)."""
+    """Returns a set of an earlier version with estimated normals; unchanged if its points are not
+    an array (P, 3).
+    """
     points = message.arrays["surface/points"]
     if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_POINTS:
         return message
@@ -164,18 +193,27 @@ def _with_normals(message: Message) -> Message:
 
 def _check(message: Message) -> None:
     """Raises an error for invalid metadata, and for arrays that do not match `MEANING`."""
-    meta, sizes = message.meta, {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))}
+    meta, sizes = (
+        message.meta,
+        {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))},
+    )
     for name in ("object", "hand"):
         file_name(meta.get(name), f"the {name} of a constraint set")
     scale = meta.get("object_scale")
-    if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
+    if (
+        not isinstance(scale, (int, float))
+        or not 0 < scale <= 100
+        or not isinstance(meta.get("object_digest"), str)
+    ):
         raise ValueError("its object_scale or object_digest is invalid")
     mass = meta.get("object_mass", _MASS)
     if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 < mass <= 1000:
         raise ValueError("its object_mass is invalid")
     if len(_names(meta.get("variants"))) != len(REGIONS):
         raise ValueError(f"it has other variants than {', '.join(REGIONS)}")
-    sizes = check_arrays(message.arrays, MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes)
+    sizes = check_arrays(
+        message.arrays, MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes
+    )
     faces = message.arrays["visual/faces"]
     if faces.min() < 0 or faces.max() >= sizes["n"]:
         raise ValueError("visual/faces names vertices that do not exist")
@@ -200,7 +238,8 @@ def load_for(
             made = load(path)
             if made.meta["object_digest"] != store.digest(obj):
                 raise CongraspError(
-                    f"{path} was made for another object '{obj.name}'.", "Pass the folder of that object."
+                    f"{path} was made for another object '{obj.name}'.",
+                    "Pass the folder of that object.",
                 )
             if _allowed(made, "heading", split)[0].any():
                 chosen.append(obj)
@@ -209,7 +248,11 @@ def load_for(
 
 
 def make_sets(
-    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, bank: ConstraintBank | None = None
+    hand: Hand,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    seed: int,
+    bank: ConstraintBank | None = None,
 ) -> list[Message]:
     """Generates the constraint set of each object in the same way as training and evaluation.
 
@@ -218,16 +261,25 @@ def make_sets(
       task: geometry of the approach.
       objects: the objects.
       seed: seed of the constraints.
-      bank: an existing bank of these objects, scaled for the hand, whose reference poses are used. None builds one.
+      bank: an existing bank of these objects, scaled for the hand, whose reference poses are used.
+      None builds one.
 
     Raises:
       CongraspError: see `build_bank`.
     """
     fitting = scale_objects(hand, task, objects)
-    rows = rows_of(bank or build_bank(hand, dataclasses.replace(task, constraints=OURS), fitting, seed))
+    rows = rows_of(
+        bank or build_bank(hand, dataclasses.replace(task, constraints=OURS), fitting, seed)
+    )
     scale = object_scale(hand, task)
     return [
-        set_of(hand, rows[n], fitting[n], seed, {"object_scale": scale, "object_digest": store.digest(obj)})
+        set_of(
+            hand,
+            rows[n],
+            fitting[n],
+            seed,
+            {"object_scale": scale, "object_digest": store.digest(obj)},
+        )
         for n, obj in enumerate(objects)
     ]
 
@@ -250,7 +302,8 @@ def set_of(
       obj: the object.
       seed: seed of the constraints.
       about: additional metadata of the file.
-      pose_training: (M,) bool, references for training; by default the first 80 %, as references are arranged
+      pose_training: (M,) bool, references for training; by default the first 80 %, as references
+      are arranged
         (`services.evaluate.references`).
       heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
     """
@@ -287,7 +340,9 @@ def set_of(
 
 
 def _allowed_headings(row: ConstraintBank, rests: int) -> tuple[np.ndarray, np.ndarray]:
-    """Headings that a row allows in its first R resting poses: (V, R, H) bool, and the distances back in m."""
+    """Headings that a row allows in its first R resting poses: (V, R, H) bool, and the distances
+    back in m.
+    """
     allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
     back = np.zeros(allowed.shape, np.float32)
     for v, r in np.ndindex(allowed.shape[:2]):
@@ -312,13 +367,18 @@ def _description(hand: Hand, obj: GraspObject, seed: int) -> dict[str, Any]:
         "variants": list(REGIONS),
         "finger_joints": [joint.name for joint in hand.joints],
         "quaternions": "(w, x, y, z)",
-        "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
+        "object_frame": (
+            "origin at the centre of mass, orientation of the object file, lengths times "
+            "object_scale"
+        ),
         "arrays": MEANING,
     }
 
 
 def for_training(count: int, seed: int | None = None) -> np.ndarray:
-    """(count,) bool, True for 80 % (rounded up): drawn with the seed or, without a seed, the first ones."""
+    """(count,) bool, True for 80 % (rounded up): drawn with the seed or, without a seed, the first
+    ones.
+    """
     order = np.arange(count) if seed is None else np.random.default_rng(seed).permutation(count)
     return np.asarray(order < np.ceil(_TRAINING * count))
 
@@ -346,7 +406,10 @@ def describe(constraints: Message) -> dict[str, str]:
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
         "object": f"{meta['object']} ({meta['object_digest']}){scaled}",
-        "avoid region": f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "avoid region": (
+            f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface "
+            f"points"
+        ),
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",
         "wrist trajectories": f"equally many, {waypoints.shape[2]} waypoints, "
@@ -360,5 +423,7 @@ def describe(constraints: Message) -> dict[str, str]:
             f"{region}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
             for v, region in enumerate(meta["variants"])
         ]
-        rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; clear of the table on the {'; '.join(counts)}"
+        rows[f"resting pose {r + 1}"] = (
+            f"{100 * rest[2]:.1f} cm high; clear of the table on the {'; '.join(counts)}"
+        )
     return rows

@@ -67,9 +67,13 @@ class Options:
     headings: Literal["sampled", "demonstrated"] = "sampled"
     """sampled: 256 per object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Affordance = "auto"
-    """parts: labelled parts touched by fingers are graspable; contacts: the touched points; auto: parts if labelled."""
+    """parts: labelled parts touched by fingers are graspable; contacts: the touched points; auto:
+    parts if labelled.
+    """
     beyond: float = BEYOND
-    """Tolerance in rad of a captured joint beyond its limits; it is then clamped. Only for `human`."""
+    """Tolerance in rad of a captured joint beyond its limits; it is then clamped. Only for
+    `human`.
+    """
     waypoints: int = 15
     seed: int = 0
     """Seed of headings, and of the split of all sequences into training and held-out."""
@@ -84,12 +88,18 @@ class Report:
 
     def drop(self, dropped: Dropped) -> None:
         """Records a dropped sequence."""
-        self.dropped.append({"sequence": dropped.name, "rule": dropped.rule, "reason": dropped.reason})
+        self.dropped.append(
+            {"sequence": dropped.name, "rule": dropped.rule, "reason": dropped.reason}
+        )
 
     def rules(self) -> list[tuple[str, int, str]]:
-        """Returns the name of each rule, the number of sequences it dropped, and the first reason."""
+        """Returns the name of each rule, the number of sequences it dropped, and the first
+        reason.
+        """
         counts = collections.Counter(row["rule"] for row in self.dropped)
-        first = {row["rule"]: f"{row['sequence']}: {row['reason']}" for row in reversed(self.dropped)}
+        first = {
+            row["rule"]: f"{row['sequence']}: {row['reason']}" for row in reversed(self.dropped)
+        }
         return [(rule, count, first[rule]) for rule, count in counts.most_common()]
 
 
@@ -114,8 +124,8 @@ def import_sets(
 
     Args:
       sequences: sequences of an importer.
-      hand: hand of the constraints; a hand other than the human one follows the demonstrations by its grasp axes.
-      options: options for building.
+      hand: hand of the constraints; a hand other than the human one follows the demonstrations by
+      its grasp axes. options: options for building.
       source: name of the data set.
       progress: called with a description of the current step.
 
@@ -129,7 +139,10 @@ def import_sets(
         read.append(item)
     shapes = _shapes([item for item in read if isinstance(item, Sequence)], progress)
     groups: dict[tuple[str, bytes, bytes], _Group] = {}
-    beyond, scale = options.beyond if hand is HUMAN else np.inf, object_scale(hand, TaskConfig(hand=hand.name))
+    beyond, scale = (
+        options.beyond if hand is HUMAN else np.inf,
+        object_scale(hand, TaskConfig(hand=hand.name)),
+    )
     for item in read:
         try:
             if isinstance(item, Dropped):
@@ -143,7 +156,9 @@ def import_sets(
             groups.setdefault(key, _Group(labelled)).demonstrations.append(demonstration)
         except Dropped as dropped:
             report.drop(dropped)
-    for group, name in zip(groups.values(), distinct_names(name for name, *_ in groups), strict=True):
+    for group, name in zip(
+        groups.values(), distinct_names(name for name, *_ in groups), strict=True
+    ):
         group.obj = dataclasses.replace(group.obj, name=name)
     objects, sets = [], []
     # Sets may hold a single sequence each: 80 % refers to all sequences, not to each set.
@@ -173,7 +188,10 @@ def _rows(hand: Hand, group: _Group, made: Message, given: np.ndarray) -> Iterat
       given: (M, F) finger angles before fingers were separated.
     """
     usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(hand, made)
-    overlap, moved = np.asarray(deepest(hand, given)), np.abs(made.arrays["pose/q"][0] - given).max(-1)
+    overlap, moved = (
+        np.asarray(deepest(hand, given)),
+        np.abs(made.arrays["pose/q"][0] - given).max(-1),
+    )
     for m, demonstration in enumerate(group.demonstrations):
         yield {
             "sequence": demonstration.name,
@@ -193,7 +211,9 @@ def _rows(hand: Hand, group: _Group, made: Message, given: np.ndarray) -> Iterat
 
 
 def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shapes:
-    """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for failures."""
+    """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for
+    failures.
+    """
     names = {sequence.mesh: sequence.object_name for sequence in sequences}
     distinct = distinct_names(safe_name(name) for name in names.values())
     shapes, sources = _Shapes(), dict[pathlib.Path, Source]()
@@ -216,7 +236,9 @@ def _source(mesh: pathlib.Path) -> Source:
     """Returns the files of the one object at a path."""
     sources = find_sources(mesh)
     if len(sources) > 1:
-        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file.")
+        raise CongraspError(
+            f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file."
+        )
     return sources[0]
 
 
@@ -231,15 +253,23 @@ def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:
 def _labelled(
     sequence: Sequence, obj: GraspObject, demonstration: Demonstration, affordance: Affordance
 ) -> GraspObject:
-    """Returns the object with the grasp's partition into graspable and avoid region, under a separate name."""
+    """Returns the object with the grasp's partition into graspable and avoid region, under a
+    separate name.
+    """
     names, clouds = _parts(sequence, obj)
     if affordance == "none" or (affordance == "auto" and not names):
         return obj
     if affordance == "contacts":
         touched = near_points(obj, demonstration.contact, _TOUCHED)
-        return _with_region(sequence, lambda: two_parts(obj, touched, safe_name(f"{obj.name}-{sequence.name}")))
+        return _with_region(
+            sequence, lambda: two_parts(obj, touched, safe_name(f"{obj.name}-{sequence.name}"))
+        )
     if not names:
-        raise Dropped(sequence.name, "no labelled parts", f"the parts of '{sequence.object_name}' are not labelled")
+        raise Dropped(
+            sequence.name,
+            "no labelled parts",
+            f"the parts of '{sequence.object_name}' are not labelled",
+        )
     labels = _nearest(clouds, obj.points)
     counts = np.bincount(_nearest(clouds, demonstration.contact), minlength=len(names))
     graspable = counts >= _VERTICES
@@ -248,13 +278,19 @@ def _labelled(
         raise Dropped(sequence.name, "no part touched", reason)
     touched_names = [name for name, touched in zip(names, graspable, strict=True) if touched]
     name = obj.name if graspable.all() else safe_name("-".join([obj.name, *touched_names]))
-    return _with_region(sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in graspable], name))
+    return _with_region(
+        sequence, lambda: relabelled(obj, labels, names, [bool(part) for part in graspable], name)
+    )
 
 
 def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.ndarray]]:
-    """Names and points (n, 3), in the object frame, of the parts labelled by the data set or the object's files."""
+    """Names and points (n, 3), in the object frame, of the parts labelled by the data set or the
+    object's files.
+    """
     if sequence.parts:
-        return [part.name for part in sequence.parts], [part.points + obj.origin for part in sequence.parts]
+        return [part.name for part in sequence.parts], [
+            part.points + obj.origin for part in sequence.parts
+        ]
     if obj.part_names == UNLABELLED:
         return [], []
     return list(obj.part_names), [obj.points[obj.labels == i] for i in range(len(obj.part_names))]
@@ -265,7 +301,9 @@ def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspOb
     try:
         return make()
     except CongraspError as error:
-        raise Dropped(sequence.name, "graspable region too small", str(error).split(". ")[0]) from None
+        raise Dropped(
+            sequence.name, "graspable region too small", str(error).split(". ")[0]
+        ) from None
 
 
 def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
@@ -278,10 +316,12 @@ def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 def _resting_poses(
     hand: Hand, q: np.ndarray, position: np.ndarray, quaternion: np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
-    """(M, R) bool: resting poses (R, 7) of the object in which each of M captured references is used.
+    """(M, R) bool: resting poses (R, 7) of the object in which each of M captured references is
+    used.
 
-    The wrist must stay above the table and the hand outside it, as for other references. If no resting pose allows
-    that, because captured hands are off by some millimetres, the one with the least depth is used, up to `IN_TABLE`.
+    The wrist must stay above the table and the hand outside it, as for other references. If no
+    resting pose allows that, because captured hands are off by some millimetres, the one with the
+    least depth is used, up to `IN_TABLE`.
 
     Args:
       hand: hand of the references.
@@ -296,8 +336,11 @@ def _resting_poses(
     return clear & (height >= np.clip(height.max(1, keepdims=True), -IN_TABLE, -SOFT))
 
 
-def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) -> tuple[Message, np.ndarray]:
-    """Returns the constraint set of an object scaled for the hand, and the initial finger angles (M, F).
+def _set(
+    hand: Hand, group: _Group, options: Options, number: int, source: str
+) -> tuple[Message, np.ndarray]:
+    """Returns the constraint set of an object scaled for the hand, and the initial finger angles
+    (M, F).
 
     Args:
       hand: hand of the constraints.
@@ -315,11 +358,16 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     fitting = obj.scaled(scale)
     given = None
     if options.headings == "demonstrated":
-        given = Headings(*(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale)))
+        given = Headings(
+            *(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale))
+        )
     # Human grasps are not tested against the hand's outline, since their table was elsewhere.
     fields = headings_of(task, fitting, seed, given, scale, CENTER if given else outline(hand))
     if hand is HUMAN:
-        posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
+        posed = tuple(
+            np.stack([getattr(d, x) for d in demonstrations])
+            for x in ("q", "position", "quaternion")
+        )
     else:
         posed = transferred(hand, demonstrations, fitting, scale)
     given_q, position, quaternion = (values.astype(np.float32) for values in posed)
@@ -327,7 +375,11 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     clear = _resting_poses(hand, q, position, quaternion, fields["rest"])
     nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     row = ConstraintBank(
-        **{name: value for name, value in fields.items() if name != "weight" and not name.startswith("chosen")},
+        **{
+            name: value
+            for name, value in fields.items()
+            if name != "weight" and not name.startswith("chosen")
+        },
         pose_q=_twice(q),
         pose_position=_twice(position[:, -1]),
         pose_quaternion=_twice(quaternion[:, -1]),
@@ -347,12 +399,16 @@ def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) 
     }
     # Demonstrated headings repeat, and each belongs to the split of its demonstration.
     own = np.resize(group.training, HEADINGS) if given else None
-    made = set_of(hand, row, fitting, options.seed, about, pose_training=group.training, heading_training=own)
+    made = set_of(
+        hand, row, fitting, options.seed, about, pose_training=group.training, heading_training=own
+    )
     return made, given_q
 
 
 def _from_below(hand: Hand, made: Message) -> np.ndarray:
-    """(M,) bool: demonstrations excluded in every resting pose, in one of them only by the approach from below."""
+    """(M,) bool: demonstrations excluded in every resting pose, in one of them only by the approach
+    from below.
+    """
     names = "trajectory/position", "pose/quaternion", "rest"
     path, turn, rest = (made.arrays[name] for name in names)
     rests = np.stack([rest] * path.shape[1])
@@ -365,7 +421,11 @@ def _twice(values: np.ndarray) -> np.ndarray:
     return np.stack([values, values])
 
 
-def _ends_nearer_to_graspable(wrist: np.ndarray, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
-    """(M,) bool: wrist positions (M, 3) agree with the affordance (`common.task.constraints.priority`)."""
+def _ends_nearer_to_graspable(
+    wrist: np.ndarray, points: np.ndarray, avoid: np.ndarray
+) -> np.ndarray:
+    """(M,) bool: wrist positions (M, 3) agree with the affordance
+    (`common.task.constraints.priority`).
+    """
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
     return away[:, ~avoid].min(-1, initial=np.inf) < away[:, avoid].min(-1, initial=np.inf)

@@ -1,8 +1,10 @@
-"""DexYCB: `<date>-subject-XX/<session>` with `meta.yml` and `pose.npz`, in metres, in the master camera's frame.
+"""DexYCB: `<date>-subject-XX/<session>` with `meta.yml` and `pose.npz`, in metres, in the master
+camera's frame.
 
-`pose_y (F, n, 7)`: quaternion (x, y, z, w) and position of each object; `pose_m (F, 1, 51)`: MANO's root axis-angle, 45
-coefficients of its principal components, and a translation that is added to the vertices. Unobserved values are zeros,
-or the identity. Only the grasped object is used; `meta.yml` names the hand's side.
+`pose_y (F, n, 7)`: quaternion (x, y, z, w) and position of each object; `pose_m (F, 1, 51)`: MANO's
+root axis-angle, 45 coefficients of its principal components, and a translation that is added to the
+vertices. Unobserved values are zeros, or the identity. Only the grasped object is used; `meta.yml`
+names the hand's side.
 """
 
 import pathlib
@@ -31,15 +33,42 @@ from congrasp.services.assets.captures.sequence import (
 _LARGEST_YAML, _DEEPEST_YAML = 64 << 10, 16
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
-    *("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle"),
-    *("007_tuna_fish_can", "008_pudding_box", "009_gelatin_box", "010_potted_meat_can", "011_banana"),
-    *("019_pitcher_base", "021_bleach_cleanser", "024_bowl", "025_mug", "035_power_drill", "036_wood_block"),
-    *("037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick"),
+    *(
+        "002_master_chef_can",
+        "003_cracker_box",
+        "004_sugar_box",
+        "005_tomato_soup_can",
+        "006_mustard_bottle",
+    ),
+    *(
+        "007_tuna_fish_can",
+        "008_pudding_box",
+        "009_gelatin_box",
+        "010_potted_meat_can",
+        "011_banana",
+    ),
+    *(
+        "019_pitcher_base",
+        "021_bleach_cleanser",
+        "024_bowl",
+        "025_mug",
+        "035_power_drill",
+        "036_wood_block",
+    ),
+    *(
+        "037_scissors",
+        "040_large_marker",
+        "051_large_clamp",
+        "052_extra_large_clamp",
+        "061_foam_brick",
+    ),
 )
 """Names by DexYCB's ids, from 1."""
 
 
-def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
+def read(
+    path: pathlib.Path, meshes: Meshes, model: ManoModel | None
+) -> Iterator[Sequence | Dropped]:
     """Yields the sequences of a session's folder, or of all of them in a folder.
 
     Raises:
@@ -47,16 +76,21 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     """
     if model is None:
         raise CongraspError(
-            "DexYCB's hand poses need your copy of MANO_RIGHT.pkl.", f"Pass it with --mano, or set {VARIABLE}."
+            "DexYCB's hand poses need your copy of MANO_RIGHT.pkl.",
+            f"Pass it with --mano, or set {VARIABLE}.",
         )
-    root = next((folder for folder in (path, *path.parents) if (folder / "calibration").is_dir()), path)
+    root = next(
+        (folder for folder in (path, *path.parents) if (folder / "calibration").is_dir()), path
+    )
     found = meshes.beside(root / "models")
     for file in sorted(path.glob("**/meta.yml")):
         name = f"{file.parent.parent.name}/{file.parent.name}"
         yield read_or_drop(name, _sequence, name, file.parent, root, found, model)
 
 
-def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
+def _sequence(
+    name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel
+) -> Sequence:
     """Reads the sequence of a session's folder."""
     meta = _yaml(name, folder / "meta.yml")
     sides = _value(name, meta, "mano_sides")
@@ -64,13 +98,20 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
         raise Dropped(name, "left hand", f"the hand is the {', '.join(map(str, sides))} one")
     ids, grasped = _value(name, meta, "ycb_ids"), int(_value(name, meta, "ycb_grasp_ind"))
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
-        raise Dropped(name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}")
+        raise Dropped(
+            name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}"
+        )
     objects, hands = frames_of(
-        name, "pose.npz", read_archive(folder / "pose.npz"), {"pose_y": ("n", 7), "pose_m": ("n", 51)}
+        name,
+        "pose.npz",
+        read_archive(folder / "pose.npz"),
+        {"pose_y": ("n", 7), "pose_m": ("n", 51)},
     )
     if objects.shape[1] != len(ids) or hands.shape[1] != 1:
         raise Dropped(
-            name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not match meta.yml"
+            name,
+            "wrong layout",
+            f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not match meta.yml",
         )
     place, hand = objects[:, grasped], hands[:, 0]
     present = np.isfinite(place).all(-1) & (place[:, 4:] != 0).any(-1) & is_unit(place[:, :4])
@@ -78,7 +119,9 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
     place, hand = known_frames(name, present, place, hand)
     skeleton = human.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
     angles = model.hand_mean + hand[:, 3:48] @ model.components
-    wrist, joints = skeleton.posed(*map(Rotation.from_rotvec, (hand[:, :3], angles.reshape(-1, 15, 3))))
+    wrist, joints = skeleton.posed(
+        *map(Rotation.from_rotvec, (hand[:, :3], angles.reshape(-1, 15, 3)))
+    )
     object_name = OBJECTS[ids[grasped] - 1]
     return Sequence(
         name=name,
@@ -114,7 +157,9 @@ def _check_structure(text: bytes) -> None:
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError("it repeats its values")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
+            event, yaml.CollectionEndEvent
+        )
         if depth > _DEEPEST_YAML:
             raise ValueError(f"its values are more than {_DEEPEST_YAML} deep inside one another")
 
@@ -128,8 +173,12 @@ def _value(name: str, meta: dict[str, Any], key: str) -> Any:
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
     """Shape parameters (10,) of a calibration."""
-    content = _yaml(name, root / "calibration" / file_name(f"mano_{calibration}", "a calibration") / "mano.yml")
+    content = _yaml(
+        name, root / "calibration" / file_name(f"mano_{calibration}", "a calibration") / "mano.yml"
+    )
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):
-        raise Dropped(name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10")
+        raise Dropped(
+            name, "wrong layout", f"mano.yml of {calibration} has {betas.size} 'betas', not 10"
+        )
     return betas

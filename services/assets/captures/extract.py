@@ -1,14 +1,17 @@
-"""Extracts a reference pose and a wrist trajectory from a captured sequence (paper, section Constraint Setup).
+"""Extracts a reference pose and a wrist trajectory from a captured sequence (paper, section
+Constraint Setup).
 
 Definitions of terms that the paper leaves open:
 
 * wrist-object distance: from the wrist's origin to the nearest point of the object's surface;
 * contact: a finger's skin within `CONTACT` of the surface, or below it;
-* grasped: skins of thumb and another finger within `CLOSED` of the surface, where its normals oppose each other;
+* grasped: skins of thumb and another finger within `CLOSED` of the surface, where its normals
+  oppose each other;
 * carried: the object has moved by `CARRIED`, and the wrist by less than half as much against it;
-* continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row are missing;
-* too complex: the path is more than `DETOUR` times its straight line, or the wrist rotates by more than `TURN` in
-  total.
+* continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row
+  are missing;
+* too complex: the path is more than `DETOUR` times its straight line, or the wrist rotates by more
+  than `TURN` in total.
 """
 
 import dataclasses
@@ -32,7 +35,9 @@ FARTHEST = 0.20
 """Greatest distance at which a trajectory begins, m."""
 CONTACT = 0.005
 CLOSED, OPPOSITE = 0.002, -0.5
-"""Distance of skin from the surface in m, and cosine of its normals, where fingers oppose each other."""
+"""Distance of skin from the surface in m, and cosine of its normals, where fingers oppose each
+other.
+"""
 LATER = 30
 """Most frames between the first stable contact and the grasping frame."""
 JUMP = 0.10
@@ -120,7 +125,10 @@ def extract(
         raise Dropped(sequence.name, "frames missing", "hand and object are in no frame together")
     if far[sequence.present].min() > 1.0:
         nearest = far[sequence.present].min()
-        reason = f"the wrist stays {nearest:.3g} m from the object: check that its positions are in metres"
+        reason = (
+            f"the wrist stays {nearest:.3g} m from the object: check that its positions are in "
+            f"metres"
+        )
         raise Dropped(sequence.name, "wrong units", reason)
     skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
     first = _first_contact(sequence, surface, skin)
@@ -128,7 +136,9 @@ def extract(
     if sequence.grasp is None:
         touched = _opposed(sequence, surface, skin, first)
         frame = _before_carried(sequence, position, touched)
-    start, path, turns = approach(sequence.name, position, rotation, far, sequence.present, frame, waypoints)
+    start, path, turns = approach(
+        sequence.name, position, rotation, far, sequence.present, frame, waypoints
+    )
     found = _fit(sequence, frame)
     _check_limits(sequence.name, found.q, beyond)
     return Demonstration(
@@ -172,7 +182,10 @@ def approach(
     """
     start = _farthest(position, far, present, frame)
     if far[start] < NEAREST:
-        reason = f"the wrist comes from only {100 * far[start]:.1f} cm ({100 * NEAREST:.0f} cm are needed)"
+        reason = (
+            f"the wrist comes from only {100 * far[start]:.1f} cm ({100 * NEAREST:.0f} cm are "
+            f"needed)"
+        )
         raise Dropped(name, "starts too near", reason)
     frames = np.flatnonzero(present[start : frame + 1]) + start
     path, turns = _truncated(position[frames], rotation[frames], far[frames])
@@ -204,7 +217,11 @@ def _first_contact(sequence: Sequence, surface: Surface, skin: np.ndarray) -> in
     both = touching[:, 0] & touching[:, 1:].any(-1) & sequence.present
     stable = np.convolve(both, np.ones(STABLE), "valid") == STABLE
     if not stable.any():
-        ever = [name for name, touched in zip(FINGERS, touching[sequence.present].any(0), strict=True) if touched]
+        ever = [
+            name
+            for name, touched in zip(FINGERS, touching[sequence.present].any(0), strict=True)
+            if touched
+        ]
         raise Dropped(
             sequence.name,
             "no stable contact",
@@ -217,8 +234,9 @@ def _first_contact(sequence: Sequence, surface: Surface, skin: np.ndarray) -> in
 def _opposed(sequence: Sequence, surface: Surface, skin: np.ndarray, first: int) -> int:
     """First frame, from that of stable contact on, in which thumb and another finger have grasped.
 
-    Frames count while the object is not carried, at most `LATER` of them. If fingers never close in them, it is the
-    frame in which an opposing pair comes nearest to the surface; the first one if none opposes.
+    Frames count while the object is not carried, at most `LATER` of them. If fingers never close in
+    them, it is the frame in which an opposing pair comes nearest to the surface; the first one if
+    none opposes.
 
     Args:
       sequence: captured sequence.
@@ -240,10 +258,11 @@ def _opposed(sequence: Sequence, surface: Surface, skin: np.ndarray, first: int)
 
 
 def _before_carried(sequence: Sequence, position: np.ndarray, frame: int) -> int:
-    """Returns the frame or, if the object is being carried, the last one before in which it was at rest.
+    """Returns the frame or, if the object is being carried, the last one before in which it was at
+    rest.
 
-    Slightly inaccurate skin touches late. By then the hand may be in the place of the table, and its path is not an
-    approach.
+    Slightly inaccurate skin touches late. By then the hand may be in the place of the table, and
+    its path is not an approach.
 
     Args:
       sequence: captured sequence.
@@ -251,14 +270,18 @@ def _before_carried(sequence: Sequence, position: np.ndarray, frame: int) -> int
       frame: frame of stable contact.
     """
     known = np.flatnonzero(sequence.present[: frame + 1])
-    moved = np.linalg.norm(sequence.object_position[known] - sequence.object_position[frame], axis=-1)
+    moved = np.linalg.norm(
+        sequence.object_position[known] - sequence.object_position[frame], axis=-1
+    )
     picked = int(known[moved >= moved.max() - STILL][-1])
     slid = np.linalg.norm(position[picked] - position[frame])
     return picked if moved.max() > CARRIED and slid < moved.max() / 2 else frame
 
 
 def _bones(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (..., 5, 3, n, 3) along the bones between joints (..., 5, 4, 3), and the skin's radii (5, 3, 1)."""
+    """Points (..., 5, 3, n, 3) along the bones between joints (..., 5, 4, 3), and the skin's radii
+    (5, 3, 1).
+    """
     share = np.array(_ALONG)[:, None]
     points = (1 - share) * joints[..., :-1, None, :] + share * joints[..., 1:, None, :]
     return points, _RADII[..., None]
@@ -271,7 +294,9 @@ def _skin_balls(joints: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarr
 
 
 def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
-    """Frame of the local maximum of the distance, backwards from the grasping frame along continuous motion."""
+    """Frame of the local maximum of the distance, backwards from the grasping frame along
+    continuous motion.
+    """
     best = last = frame
     for t in range(frame - 1, -1, -1):
         if not present[t]:
@@ -297,11 +322,17 @@ def _check_limits(name: str, q: np.ndarray, beyond: float) -> None:
     excess = np.maximum(HUMAN.lower - q, q - HUMAN.upper)
     worst = int(excess.argmax())
     if excess[worst] > beyond:
-        raise Dropped(name, "joint limits", f"{HUMAN.joints[worst].name} is {excess[worst]:.2f} rad beyond its limits")
+        raise Dropped(
+            name,
+            "joint limits",
+            f"{HUMAN.joints[worst].name} is {excess[worst]:.2f} rad beyond its limits",
+        )
 
 
 def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """Path from its last entry within `FARTHEST` on; the entry point is interpolated between two frames."""
+    """Path from its last entry within `FARTHEST` on; the entry point is interpolated between two
+    frames.
+    """
     rotation = Rotation.from_matrix(turns)
     beyond = np.flatnonzero(far > FARTHEST)
     if len(beyond) == 0 or beyond[-1] == len(far) - 1:
@@ -310,7 +341,9 @@ def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np
     share = (far[i] - FARTHEST) / (far[i] - far[i + 1])
     first = Slerp([0.0, 1.0], rotation[[i, i + 1]])(share)
     start = (1 - share) * path[i] + share * path[i + 1]
-    return np.concatenate([start[None], path[i + 1 :]]), Rotation.concatenate([first, rotation[i + 1 :]])
+    return np.concatenate([start[None], path[i + 1 :]]), Rotation.concatenate(
+        [first, rotation[i + 1 :]]
+    )
 
 
 def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
@@ -319,7 +352,9 @@ def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
     straight = np.linalg.norm(path[-1] - path[0])
     if length > DETOUR * straight:
         raise Dropped(
-            name, "too complex", f"the wrist's path is {length / max(straight, 1e-9):.1f} times its straight line"
+            name,
+            "too complex",
+            f"the wrist's path is {length / max(straight, 1e-9):.1f} times its straight line",
         )
     turn = float((turns[1:] * turns[:-1].inv()).magnitude().sum())
     if turn > TURN:

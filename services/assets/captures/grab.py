@@ -1,9 +1,9 @@
 """GRAB: one NPZ file a sequence, `grab/s1/mug_drink_1.npz`, in metres, 120 frames a second.
 
-MANO's translation is added to the vertices, so the wrist is at the rest shape's wrist joint plus the translation. GRAB
-multiplies an object's vertices from the right: its rotation is the transpose of the stored one. If the folder has
-GrabNet's `frame_names.npz`, its first frame of a sequence is the grasping frame; otherwise the labels of the object's
-contacts give the touching fingers.
+MANO's translation is added to the vertices, so the wrist is at the rest shape's wrist joint plus
+the translation. GRAB multiplies an object's vertices from the right: its rotation is the transpose
+of the stored one. If the folder has GrabNet's `frame_names.npz`, its first frame of a sequence is
+the grasping frame; otherwise the labels of the object's contacts give the touching fingers.
 """
 
 import functools
@@ -27,11 +27,19 @@ from congrasp.services.assets.captures.sequence import (
 )
 
 HOLDS = "s1/*.npz and the other subjects"
-_LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
+_LABELS = {
+    "thumb": (53, 55),
+    "index": (41, 43),
+    "middle": (44, 46),
+    "ring": (50, 52),
+    "little": (47, 49),
+}
 """First and last contact label of each right finger."""
 
 
-def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
+def read(
+    path: pathlib.Path, meshes: Meshes, model: ManoModel | None
+) -> Iterator[Sequence | Dropped]:
     """Yields the sequences of a file, or of all subjects' folders in a folder."""
     root = _root(path)
     found = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
@@ -59,7 +67,11 @@ def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
 
 
 def _sequence(
-    file: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel | None, named: dict[tuple[str, str], int]
+    file: pathlib.Path,
+    root: pathlib.Path,
+    meshes: Meshes,
+    model: ManoModel | None,
+    named: dict[tuple[str, str], int],
 ) -> Sequence:
     """Reads the sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
@@ -114,4 +126,10 @@ def _touching(data: dict[str, np.ndarray], frames: int) -> np.ndarray | None:
     labels = data.get("contact/object")
     if labels is None or labels.ndim != 2 or len(labels) != frames:
         return None
-    return np.stack([((labels >= low) & (labels <= high)).any(-1) for low, high in (_LABELS[f] for f in FINGERS)], -1)
+    return np.stack(
+        [
+            ((labels >= low) & (labels <= high)).any(-1)
+            for low, high in (_LABELS[f] for f in FINGERS)
+        ],
+        -1,
+    )

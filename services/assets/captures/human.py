@@ -1,8 +1,9 @@
-"""The joints of a captured human hand, by finger angles or by MANO's parameters; and finger angles fitted to joints.
+"""The joints of a captured human hand, by finger angles or by MANO's parameters; and finger angles
+fitted to joints.
 
-Joints are in the wrist frame of the `human` hand. MANO's wrist frame has the fingers towards -x, the back of the hand
-+y and the thumb's side +z. Without the user's MANO file the bones are those of the `human` hand; the thumb, whose rest
-directions differ, is then off by some degrees.
+Joints are in the wrist frame of the `human` hand. MANO's wrist frame has the fingers towards -x,
+the back of the hand +y and the thumb's side +z. Without the user's MANO file the bones are those of
+the `human` hand; the thumb, whose rest directions differ, is then off by some degrees.
 """
 
 import dataclasses
@@ -38,26 +39,35 @@ class Fit(NamedTuple):
     angle: float
     """Root mean square angle between the fifteen bones and those of the capture, rad."""
     tip: float
-    """Mean distance of the fingertips from those of the capture, m; mostly the hands' different sizes."""
+    """Mean distance of the fingertips from those of the capture, m; mostly the hands' different
+    sizes.
+    """
 
 
 def joint_positions(q: np.ndarray) -> np.ndarray:
-    """Joints and tips (..., 5, 4, 3) of `FINGERS` of the `human` hand at angles q (..., 20), in its wrist frame, m."""
+    """Joints and tips (..., 5, 4, 3) of `FINGERS` of the `human` hand at angles q (..., 20), in its
+    wrist frame, m.
+    """
     data = posed(HUMAN, HUMAN.q_open)
-    return np.reshape([_joints(data, row) for row in q.reshape(-1, q.shape[-1])], (*q.shape[:-1], 5, 4, 3))
+    return np.reshape(
+        [_joints(data, row) for row in q.reshape(-1, q.shape[-1])], (*q.shape[:-1], 5, 4, 3)
+    )
 
 
 def fit(joints: np.ndarray) -> Fit:
     """Fits the `human` hand's finger angles to the directions of a capture's bones.
 
-    The two hands have bones of different lengths. Four joints of a finger cannot follow three bones exactly.
+    The two hands have bones of different lengths. Four joints of a finger cannot follow three bones
+    exactly.
 
     Args:
       joints: (5, 4, 3) joints and tips of the captured hand, in the wrist frame, m.
     """
     data, bones = posed(HUMAN, HUMAN.q_open), _directions(joints)
     found = least_squares(
-        lambda q: (_directions(_joints(data, q)) - bones).ravel(), np.zeros(len(HUMAN.joints)), method="lm"
+        lambda q: (_directions(_joints(data, q)) - bones).ravel(),
+        np.zeros(len(HUMAN.joints)),
+        method="lm",
     )
     q = (found.x + np.pi) % (2 * np.pi) - np.pi
     reached = _joints(data, q)
@@ -78,11 +88,15 @@ def _joints(data: mujoco.MjData, q: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _fingers() -> tuple[np.ndarray, np.ndarray]:
-    """Bodies (5, 3) of `FINGERS`, from the palm outwards, and the tip (5, 3) of each in its last body's frame, m."""
+    """Bodies (5, 3) of `FINGERS`, from the palm outwards, and the tip (5, 3) of each in its last
+    body's frame, m.
+    """
     model = posed(HUMAN, HUMAN.q_open).model
     chains = [[link for link in HUMAN.links if link.name.startswith(finger)] for finger in FINGERS]
     bodies = [[model.body(link.name).id for link in chain] for chain in chains]
-    return np.array(bodies), np.array([np.subtract(chain[-1].tip, link_origin(chain[-1])) for chain in chains])  # type: ignore[arg-type]
+    return np.array(bodies), np.array(
+        [np.subtract(chain[-1].tip, link_origin(chain[-1])) for chain in chains]  # type: ignore[arg-type]
+    )
 
 
 def _directions(points: np.ndarray) -> np.ndarray:
@@ -101,11 +115,13 @@ class Skeleton:
     """(5, 4, 3) joints and tip of each of `MANO_FINGERS`."""
 
     def posed(self, root: Rotation, fingers: Rotation) -> tuple[np.ndarray, np.ndarray]:
-        """Orientations (T, 3, 3) of the human hand's wrist frame, and joints (T, 5, 4, 3) in it, as in a `Sequence`.
+        """Orientations (T, 3, 3) of the human hand's wrist frame, and joints (T, 5, 4, 3) in it, as
+        in a `Sequence`.
 
         Args:
           root: (T,) orientations of MANO's root.
-          fingers: (T, 15) rotations of the finger joints relative to their parents, in MANO's order.
+          fingers: (T, 15) rotations of the finger joints relative to their parents, in MANO's
+          order.
         """
         local = fingers.as_matrix().reshape(-1, 5, 3, 3, 3)
         bones = np.diff(self.fingers, axis=1)
@@ -134,7 +150,10 @@ def skeleton(
     joints, tips = model.skeleton(betas)
     if template is not None:
         vertices = read_vertices(template)
-        joints, tips = model.regressor @ vertices, vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]]
+        joints, tips = (
+            model.regressor @ vertices,
+            vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]],
+        )
     fingers = np.concatenate([joints[1:].reshape(5, 3, 3), tips[:, None]], 1)
     return Skeleton(joints[0], fingers)
 
@@ -147,5 +166,7 @@ def read_vertices(path: pathlib.Path) -> np.ndarray:
     """
     found = load_geometry(path, "Download the file again.", maintain_order=True)
     if not hasattr(found, "vertices"):
-        raise CongraspError(f"{path} does not hold a single mesh or point cloud.", "Download the file again.")
+        raise CongraspError(
+            f"{path} does not hold a single mesh or point cloud.", "Download the file again."
+        )
     return np.asarray(found.vertices, float)

@@ -1,10 +1,11 @@
 """MyoDM's reference motions (MyoSuite): NPZ files with the joints of MyoHand, and an object's pose.
 
-`time (T,)` s; `robot (T, 29)`: three slides (m), three hinges, pronation, deviation and wrist flexion, then the twenty
-finger joints in the order of the `human` hand (rad); `object (T, 7)`: position (m) and quaternion (w, x, y, z). A file
-is named `MyoHand_<object>_<action>.npz`. The arm is MyoHand's at its table (Apache-2.0, MyoHub): slides and hinges move
-a base in front of the table, to which shoulder, elbow and forearm connect the wrist rigidly. The object's slides are
-relative to a point above the table's centre.
+`time (T,)` s; `robot (T, 29)`: three slides (m), three hinges, pronation, deviation and wrist
+flexion, then the twenty finger joints in the order of the `human` hand (rad); `object (T, 7)`:
+position (m) and quaternion (w, x, y, z). A file is named `MyoHand_<object>_<action>.npz`. The arm
+is MyoHand's at its table (Apache-2.0, MyoHub): slides and hinges move a base in front of the table,
+to which shoulder, elbow and forearm connect the wrist rigidly. The object's slides are relative to
+a point above the table's centre.
 """
 
 import pathlib
@@ -31,7 +32,9 @@ HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
 """Origin of the forearm in the base."""
-_FOREARM = Rotation.from_quat([0.000281544, 0.707106501, -0.000281544, 0.707106949], scalar_first=True)
+_FOREARM = Rotation.from_quat(
+    [0.000281544, 0.707106501, -0.000281544, 0.707106949], scalar_first=True
+)
 _PRONATION = np.array([-0.017161, 0.992666, -0.119668])
 _WRIST = np.array([0.018, -0.242, 0.025])
 """Pose of the wrist in the forearm."""
@@ -39,27 +42,39 @@ _OBJECT = np.array([0.0, 0.0, 0.035])
 _LARGEST = 2 * np.pi
 
 
-def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
+def read(
+    path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None
+) -> Iterator[Sequence | Dropped]:
     """Yields the sequences of a file, or of all NPZ files of a folder; MANO is not used."""
     for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
         yield read_or_drop(file.stem, _sequence, file, meshes)
 
 
 def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """World positions (T, 3) and orientations of the wrist for MyoHand's first nine joints (T, 9)."""
+    """World positions (T, 3) and orientations of the wrist for MyoHand's first nine joints (T,
+    9).
+    """
     arm = Rotation.from_euler("XYZ", robot[:, 3:6])
     axis = _PRONATION / np.linalg.norm(_PRONATION)
     forearm = arm * _FOREARM * Rotation.from_rotvec(robot[:, 6:7] * axis)
-    wrist = forearm * Rotation.from_rotvec(robot[:, 7:8] * [0, 0, 1]) * Rotation.from_rotvec(robot[:, 8:9] * [1, 0, 0])
+    wrist = (
+        forearm
+        * Rotation.from_rotvec(robot[:, 7:8] * [0, 0, 1])
+        * Rotation.from_rotvec(robot[:, 8:9] * [1, 0, 0])
+    )
     return _BASE + robot[:, :3] + arm.apply(_ELBOW) + forearm.apply(_WRIST), wrist
 
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     """Reads the sequence of a file."""
     name = file.stem
-    time, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
+    time, robot, pose = frames_of(
+        name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)}
+    )
     if runs_back(time).any():
-        raise Dropped(name, "wrong layout", "its time runs back: sort its frames, and cut it to one motion")
+        raise Dropped(
+            name, "wrong layout", "its time runs back: sort its frames, and cut it to one motion"
+        )
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
     if not present.any():
         reason = "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
@@ -67,7 +82,11 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     robot, pose = known_frames(name, present, robot, pose)
     largest = float(np.abs(robot[:, 3:]).max())
     if largest > _LARGEST:
-        raise Dropped(name, "wrong units", f"a joint is at {largest:.4g}: check that its angles are in radians")
+        raise Dropped(
+            name,
+            "wrong units",
+            f"a joint is at {largest:.4g}: check that its angles are in radians",
+        )
     position, rotation = wrist_pose(robot)
     object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]
     return Sequence(

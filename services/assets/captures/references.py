@@ -1,9 +1,11 @@
-"""References of a hand from demonstrations: those that it cannot take are refused, and overlapping fingers separated.
+"""References of a hand from demonstrations: those that it cannot take are refused, and overlapping
+fingers separated.
 
-A human's finger angles and wrist do not apply to a robot hand. Its hand centre is placed at the human one, with the
-grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones; the fingers then close around the
-object. Lengths scale with the object, which is scaled for the hand. Captured hands have other bones and flesh than the
-`human` hand that follows them, so that their angles make its fingers overlap, in poses that no hand can hold.
+A human's finger angles and wrist do not apply to a robot hand. Its hand centre is placed at the
+human one, with the grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones;
+the fingers then close around the object. Lengths scale with the object, which is scaled for the
+hand. Captured hands have other bones and flesh than the `human` hand that follows them, so that
+their angles make its fingers overlap, in poses that no hand can hold.
 """
 
 import functools
@@ -41,11 +43,14 @@ _AT_ONCE = 20
 """Number of poses closed in one compiled call."""
 
 
-def check_reference(hand: Hand, demonstration: Demonstration, obj: GraspObject, scale: float) -> None:
+def check_reference(
+    hand: Hand, demonstration: Demonstration, obj: GraspObject, scale: float
+) -> None:
     """Raises Dropped for a reference that the hand cannot take.
 
     Args:
-      hand: hand of the reference; for a hand other than the human one, which closes around the object by itself, only
+      hand: hand of the reference; for a hand other than the human one, which closes around the
+      object by itself, only
         the width is checked.
       demonstration: demonstration of the human hand.
       obj: the unscaled object.
@@ -53,11 +58,16 @@ def check_reference(hand: Hand, demonstration: Demonstration, obj: GraspObject, 
     """
     wide, opening = scale * width(demonstration), widest_gap(hand)
     if wide > opening:
-        reason = f"thumb and fingers touch it {100 * wide:.1f} cm apart, but the hand opens only {100 * opening:.1f} cm"
+        reason = (
+            f"thumb and fingers touch it {100 * wide:.1f} cm apart, but the hand opens only "
+            f"{100 * opening:.1f} cm"
+        )
         raise Dropped(demonstration.name, "too wide", reason)
     deep = depth(demonstration, obj) if hand is HUMAN else 0.0
     if deep > DEEPEST:
-        reason = f"the hand is {1000 * deep:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm at most)"
+        reason = (
+            f"the hand is {1000 * deep:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm at most)"
+        )
         raise Dropped(demonstration.name, "too deep", reason)
 
 
@@ -88,14 +98,17 @@ def _capsules(hand: Hand, q: Array) -> Array:
 
 
 def _above_faces(piece: Piece, points: np.ndarray) -> np.ndarray:
-    """Greatest height (N,) of points (N, 3) above the planes of a piece's faces, m; negative inside."""
+    """Greatest height (N,) of points (N, 3) above the planes of a piece's faces, m; negative
+    inside.
+    """
     vertices, _ = tessellate(piece)
     planes = hull_of(vertices).equations
     return np.asarray((points @ planes[:, :3].T + planes[:, 3]).max(-1))
 
 
 def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float) -> Headings:
-    """Hand centres (M, 3) m, heading axes and cross-finger axes (M, 3) of the captured grasps, object frame.
+    """Hand centres (M, 3) m, heading axes and cross-finger axes (M, 3) of the captured grasps,
+    object frame.
 
     Args:
       demonstrations: M demonstrations on one object.
@@ -111,7 +124,8 @@ def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float)
 def transferred(
     hand: Hand, demonstrations: Sequence[Demonstration], obj: GraspObject, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Reference poses and wrist trajectories of another hand that follow M demonstrations on one object.
+    """Reference poses and wrist trajectories of another hand that follow M demonstrations on one
+    object.
 
     Args:
       hand: any hand.
@@ -120,17 +134,24 @@ def transferred(
       scale: factor of this scaling.
 
     Returns:
-      Finger angles (M, F) that close the hand at the last waypoint, and waypoints (M, K, 3) m and (M, K, 4) of its
-      wrist in the object frame.
+      Finger angles (M, F) that close the hand at the last waypoint, and waypoints (M, K, 3) m and
+      (M, K, 4) of its wrist in the object frame.
     """
     headings = demonstrated_headings(demonstrations, scale)
     surface = obj.points.astype(np.float32), obj.normals.astype(np.float32)
-    rows = np.resize(np.arange(len(demonstrations)), (-(-len(demonstrations) // _AT_ONCE), _AT_ONCE))
+    rows = np.resize(
+        np.arange(len(demonstrations)), (-(-len(demonstrations) // _AT_ONCE), _AT_ONCE)
+    )
     parts = [closed_poses(hand, *surface, *(field[some] for field in headings)) for some in rows]
-    q, end = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(demonstrations)] for i in (0, 1))
+    q, end = (
+        np.concatenate([np.asarray(part[i]) for part in parts])[: len(demonstrations)]
+        for i in (0, 1)
+    )
     onto = _onto_human(hand)
     positions, quaternions = [], []
-    for demonstration, center, last in zip(demonstrations, _centers(demonstrations), end, strict=True):
+    for demonstration, center, last in zip(
+        demonstrations, _centers(demonstrations), end, strict=True
+    ):
         human = Rotation.from_quat(demonstration.quaternion, scalar_first=True)
         turn = human * onto
         path = scale * (human.apply(center) + demonstration.position)
@@ -141,7 +162,8 @@ def transferred(
 
 
 def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
-    """Path of the wrist of a hand whose open grasp moves like that of a human hand, for captures without fingers.
+    """Path of the wrist of a hand whose open grasp moves like that of a human hand, for captures
+    without fingers.
 
     Args:
       hand: any hand.
@@ -149,11 +171,15 @@ def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.n
       rotation: T orientations of its frame, that of the `human` hand.
     """
     turn = rotation * _onto_human(hand)
-    return position + rotation.apply(grasp_frame(HUMAN).center) - turn.apply(grasp_frame(hand).center), turn
+    return position + rotation.apply(grasp_frame(HUMAN).center) - turn.apply(
+        grasp_frame(hand).center
+    ), turn
 
 
 def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
-    """Centres (M, 3) of the human hand in its wrist frame, m: between the thumb's tip and the mean of the others."""
+    """Centres (M, 3) of the human hand in its wrist frame, m: between the thumb's tip and the mean
+    of the others.
+    """
     tips = joint_positions(np.stack([d.q for d in demonstrations]))[:, :, 3]
     return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
 
@@ -172,16 +198,18 @@ def _axes(hand: Hand) -> np.ndarray:
 def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
     """Returns the nearest finger angles whose links overlap by at most `OVERLAP`.
 
-    They minimise |q - q_0|^2 subject to the limit on all pairs of `common.task.plausibility.overlaps`, by sequential
-    quadratic programming. The variables are motors, so that couplings and tendons are preserved; all joints stay within
-    their limits.
+    They minimise |q - q_0|^2 subject to the limit on all pairs of
+    `common.task.plausibility.overlaps`, by sequential quadratic programming. The variables are
+    motors, so that couplings and tendons are preserved; all joints stay within their limits.
 
     Args:
       hand: any hand.
       q: (M, F) rad, within the limits; poses within the limit are returned unchanged.
     """
     deep = np.asarray(deepest(hand, q)) > OVERLAP
-    return np.stack([_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)])
+    return np.stack(
+        [_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)]
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -195,7 +223,10 @@ def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
     own, motors = transmission(hand), range(len(hand.motors))
     # Range of each motor until the first of its joints is at a limit.
     ends = np.sort([(limit - q) / own.ratio for limit in (hand.lower, hand.upper)], axis=0)
-    bounds = [(min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0)) for m in motors]
+    bounds = [
+        (min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0))
+        for m in motors
+    ]
     weight = np.bincount(own.motor, own.ratio**2)
     found = minimize(
         lambda way: (0.5 * weight @ way**2, weight * way),
@@ -217,7 +248,9 @@ def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
 
 
 def _room_of(hand: Hand, q: Array, way: Array) -> Array:
-    """Remaining clearance (Q,) in mm of pairs of links after a motion (M,) of the motors from angles (F,)."""
+    """Remaining clearance (Q,) in mm of pairs of links after a motion (M,) of the motors from
+    angles (F,).
+    """
     own = transmission(hand)
     return 1e3 * (OVERLAP - overlaps(hand, link_transforms(hand, q + own.ratio * way[own.motor])))
 

@@ -1,9 +1,10 @@
-"""Output of importers: one captured grasp of one object by a right hand, in metres, in any world frame.
+"""Output of importers: one captured grasp of one object by a right hand, in metres, in any world
+frame.
 
 Importers share `frames_of`, `array_of`, `known_frames` and `Meshes`.
 
-The wrist frame is that of the `human` hand: its origin at the wrist, fingers towards -y, the thumb's side +x, the back
-of the hand +z.
+The wrist frame is that of the `human` hand: its origin at the wrist, fingers towards -y, the
+thumb's side +x, the back of the hand +z.
 """
 
 import dataclasses
@@ -47,7 +48,9 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """T frames of a hand and an object. Rotations are matrices from a body's frame to the world frame."""
+    """T frames of a hand and an object. Rotations are matrices from a body's frame to the world
+    frame.
+    """
 
     name: str
     object_name: str
@@ -58,7 +61,9 @@ class Sequence:
     wrist_rotation: np.ndarray
     """(T, 3, 3)."""
     joints: np.ndarray
-    """(T, 5, 4, 3) three joints and the tip of each of `FINGERS`, from the palm outwards, in the wrist frame."""
+    """(T, 5, 4, 3) three joints and the tip of each of `FINGERS`, from the palm outwards, in the
+    wrist frame.
+    """
     object_position: np.ndarray
     """(T, 3) positions of the mesh file's origin."""
     object_rotation: np.ndarray
@@ -76,27 +81,48 @@ class Sequence:
 
     def __post_init__(self) -> None:
         frames = len(self.present)
-        for field in ("wrist_position", "wrist_rotation", "joints", "object_position", "object_rotation"):
+        for field in (
+            "wrist_position",
+            "wrist_rotation",
+            "joints",
+            "object_position",
+            "object_rotation",
+        ):
             values = getattr(self, field)
             if len(values) != frames:
-                raise Dropped(self.name, "wrong layout", f"{field} has {len(values)} frames, but there are {frames}")
+                raise Dropped(
+                    self.name,
+                    "wrong layout",
+                    f"{field} has {len(values)} frames, but there are {frames}",
+                )
             if not np.isfinite(values[self.present]).all():
                 raise Dropped(self.name, "not finite", f"{field} holds values that are not finite")
 
 
 def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
-    """Returns the result of `read(*arguments)`, or the reason why the sequence of this name cannot be used."""
+    """Returns the result of `read(*arguments)`, or the reason why the sequence of this name cannot
+    be used.
+    """
     try:
         return read(*arguments)
     except Dropped as dropped:
         return dropped
     except (CongraspError, OSError) as error:
         return Dropped(name, "unreadable", " ".join(str(error).split()))
-    except (AttributeError, LookupError, TypeError, ValueError) as error:  # values of other types than expected
-        return Dropped(name, "wrong layout", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
+    except (
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:  # values of other types than expected
+        return Dropped(
+            name, "wrong layout", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        )
 
 
-def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
+def array_of(
+    name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str
+) -> np.ndarray:
     """Returns an array of floats from a file.
 
     Args:
@@ -104,7 +130,8 @@ def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape:
       where: container of the array, for the reason.
       values: arrays by name.
       key: name of the array.
-      shape: expected sizes; a letter matches any. As many numbers in another shape count if all sizes are given.
+      shape: expected sizes; a letter matches any. As many numbers in another shape count if all
+      sizes are given.
 
     Raises:
       Dropped: the array is missing, holds no numbers, or has another shape.
@@ -114,13 +141,19 @@ def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape:
     try:
         array = np.array(values[key], float)
     except (TypeError, ValueError):
-        raise Dropped(name, "wrong layout", f"'{key}' of {where} holds no numbers of one shape") from None
+        raise Dropped(
+            name, "wrong layout", f"'{key}' of {where} holds no numbers of one shape"
+        ) from None
     known = [size for size in shape if isinstance(size, int)]
     if len(known) == len(shape) and array.size == math.prod(known):
         return array.reshape(known)
     pairs = zip(shape, array.shape, strict=False)
-    if array.ndim != len(shape) or any(wanted != size for wanted, size in pairs if isinstance(wanted, int)):
-        raise Dropped(name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}")
+    if array.ndim != len(shape) or any(
+        wanted != size for wanted, size in pairs if isinstance(wanted, int)
+    ):
+        raise Dropped(
+            name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}"
+        )
     return array
 
 
@@ -173,7 +206,8 @@ class Meshes:
         return Meshes((*self.folders, *folders))
 
     def find(self, sequence: str, *names: str, inside: str = "") -> pathlib.Path:
-        """Finds the mesh file `<name>.*`, or the folder `<name>` with one, of the first name that has either.
+        """Finds the mesh file `<name>.*`, or the folder `<name>` with one, of the first name that
+        has either.
 
         Args:
           sequence: name of the sequence that needs it.
@@ -186,10 +220,16 @@ class Meshes:
         for name in names:
             file_name(name, "the mesh of an object")
             for folder in self.folders:
-                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES] + [folder / name / inside] * bool(inside)
+                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES] + [
+                    folder / name / inside
+                ] * bool(inside)
                 if mesh := next((file for file in files if file.is_file()), None):
                     return mesh
                 if (folder / name).is_dir():
                     return folder / name
         where = f" in {', '.join(map(str, self.folders))}" if self.folders else ""
-        raise Dropped(sequence, "no mesh", f"there is no mesh of '{names[-1]}'{where}: pass its folder with --meshes")
+        raise Dropped(
+            sequence,
+            "no mesh",
+            f"there is no mesh of '{names[-1]}'{where}: pass its folder with --meshes",
+        )

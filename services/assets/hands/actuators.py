@@ -1,7 +1,7 @@
 """The actuators of a hand's file: motors with gains and limits, couplings between joints, tendons.
 
-MuJoCo reads URDF's mimic joints as joint equalities. Everything is relative to the pose in which the file shows the
-hand, which is zero here.
+MuJoCo reads URDF's mimic joints as joint equalities. Everything is relative to the pose in which
+the file shows the hand, which is zero here.
 """
 
 import dataclasses
@@ -45,7 +45,9 @@ class Follow:
 
 
 def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
-    """Returns the motors of joints and of tendons; replacements and simplifications are added to the notes."""
+    """Returns the motors of joints and of tendons; replacements and simplifications are added to
+    the notes.
+    """
     found, muscles, through_space, slopes = [], 0, 0, _slopes(model)
     for a in range(model.nu):
         kind, gear = mujoco.mjtTrn(model.actuator_trntype[a]), float(model.actuator_gear[a, 0])
@@ -64,12 +66,22 @@ def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
         else:
             continue
         kp = max(0.0, -float(model.actuator_biasprm[a, 1])) * gear**2
-        limit = float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else 0.0
+        limit = (
+            float(np.abs(model.actuator_forcerange[a]).max())
+            if model.actuator_forcelimited[a]
+            else 0.0
+        )
         if not limit and not kp and model.actuator_ctrllimited[a]:
-            limit = float(np.abs(model.actuator_ctrlrange[a]).max() * abs(model.actuator_gainprm[a, 0]))
+            limit = float(
+                np.abs(model.actuator_ctrlrange[a]).max() * abs(model.actuator_gainprm[a, 0])
+            )
         position = kp > 0 and model.actuator_ctrllimited[a] and gear == 1 and of_joint
         position = position and np.isclose(model.actuator_gainprm[a, 0], kp)
-        reach = tuple(model.actuator_ctrlrange[a] - model.qpos0[model.jnt_qposadr[target]]) if position else None
+        reach = (
+            tuple(model.actuator_ctrlrange[a] - model.qpos0[model.jnt_qposadr[target]])
+            if position
+            else None
+        )
         found.append(Servo(joints, kp, limit * abs(gear), reach))  # type: ignore[arg-type]
     if muscles:
         notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
@@ -78,7 +90,9 @@ def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
     return found
 
 
-def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: list[str]) -> list[Follow]:
+def couplings(
+    model: mujoco.MjModel, hand: set[int], driven: set[int], notes: list[str]
+) -> list[Follow]:
     """Returns joints that follow others, each once, with leaders that follow none.
 
     Args:
@@ -92,7 +106,10 @@ def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: li
         if a not in hand or b not in hand:
             continue
         if not ratio:
-            notes.append(f"'{model.joint(a).name}' follows '{model.joint(b).name}' with the ratio 0: that is dropped")
+            notes.append(
+                f"'{model.joint(a).name}' follows '{model.joint(b).name}' with the ratio 0: that "
+                f"is dropped"
+            )
             continue
         if (a in driven and b not in driven) or a in found:
             a, b, ratio, offset = b, a, 1.0 / ratio, -offset / ratio
@@ -104,19 +121,28 @@ def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: li
         while link.b in found and link.b not in passed:
             above = found[link.b]
             passed.add(link.b)
-            link = Follow(first.a, above.b, link.ratio * above.ratio, link.offset + link.ratio * above.offset)
+            link = Follow(
+                first.a, above.b, link.ratio * above.ratio, link.offset + link.ratio * above.offset
+            )
         if link.b in passed:
-            notes.append(f"joints are coupled in a circle: the coupling of '{model.joint(first.a).name}' is dropped")
+            notes.append(
+                f"joints are coupled in a circle: the coupling of '{model.joint(first.a).name}' is "
+                f"dropped"
+            )
         elif _fits(model, link):
             settled.append(link)
         else:
             joints = f"'{model.joint(link.a).name}' to '{model.joint(link.b).name}'"
-            notes.append(f"the coupling of {joints} is dropped: their limits leave it no range ('couplings')")
+            notes.append(
+                f"the coupling of {joints} is dropped: their limits leave it no range ('couplings')"
+            )
     return settled
 
 
 def _fits(model: mujoco.MjModel, link: Follow) -> bool:
-    """True if a follower's limits leave its leader a part of its range; a follower without limits takes all of it."""
+    """True if a follower's limits leave its leader a part of its range; a follower without limits
+    takes all of it.
+    """
     if not model.jnt_limited[link.a]:
         return True
     lower, upper = _limits(model, link.b)
@@ -130,7 +156,9 @@ def _limits(model: mujoco.MjModel, j: int) -> np.ndarray:
 
 
 def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int, float, float]]:
-    """(follower, leader, ratio, offset) of equalities between joints or between the joints of a fixed tendon."""
+    """(follower, leader, ratio, offset) of equalities between joints or between the joints of a
+    fixed tendon.
+    """
     found = []
     for e in range(model.neq):
         kind, data = model.eq_type[e], model.eq_data[e, :5]
@@ -140,23 +168,39 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int,
         if kind == mujoco.mjtEq.mjEQ_JOINT and two >= 0:
             ratio, offset = float(data[1]), float(data[0])
             if np.abs(data[2:]).max() > 0:
-                where = np.linspace(float(_limits(model, two)[0]), float(_limits(model, two)[1]), 50)
-                ratio, offset = map(float, np.polyfit(where, np.polynomial.polynomial.polyval(where, data), 1))
+                where = np.linspace(
+                    float(_limits(model, two)[0]), float(_limits(model, two)[1]), 50
+                )
+                ratio, offset = map(
+                    float, np.polyfit(where, np.polynomial.polynomial.polyval(where, data), 1)
+                )
                 notes.append(f"'{model.joint(one).name}' follows a curve, which is linearised")
             found.append((one, two, ratio, offset))
-        elif kind == mujoco.mjtEq.mjEQ_TENDON and two < 0 and len(pulled := _tendon(model, one)) == 2:
+        elif (
+            kind == mujoco.mjtEq.mjEQ_TENDON and two < 0 and len(pulled := _tendon(model, one)) == 2
+        ):
             (b, own), (a, other) = pulled.items()
             found.append((a, b, -own / other, float(data[0]) / other))
         elif kind == mujoco.mjtEq.mjEQ_CONNECT:
-            notes.append("closed loops of links are opened (import a URDF whose joints mimic one another)")
+            notes.append(
+                "closed loops of links are opened (import a URDF whose joints mimic one another)"
+            )
         elif kind == mujoco.mjtEq.mjEQ_JOINT or kind == mujoco.mjtEq.mjEQ_TENDON:
-            what = model.joint(one).name if kind == mujoco.mjtEq.mjEQ_JOINT else model.tendon(one).name
-            notes.append(f"an equality of '{what}' that does not couple two joints is dropped ('couplings')")
+            what = (
+                model.joint(one).name if kind == mujoco.mjtEq.mjEQ_JOINT else model.tendon(one).name
+            )
+            notes.append(
+                f"an equality of '{what}' that does not couple two joints is dropped ('couplings')"
+            )
     return found
 
 
-def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[tuple[int, int, float, float]]:
-    """Couplings by tendons whose limits leave two joints, one of them without a motor, almost no relative motion."""
+def _limited_tendons(
+    model: mujoco.MjModel, driven: set[int]
+) -> list[tuple[int, int, float, float]]:
+    """Couplings by tendons whose limits leave two joints, one of them without a motor, almost no
+    relative motion.
+    """
     found = []
     for t in range(model.ntendon):
         pulled = _tendon(model, t)
@@ -167,7 +211,9 @@ def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[tuple[int,
         lower, upper = model.tendon_range[t]
         if (upper - lower) / abs(pulled[a]) > _SLACK:
             continue
-        middle = 0.5 * (lower + upper) - sum(c * model.qpos0[model.jnt_qposadr[j]] for j, c in pulled.items())
+        middle = 0.5 * (lower + upper) - sum(
+            c * model.qpos0[model.jnt_qposadr[j]] for j, c in pulled.items()
+        )
         found.append((a, b, -pulled[b] / pulled[a], float(middle / pulled[a])))
     return found
 
@@ -181,9 +227,13 @@ def _tendon(model: mujoco.MjModel, t: int) -> dict[int, float]:
 
 
 def _slopes(model: mujoco.MjModel) -> np.ndarray:
-    """Changes (ntendon, njnt) of tendon lengths per joint angle, m/rad, with the other joints at their centres."""
+    """Changes (ntendon, njnt) of tendon lengths per joint angle, m/rad, with the other joints at
+    their centres.
+    """
     data = mujoco.MjData(model)
-    turning = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited > 0))
+    turning = np.flatnonzero(
+        (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited > 0)
+    )
     where = model.jnt_qposadr[turning]
     data.qpos[where] = model.jnt_range[turning].mean(1)
     middle, slopes = data.qpos.copy(), np.zeros((model.ntendon, model.njnt))
@@ -197,7 +247,9 @@ def _slopes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _through_space(slopes: np.ndarray) -> dict[int, float]:
-    """Coefficients of a spatial tendon by joint, from its slopes (njnt,), without negligible ones."""
+    """Coefficients of a spatial tendon by joint, from its slopes (njnt,), without negligible
+    ones.
+    """
     least = _PULL * np.abs(slopes).max(initial=0.0)
     return {int(j): float(slopes[j]) for j in np.flatnonzero(np.abs(slopes) > least)}
 
@@ -205,16 +257,28 @@ def _through_space(slopes: np.ndarray) -> dict[int, float]:
 def _shared_out(pulls: list[dict[int, float]]) -> list[dict[int, float]]:
     """Assigns every joint to one tendon: the motor that pulls only this joint, or pulls it most."""
     owner = {
-        j: max((k for k, pull in enumerate(pulls) if j in pull), key=lambda k: (len(pulls[k]) == 1, abs(pulls[k][j])))
+        j: max(
+            (k for k, pull in enumerate(pulls) if j in pull),
+            key=lambda k: (len(pulls[k]) == 1, abs(pulls[k][j])),
+        )
         for j in set[int]().union(*pulls)
     }
-    return [{j: c for j, c in pull.items() if len(pull) == 1 or owner[j] == k} for k, pull in enumerate(pulls)]
+    return [
+        {j: c for j, c in pull.items() if len(pull) == 1 or owner[j] == k}
+        for k, pull in enumerate(pulls)
+    ]
 
 
 class Drive:
     """Gains of a hand's joints and motors from a file, and proposals for missing ones."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, joints: dict[int, str], levers: dict[int, float]):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        joints: dict[int, str],
+        levers: dict[int, float],
+    ):
         """Reads motors and couplings.
 
         Args:
@@ -236,20 +300,31 @@ class Drive:
         self._damped: list[str] = []
         passive = [name for j, name in joints.items() if j not in driven and j not in self._leaders]
         if driven:
-            self.notes += listed("no motor in the file, one each is added ('couplings' in the hand file)", passive)
+            self.notes += listed(
+                "no motor in the file, one each is added ('couplings' in the hand file)", passive
+            )
         pulls = [self._reduced(servo) for servo in found]
         self._pulls = list(zip(found, _shared_out(pulls), strict=True))
-        if idle := sum(bool(before) and not after for before, (_, after) in zip(pulls, self._pulls, strict=True)):
-            self.notes.append(f"{idle} motors that only pull joints of others are dropped ('tendons' in the hand file)")
+        if idle := sum(
+            bool(before) and not after
+            for before, (_, after) in zip(pulls, self._pulls, strict=True)
+        ):
+            self.notes.append(
+                f"{idle} motors that only pull joints of others are dropped ('tendons' in the hand "
+                f"file)"
+            )
 
     def couplings(self) -> tuple[Coupling, ...]:
         """Returns the couplings as data."""
         return tuple(
-            Coupling(self._names[x.a], self._names[x.b], round(x.ratio, 6), round(x.offset, 6)) for x in self.links
+            Coupling(self._names[x.a], self._names[x.b], round(x.ratio, 6), round(x.offset, 6))
+            for x in self.links
         )
 
     def limits(self, j: int) -> np.ndarray | None:
-        """Limits (2,) of a joint relative to the file's pose, or those that its leader's give it; None without any."""
+        """Limits (2,) of a joint relative to the file's pose, or those that its leader's give it;
+        None without any.
+        """
         if self._model.jnt_limited[j]:
             return _limits(self._model, j)
         link = self._leaders.get(j)
@@ -258,21 +333,30 @@ class Drive:
         return np.sort(link.offset + link.ratio * _limits(self._model, link.b))
 
     def joint(self, j: int, lower: float, upper: float, joint: Joint) -> Joint:
-        """Returns a joint with the gains of its motor, zeros if it has none, within the motor's range."""
+        """Returns a joint with the gains of its motor, zeros if it has none, within the motor's
+        range.
+        """
         dof = self._model.jnt_dofadr[j]
         armature = float(self._model.dof_armature[dof]) or 5e-4
         damping = float(self._model.dof_damping[dof])
         kp = kv = limit = 0.0
-        if j not in self._leaders and not any(j in pulled for _, pulled in self._pulls if len(pulled) > 1):
+        if j not in self._leaders and not any(
+            j in pulled for _, pulled in self._pulls if len(pulled) > 1
+        ):
             mine = [(x, pulled[j]) for x, pulled in self._pulls if {*pulled} == {j}]
-            servo, scale = next((x for x in mine if j in x[0].joints), mine[0] if mine else (None, 1.0))
+            servo, scale = next(
+                (x for x in mine if j in x[0].joints), mine[0] if mine else (None, 1.0)
+            )
             kp, limit = self._gains(j, servo, scale, self._names[j])
             if servo and servo.reach and j in servo.joints:
                 reach = max(lower, servo.reach[0]), min(upper, servo.reach[1])
                 if reach[0] < reach[1]:
                     lower, upper = reach
                 else:
-                    self.notes.append(f"the control range of '{self._names[j]}' is outside its limits, and is left out")
+                    self.notes.append(
+                        f"the control range of '{self._names[j]}' is outside its limits, and is "
+                        f"left out"
+                    )
             followers = {j: 1.0} | {x.a: x.ratio for x in self.links if x.b == j}
             kv = self._damping(followers, kp)
             if damping > _SLOW * kp:
@@ -306,10 +390,22 @@ class Drive:
 
     def remarks(self) -> list[str]:
         """Returns the proposals, once all joints and tendons have been requested."""
-        proposed = f"no torque limit, {FINGERTIP_FORCE:g} N at the fingertip is proposed ('torque_limit')"
-        lowered = f"torque limits above {LARGEST_FORCE:g} N at the fingertip are lowered to that ('torque_limit')"
-        damped = f"damping that holds joints for more than {_SLOW:g} s is lowered ('damping' in the hand file)"
-        found = listed(proposed, self._limitless) + listed(lowered, self._strong) + listed(damped, self._damped)
+        proposed = (
+            f"no torque limit, {FINGERTIP_FORCE:g} N at the fingertip is proposed ('torque_limit')"
+        )
+        lowered = (
+            f"torque limits above {LARGEST_FORCE:g} N at the fingertip are lowered to that "
+            f"('torque_limit')"
+        )
+        damped = (
+            f"damping that holds joints for more than {_SLOW:g} s is lowered ('damping' in the "
+            f"hand file)"
+        )
+        found = (
+            listed(proposed, self._limitless)
+            + listed(lowered, self._strong)
+            + listed(damped, self._damped)
+        )
         return [*self.notes, *found]
 
     def _reduced(self, servo: Servo) -> dict[int, float]:
@@ -323,7 +419,9 @@ class Drive:
         return {j: c for j, c in pulled.items() if c}
 
     def _gains(self, j: int, servo: Servo | None, scale: float, name: str) -> tuple[float, float]:
-        """Returns kp and torque limit of a motor; without a gain in the file, kp gives the full torque at `_REACH`."""
+        """Returns kp and torque limit of a motor; without a gain in the file, kp gives the full
+        torque at `_REACH`.
+        """
         kp = servo.kp * scale**2 if servo else 0.0
         limit = servo.limit * abs(scale) if servo else 0.0
         if self._model.jnt_actfrclimited[j]:
@@ -339,7 +437,9 @@ class Drive:
         return kp or limit / _REACH, limit
 
     def _damping(self, moved: dict[int, float], kp: float) -> float:
-        """Returns kv = 1.4 sqrt(kp I), with the inertia I of everything that a motor moves, by the joints' ratios."""
+        """Returns kv = 1.4 sqrt(kp I), with the inertia I of everything that a motor moves, by the
+        joints' ratios.
+        """
         dofs = [self._model.jnt_dofadr[j] for j in moved]
         ratios = np.array([*moved.values()])
         inertia = self._inertia[np.ix_(dofs, dofs)].copy()

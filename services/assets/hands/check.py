@@ -1,8 +1,8 @@
 """Self-check of a hand before training: tests by geometry and physics whether it can grasp.
 
-Every check is a line with a measurement and, if in doubt or failed, the field or option to change. Palm, joints,
-opening and strength are computed from the hand's data; servos, overlaps and grips are simulated (`trials`) in
-the physics of the full task.
+Every check is a line with a measurement and, if in doubt or failed, the field or option to change.
+Palm, joints, opening and strength are computed from the hand's data; servos, overlaps and grips are
+simulated (`trials`) in the physics of the full task.
 """
 
 import functools
@@ -33,11 +33,24 @@ from congrasp.common.task.settings import GRAVITY
 from congrasp.services.assets.hands.trials import Grip, Response, closed_overlap, grips, responses
 
 Verdict = Literal["passed", "doubt", "failed"]
-_APART = 0.03, 0.06  # distance of a finger's first joint from the palm, m: limits for doubt and failure
-_REACH = 2.5, 4.0  # distance of the hand centre from the wrist in finger lengths: limits for doubt and failure
+# Distance of a finger's first joint from the palm, m: limits for doubt and failure
+_APART = (
+    0.03,
+    0.06,
+)
+# Distance of the hand centre from the wrist in finger lengths: limits for doubt and failure
+_REACH = (
+    2.5,
+    4.0,
+)
 _STAYS = 0.01  # least displacement of a fingertip by a closing joint, m
-_ALONG = -0.1, -0.3  # cosine between a closing fingertip's motion and its opponent: limits for doubt and failure
-_PARALLEL = 0.2  # of a follower's turn: turn of its link in the palm's frame below which that is a parallel pad
+# Cosine between a closing fingertip's motion and its opponent: limits for doubt and failure
+_ALONG = (
+    -0.1,
+    -0.3,
+)
+# Of a follower's turn: turn of its link in the palm's frame below which that is a parallel pad
+_PARALLEL = 0.2
 _GAP = 0.3, 0.5  # shares of the opening to which the fingertips close
 _FITTING = 0.9, 0.6  # shares of the objects spanned by the opening
 _CARRIED = 2.0, 1.0  # weights of a median object that friction carries
@@ -95,7 +108,10 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
 
 def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
     """Writes findings as JSON for `read_findings`."""
-    write_atomically(path, json.dumps({"findings": [finding._asdict() for finding in findings]}, indent=1).encode())
+    write_atomically(
+        path,
+        json.dumps({"findings": [finding._asdict() for finding in findings]}, indent=1).encode(),
+    )
 
 
 def read_findings(path: pathlib.Path) -> list[Finding]:
@@ -153,9 +169,11 @@ def _palm(hand: Hand) -> Finding:
     return _finding(
         "palm",
         _worst(_verdict(apart[farthest], *_APART), _verdict(reach, *_REACH)),
-        f"fingers begin within {100 * max(apart[farthest], 0.0):.1f} cm of it ({hand.fingers[farthest]}), the hand "
+        f"fingers begin within {100 * max(apart[farthest], 0.0):.1f} cm of it "
+        f"({hand.fingers[farthest]}), the hand "
         f"centre is {reach:.1f} fingers' lengths from the wrist",
-        f"import with --palm and the body that carries '{hand.finger_roots[farthest]}', or correct the capsules "
+        f"import with --palm and the body that carries '{hand.finger_roots[farthest]}', or correct "
+        f"the capsules "
         f"of '{hand.links[0].name}'",
     )
 
@@ -171,7 +189,8 @@ def _joints(hand: Hand) -> list[Finding]:
             "closing",
             _verdict(float(gaps.min() / gaps[0]), *_GAP),
             f"thumb and fingers close from {100 * gaps[0]:.1f} to {100 * gaps.min():.1f} cm",
-            "close further: increase the angles of closed_pose, and turn the thumb towards the fingers in open_pose",
+            "close further: increase the angles of closed_pose, and turn the thumb towards the "
+            "fingers in open_pose",
         )
     ]
     leaders = {coupling.joint: coupling.leader for coupling in hand.couplings}
@@ -189,28 +208,42 @@ def _joints(hand: Hand) -> list[Finding]:
                 Finding(
                     "joint",
                     "doubt" if parallel else verdict,
-                    f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' {100 * path:.1f} cm, at a "
+                    f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' "
+                    f"{100 * path:.1f} cm, at a "
                     f"cosine of {cosine:.2f} to its opponent",
-                    "change its ratio or its leader in couplings" + ", unless it keeps a pad parallel" * parallel
+                    "change its ratio or its leader in couplings"
+                    + ", unless it keeps a pad parallel" * parallel
                     if joint.name in leaders
-                    else f"turn its axis, or close it towards {limit:.2f} in closed_pose; omit it if it spreads",
+                    else (
+                        f"turn its axis, or close it towards {limit:.2f} in closed_pose; omit it "
+                        f"if it spreads"
+                    ),
                 )
             )
     if not moved:
-        found.append(Finding("joints", "failed", "no joint closes", "give closed_pose the angles of a fist"))
+        found.append(
+            Finding("joints", "failed", "no joint closes", "give closed_pose the angles of a fist")
+        )
     elif len(found) == 1:
-        found.append(Finding("joints", "passed", f"each of the {moved} that close brings its fingertip nearer"))
+        found.append(
+            Finding(
+                "joints", "passed", f"each of the {moved} that close brings its fingertip nearer"
+            )
+        )
     return found
 
 
 def _keeps_parallel(hand: Hand, follower: int, leaders: dict[str, str]) -> bool:
-    """True if the turns of the joints with a follower's leader, up to its link, cancel, as those of a parallel pad."""
+    """True if the turns of the joints with a follower's leader, up to its link, cancel, as those of
+    a parallel pad.
+    """
     way, leader = hand.q_closed - hand.q_open, leaders[hand.joints[follower].name]
     chain = chain_of(hand, hand.links[hand.joint_links[follower]].name)
     turns = [
         way[j] * np.array(joint.axis)
         for j, joint in enumerate(hand.joints)
-        if hand.links[hand.joint_links[j]].name in chain and leaders.get(joint.name, joint.name) == leader
+        if hand.links[hand.joint_links[j]].name in chain
+        and leaders.get(joint.name, joint.name) == leader
     ]
     return bool(np.linalg.norm(np.sum(turns, axis=0)) < _PARALLEL * abs(way[follower]))
 
@@ -218,8 +251,9 @@ def _keeps_parallel(hand: Hand, follower: int, leaders: dict[str, str]) -> bool:
 def _approach(hand: Hand, joint: int, finger: int) -> tuple[float, float]:
     """Closing direction of a joint: cosine to the opponent of its fingertip, and path length.
 
-    The cosine is that between the motion of a fingertip as one joint begins to close and the direction to its opponent
-    (for the thumb the mean of the others). The path length in m covers the whole closing motion.
+    The cosine is that between the motion of a fingertip as one joint begins to close and the
+    direction to its opponent (for the thumb the mean of the others). The path length in m covers
+    the whole closing motion.
     """
     way, small = float(hand.q_closed[joint] - hand.q_open[joint]), 0.01
     cosines, levers = [], []
@@ -246,9 +280,11 @@ def _opening(hand: Hand) -> Finding:
     return _finding(
         "opening",
         _verdict(share, *_FITTING),
-        f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) have a narrower "
+        f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) "
+        f"have a narrower "
         f"side, {100 * np.median(widths):.1f} cm in the middle",
-        f"object_scale {max(np.floor(10 * scale) / 10, 0.1):.1f} (import with --object-scale), or widen the open_pose",
+        f"object_scale {max(np.floor(10 * scale) / 10, 0.1):.1f} (import with --object-scale), or "
+        f"widen the open_pose",
     )
 
 
@@ -260,7 +296,8 @@ def _strength(hand: Hand) -> Finding:
     return _finding(
         "strength",
         _verdict(carried / weight, *_CARRIED),
-        f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N and carry {carried:.1f} N by friction; "
+        f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N and carry {carried:.1f} "
+        f"N by friction; "
         f"a median object weighs {weight:.1f} N",
         "check torque_limit (N.m) of the motors, or use a smaller object_scale",
     )
@@ -274,9 +311,15 @@ def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
         misses = _verdict(one.error, *_ERROR)
         verdict: Verdict = "failed" if one.diverged else _worst(shakes, misses)
         if verdict != "passed":
-            remedy = f"raise kv ({motor.kv:g}) or the armature of what it moves, or lower kp ({motor.kp:g})"
+            remedy = (
+                f"raise kv ({motor.kv:g}) or the armature of what it moves, or lower kp "
+                f"({motor.kp:g})"
+            )
             if shakes == "passed" and not one.diverged:
-                remedy = f"raise kp ({motor.kp:g}), or lower kv ({motor.kv:g}) and the damping of what it moves"
+                remedy = (
+                    f"raise kp ({motor.kp:g}), or lower kv ({motor.kv:g}) and the damping of what "
+                    f"it moves"
+                )
             text = "breaks the simulation" if one.diverged else _response(one)
             bad.append(Finding("servo", verdict, f"'{motor.name}' {text}", remedy))
     overshoot, error = max(one.overshoot for one in found), max(one.error for one in found)
@@ -284,7 +327,8 @@ def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
         Finding(
             "servos",
             "passed",
-            f"{len(found)} motors follow a step, overshoot {100 * overshoot:.0f} %, {100 * error:.0f} % off in the end",
+            f"{len(found)} motors follow a step, overshoot {100 * overshoot:.0f} %, "
+            f"{100 * error:.0f} % off in the end",
         )
     ]
 
@@ -292,20 +336,27 @@ def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
 def _response(one: Response) -> str:
     """Describes a response."""
     return (
-        f"overshoots a step by {100 * one.overshoot:.0f} %, oscillates at {one.unrest:.2f} rad/s half a second "
+        f"overshoots a step by {100 * one.overshoot:.0f} %, oscillates at {one.unrest:.2f} rad/s "
+        f"half a second "
         f"later, and is then {100 * one.error:.0f} % off"
     )
 
 
 def _open_overlap(hand: Hand) -> Finding:
-    """Checks that different fingers of the open hand do not overlap; housings of one finger may nest at knuckles."""
+    """Checks that different fingers of the open hand do not overlap; housings of one finger may
+    nest at knuckles.
+    """
     names = [link.name for link in hand.links]
     depths = np.asarray(_depths(hand, np.array(hand.q_open, np.float32)))
     deepest, pair = 0.0, ""
     for pair_of in overlapping(hand):
-        if any(one in ("", names[0], *chain_of(hand, other)) for one, other in (pair_of, pair_of[::-1])):
+        if any(
+            one in ("", names[0], *chain_of(hand, other)) for one, other in (pair_of, pair_of[::-1])
+        ):
             continue
-        first, second = (np.flatnonzero(hand.capsule_links == names.index(name)) for name in pair_of)
+        first, second = (
+            np.flatnonzero(hand.capsule_links == names.index(name)) for name in pair_of
+        )
         depth = float(depths[np.ix_(first, second)].max())
         if depth > deepest:
             deepest, pair = depth, f" ({pair_of[0]} and {pair_of[1]}, which then do not collide)"
@@ -319,7 +370,9 @@ def _open_overlap(hand: Hand) -> Finding:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _depths(hand: Hand, q: jax.Array) -> jax.Array:
-    """Overlaps (C, C) in m of all pairs of capsules at finger angles (F,), compiled as one program."""
+    """Overlaps (C, C) in m of all pairs of capsules at finger angles (F,), compiled as one
+    program.
+    """
     start, end = jnp.moveaxis(kinematics.capsules(hand, kinematics.link_transforms(hand, q)), -2, 0)
     apart = plausibility.segment_distance(start[:, None], end[:, None], start, end)
     return hand.capsule_radii[:, None] + hand.capsule_radii - apart
@@ -346,14 +399,17 @@ def _grip(grip: Grip, sound: bool) -> Finding:
         if not lifted
         else "is lifted, but lost in six pushes of half its weight"
         if not half
-        else f"survives lift and six pushes of half its weight{', and six of 1 N' if newton else ''}"
+        else (
+            f"survives lift and six pushes of half its weight{', and six of 1 N' if newton else ''}"
+        )
     )
     size = f"{100 * grip.width:.1f} cm wide, {1e3 * grip.obj.mass:.0f} g"
     return _finding(
         grip.obj.name,
         verdict,
         f"{size}: {fate}; {int(grip.touching.sum())} links touch it",
-        "close further (closed_pose), turn the thumb towards the fingers (open_pose), or use a smaller object_scale"
+        "close further (closed_pose), turn the thumb towards the fingers (open_pose), or use a "
+        "smaller object_scale"
         if sound
         else "repair the failures above first",
     )

@@ -1,8 +1,9 @@
 """Links of a hand in a model: its palm, the branches from it, and their geometry.
 
-A body without a hinge belongs to its parent, so that a model is a tree of links. The palm is the link with most
-branches; bodies before it (an arm, a wrist) are dropped, since the wrist is a virtual mount. A link has capsules for
-its collision shapes, else for its visual shapes, else for its inertia; and a visual mesh.
+A body without a hinge belongs to its parent, so that a model is a tree of links. The palm is the
+link with most branches; bodies before it (an arm, a wrist) are dropped, since the wrist is a
+virtual mount. A link has capsules for its collision shapes, else for its visual shapes, else for
+its inertia; and a visual mesh.
 """
 
 import dataclasses
@@ -92,11 +93,16 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     """
     names = [model.body(i).name for i in range(model.nbody)]
     if wanted and wanted not in names:
-        raise CongraspError(f"There is no body '{wanted}'.", f"Pass one of: {', '.join(filter(None, names))}.")
+        raise CongraspError(
+            f"There is no body '{wanted}'.", f"Pass one of: {', '.join(filter(None, names))}."
+        )
     palm = names.index(wanted) if wanted else _palm(model, notes)
     owner, groups, loose = {palm: palm}, {palm: [palm]}, list[str]()
     for body in range(palm + 1, model.nbody):
-        if not model.body_parentid[body] and mujoco.mjtJoint.mjJNT_FREE in model.jnt_type[hinges(model, body)]:
+        if (
+            not model.body_parentid[body]
+            and mujoco.mjtJoint.mjJNT_FREE in model.jnt_type[hinges(model, body)]
+        ):
             loose.append(names[body] or f"body {body}")
         elif int(model.body_parentid[body]) in owner:
             owner[body] = max(palm, int(model.body_weldid[body]))
@@ -118,7 +124,15 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     called = ["palm", *(identifier(names[link], f"body_{link}") for link in groups if link != palm)]
     numbered = distinct_names(called, str)
     notes += renamed("links", called, numbered)
-    return Tree(model, data, palm, groups, owner, tuple(last.values()), dict(zip(groups, numbered, strict=True)))
+    return Tree(
+        model,
+        data,
+        palm,
+        groups,
+        owner,
+        tuple(last.values()),
+        dict(zip(groups, numbered, strict=True)),
+    )
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:
@@ -163,12 +177,15 @@ def _is_free(model: mujoco.MjModel, body: int) -> bool:
 
 
 def _forks(model: mujoco.MjModel, link: int) -> list[int]:
-    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below.
+    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount
+    below.
 
-    If that is the world itself, and the bodies with several of them are named as palms, these, of several hands, and
-    the world.
+    If that is the world itself, and the bodies with several of them are named as palms, these, of
+    several hands, and the world.
     """
-    moved = np.array([body for body in np.flatnonzero(model.body_jntnum).tolist() if not _is_free(model, body)])
+    moved = np.array(
+        [body for body in np.flatnonzero(model.body_jntnum).tolist() if not _is_free(model, body)]
+    )
     carriers = [int(body) for body in model.body_parentid[moved] if model.body_weldid[body] == link]
     if len(set(carriers)) == 1:
         return carriers[:1]
@@ -180,18 +197,26 @@ def _forks(model: mujoco.MjModel, link: int) -> list[int]:
         paths.append(path)
     fork = next(body for body in paths[0] if all(body in path for path in paths))
     palms = [body for body, count in Counter(carriers).items() if count > 1 and body]
-    return [*palms, 0] if not fork and len(palms) > 1 and all(_called(model, body) for body in palms) else [fork]
+    return (
+        [*palms, 0]
+        if not fork and len(palms) > 1 and all(_called(model, body) for body in palms)
+        else [fork]
+    )
 
 
 def placed(tree: Tree, link: int, *, colliding: bool) -> list[trimesh.Trimesh]:
-    """Meshes of a link's geometry, m: of each body what collides or does not, or all of it if there is none of that."""
+    """Meshes of a link's geometry, m: of each body what collides or does not, or all of it if there
+    is none of that.
+    """
     model, data, found = tree.model, tree.data, []
     for body in tree.groups[link]:
         mine = np.flatnonzero(model.geom_bodyid == body)
         chosen = ((model.geom_contype[mine] | model.geom_conaffinity[mine]) > 0) == colliding
         for g in (mine[chosen] if chosen.any() else mine).tolist():
             if (mesh := geom_mesh(model, g)) is not None:
-                mesh.vertices = mesh.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+                mesh.vertices = (
+                    mesh.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+                )
                 found.append(mesh)
     return found
 
@@ -249,13 +274,16 @@ def link_mesh(tree: Tree, link: int) -> tuple[np.ndarray, np.ndarray] | None:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
     if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
         outer = np.asarray(joined.convex_hull.vertices)
-        directions = np.random.default_rng(0).normal(size=(3, MAX_FACES // 2))  # a hull of N points has 2 N - 4 faces
+        # A hull of N points has 2 N - 4 faces
+        directions = np.random.default_rng(0).normal(size=(3, MAX_FACES // 2))
         whole = trimesh.Trimesh(outer[np.unique((outer @ directions).argmax(0))]).convex_hull
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 
 def inertia_boxes(tree: Tree, link: int) -> list[np.ndarray]:
-    """Corners of the boxes with the mass and inertia of a link's bodies, where the file has them and a link's size."""
+    """Corners of the boxes with the mass and inertia of a link's bodies, where the file has them
+    and a link's size.
+    """
     model, data, found = tree.model, tree.data, []
     for body in tree.groups[link]:
         mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
@@ -274,7 +302,9 @@ def bare(*centers: np.ndarray) -> list[np.ndarray]:
 
 
 def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
-    """Fits capsules along the longest side of the points' box (n, 3); several in parallel if it is flat."""
+    """Fits capsules along the longest side of the points' box (n, 3); several in parallel if it is
+    flat.
+    """
     if np.linalg.matrix_rank(points - points.mean(0), tol=_THIN) < 3:
         few = np.unique(points.round(5), axis=0)
         points = np.concatenate([few + d for d in _THIN * np.concatenate([np.eye(3), -np.eye(3)])])
@@ -300,7 +330,10 @@ def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
 def far_end(capsules: tuple[Capsule, ...], origin: np.ndarray) -> np.ndarray:
     """Mean (3,) of the capsules' ends that are farther from a point (3,): the tip of a finger."""
     ends = [
-        max((capsule.start, capsule.end), key=lambda end: float(np.linalg.norm(np.subtract(end, origin))))
+        max(
+            (capsule.start, capsule.end),
+            key=lambda end: float(np.linalg.norm(np.subtract(end, origin))),
+        )
         for capsule in capsules
     ]
     return np.mean(ends, axis=0)

@@ -1,7 +1,8 @@
 """A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
-MuJoCo reads the file in a confined process (`compile`). Links of the hand and their capsules: `links`. Motors,
-couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
+MuJoCo reads the file in a confined process (`compile`). Links of the hand and their capsules:
+`links`. Motors, couplings and tendons: `actuators`. Open and closed poses, from kinematics:
+`poses`.
 """
 
 import dataclasses
@@ -49,7 +50,10 @@ _HAND = "hand.json"
 
 _NO_HAND = ", which is no hand's."
 _TWICE = "Has a scale such as 0.001 been applied twice? Lengths are in metres."
-_DEGREES = 'Are its limits in degrees? A URDF has radians; an MJCF has degrees, unless <compiler angle="radian"/>.'
+_DEGREES = (
+    "Are its limits in degrees? A URDF has radians; an MJCF has degrees, unless <compiler "
+    'angle="radian"/>.'
+)
 _GRAMS = "Is its mass in grams? Masses are in kg."
 
 
@@ -89,7 +93,9 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
 
 def write_proposal(folder: pathlib.Path, path: str, **choices: Any) -> dict[str, Any]:
-    """Does the work of `import_hand` in the confined process: writes the meshes, returns the rest."""
+    """Does the work of `import_hand` in the confined process: writes the meshes, returns the
+    rest.
+    """
     proposal = propose(pathlib.Path(path), Choices(**choices))
     save_meshes(folder / _HAND, proposal.meshes)
     return {"hand": hand_text(proposal.hand), "palm": proposal.palm, "notes": list(proposal.notes)}
@@ -100,10 +106,12 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
     Args:
       path: URDF, whose meshes are searched as ROS does, or MJCF; its root element determines which.
-      choices: name, body of the palm, last body of the thumb and object scale, which are otherwise guessed; collision.
+      choices: name, body of the palm, last body of the thumb and object scale, which are otherwise
+      guessed; collision.
 
     Raises:
-      CongraspError: the file cannot be read, is not a hand of hinges with at least two fingers, or has sizes, ranges or
+      CongraspError: the file cannot be read, is not a hand of hinges with at least two fingers, or
+      has sizes, ranges or
         masses of another unit.
     """
     notes: list[str] = []
@@ -112,8 +120,13 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     palm = model.body(tree.palm).name
     if len(tree.ends) < 2:
         if not model.njnt:
-            raise CongraspError(f"{path} has no joints.", "If it is a part, import the file that includes it.")
-        count, shown = ("no finger", "one finger")[len(tree.ends)], identifier(palm, f"body_{tree.palm}")
+            raise CongraspError(
+                f"{path} has no joints.", "If it is a part, import the file that includes it."
+            )
+        count, shown = (
+            ("no finger", "one finger")[len(tree.ends)],
+            identifier(palm, f"body_{tree.palm}"),
+        )
         raise CongraspError(f"{path} has {count} on its palm '{shown}'.", _TWO)
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
@@ -121,7 +134,10 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     links, drive = _links(tree, _points(path, tree), notes)
     _check_units(path, links)
     if choices.own_collision:
-        links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
+        links = [
+            dataclasses.replace(x, solids=solids_of(tree, i))
+            for x, i in zip(links, tree.groups, strict=True)
+        ]
         kept = [link.name for link in links if not link.solids]
         notes += listed("only meshes as collision geometry, capsules are used", kept)
     name = identifier(choices.name or path.stem, "hand").lower()
@@ -146,7 +162,10 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     hand = propose_poses(hand, notes)
     wide = opening(hand)
     if wide < _SMALL:
-        notes.append(f"thumb and fingers are only {100 * wide:.1f} cm apart ('open_pose' in the hand file, or --thumb)")
+        notes.append(
+            f"thumb and fingers are only {100 * wide:.1f} cm apart ('open_pose' in the hand file, "
+            f"or --thumb)"
+        )
     scale = choices.object_scale or fitting_scale(wide)
     hand = dataclasses.replace(hand, object_scale=scale)
     _check(path, hand)
@@ -156,32 +175,51 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
-    """Raises a CongraspError for an invalid hand; faults that contain the word `but` are ignored."""
+    """Raises a CongraspError for an invalid hand; faults that contain the word `but` are
+    ignored.
+    """
     for fault in faults(hand):
         if not but or but not in fault:
             raise CongraspError(
-                f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md)."
+                f"{path}: {fault}.",
+                "Correct the file, or write a hand file by hand (docs/add-a-hand.md).",
             )
 
 
 def _points(path: pathlib.Path, tree: Tree) -> dict[int, list[np.ndarray]]:
-    """Points of each link's geometry, m; raises a CongraspError for a link of a size that no hand has."""
-    points = {x: [p for mesh in placed(tree, x, colliding=True) for p in mesh.vertices] for x in tree.groups}
+    """Points of each link's geometry, m; raises a CongraspError for a link of a size that no hand
+    has.
+    """
+    points = {
+        x: [p for mesh in placed(tree, x, colliding=True) for p in mesh.vertices]
+        for x in tree.groups
+    }
     for link, some in points.items():
         size = float(np.ptp(some, axis=0).max()) if some else _LINK[1]
         if not _LINK[0] <= size <= _LINK[1]:
             remedy = _smaller_unit(size) if size > _LINK[1] else _TWICE
-            raise CongraspError(f"{path}: the link '{tree.names[link]}' is {length(size)} long{_NO_HAND}", remedy)
+            raise CongraspError(
+                f"{path}: the link '{tree.names[link]}' is {length(size)} long{_NO_HAND}", remedy
+            )
     return points
 
 
 def _check_units(path: pathlib.Path, links: list[Link]) -> None:
-    """Raises a CongraspError for distances, angles and masses that no hand has; the remedy is the likely unit."""
+    """Raises a CongraspError for distances, angles and masses that no hand has; the remedy is the
+    likely unit.
+    """
     for link in links:
         away = max((float(np.linalg.norm(joint.anchor)) for joint in link.joints), default=0.0)
-        turn = max(((max(-joint.lower, joint.upper), joint.name) for joint in link.joints), default=(0.0, ""))
+        turn = max(
+            ((max(-joint.lower, joint.upper), joint.name) for joint in link.joints),
+            default=(0.0, ""),
+        )
         for wrong, what, remedy in (
-            (away > _FAR, f"the link '{link.name}' turns {length(away)} from the palm", _smaller_unit(away)),
+            (
+                away > _FAR,
+                f"the link '{link.name}' turns {length(away)} from the palm",
+                _smaller_unit(away),
+            ),
             (turn[0] > _RANGE, f"the joint '{turn[1]}' turns to {turn[0]:.4g} rad", _DEGREES),
             (link.mass > _HEAVY, f"the link '{link.name}' weighs {link.mass:.4g} kg", _GRAMS),
         ):
@@ -191,9 +229,16 @@ def _check_units(path: pathlib.Path, links: list[Link]) -> None:
 
 def _smaller_unit(size: float) -> str:
     """Remedy for a length of a hand, in what should be m, that is too large."""
-    units = [f"{unit} ({length(size * factor)})" for unit, factor in METRES.items() if size * factor < _LINK[1]]
+    units = [
+        f"{unit} ({length(size * factor)})"
+        for unit, factor in METRES.items()
+        if size * factor < _LINK[1]
+    ]
     question = f"Are its lengths in {' or '.join(units)}? " if units else ""
-    return f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres; or pass another --palm.'
+    return (
+        f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres; or '
+        f"pass another --palm."
+    )
 
 
 def describe(proposal: Proposal) -> list[str]:
@@ -203,13 +248,16 @@ def describe(proposal: Proposal) -> list[str]:
     tips = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
     mass = sum(link.mass for link in hand.links)
     lines = [
-        f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.motors)} motors, {len(hand.links)} links, "
+        f"hand         {hand.name}: {len(hand.joints)} joints, {len(hand.motors)} motors, "
+        f"{len(hand.links)} links, "
         f"{mass:.3f} kg",
         f"palm         {proposal.palm}",
         f"thumb        {' - '.join(tips[0])}",
         *(f"finger       {' - '.join(tip)}" for tip in tips[1:]),
-        f"heading v    {_text(frame.heading)} in the palm's frame, cross-finger axis w {_text(frame.cross)}",
-        f"hand centre  {_text(frame.center)} m, opening {100 * frame.opening:.1f} cm: objects x {hand.object_scale:g}",
+        f"heading v    {_text(frame.heading)} in the palm's frame, cross-finger axis w "
+        f"{_text(frame.cross)}",
+        f"hand centre  {_text(frame.center)} m, opening {100 * frame.opening:.1f} cm: objects x "
+        f"{hand.object_scale:g}",
         "",
         "joint                     from      to    open  closed      kp      kv   limit",
     ]
@@ -231,9 +279,16 @@ def _text(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
-def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) -> tuple[list[Link], Drive]:
-    """Returns the links and their drive from points of their geometry (m); proposals are appended to `notes`."""
-    at = {x: tree.data.xanchor[tree.joints(x)[0]] if tree.joints(x) else np.zeros(3) for x in tree.groups}
+def _links(
+    tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]
+) -> tuple[list[Link], Drive]:
+    """Returns the links and their drive from points of their geometry (m); proposals are appended
+    to `notes`.
+    """
+    at = {
+        x: tree.data.xanchor[tree.joints(x)[0]] if tree.joints(x) else np.zeros(3)
+        for x in tree.groups
+    }
     shapes = {}
     boxed: list[str] = []
     empty: list[str] = []
@@ -262,8 +317,12 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
                 tip=vector(tips[link].round(6)) if link in tips else None,
             )
         )
-    notes += listed("no geometry, capsules follow from inertias ('capsules' in the hand file)", boxed)
-    notes += listed("no geometry and no inertia, thin capsules ('capsules' in the hand file)", empty)
+    notes += listed(
+        "no geometry, capsules follow from inertias ('capsules' in the hand file)", boxed
+    )
+    notes += listed(
+        "no geometry and no inertia, thin capsules ('capsules' in the hand file)", empty
+    )
     return links, drive
 
 
@@ -272,15 +331,23 @@ def _meshes(tree: Tree, notes: list[str]) -> Meshes:
     found = {tree.names[link]: link_mesh(tree, link) for link in tree.groups}
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
     large = [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]
-    notes += listed(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped", large)
+    notes += listed(
+        f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped", large
+    )
     return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 
 def _joint_names(tree: Tree, notes: list[str]) -> dict[int, str]:
     """Names of the hand's joints in its order, distinct from those of links."""
-    names = {j: identifier(tree.model.joint(j).name, f"joint_{j}") for link in tree.groups for j in tree.joints(link)}
+    names = {
+        j: identifier(tree.model.joint(j).name, f"joint_{j}")
+        for link in tree.groups
+        for j in tree.joints(link)
+    }
     taken = {*tree.names.values()} | TAKEN_JOINTS
-    named = distinct_names((f"{name}_joint" if name in taken else name for name in names.values()), str)
+    named = distinct_names(
+        (f"{name}_joint" if name in taken else name for name in names.values()), str
+    )
     notes += renamed("joints", names.values(), named)
     return dict(zip(names, named, strict=True))
 
@@ -299,7 +366,9 @@ def _levers(tree: Tree, tips: dict[int, np.ndarray]) -> dict[int, float]:
 def _joint(tree: Tree, j: int, name: str, drive: Drive) -> Joint:
     """Returns a hinge."""
     if tree.model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-        raise CongraspError(f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported.")
+        raise CongraspError(
+            f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported."
+        )
     limits = drive.limits(j)
     if limits is None:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")

@@ -1,8 +1,9 @@
 """Computes a thumb, an open and a closed pose from kinematics, for a hand whose file has none.
 
-First a pinch is computed: the pose nearest to zero in which the thumb's tip meets the others'. It determines the
-closing direction of joints. The open hand is then turned and spread so that thumb and fingers face each other over an
-opening of slightly more than a finger's length. It closes by every joint that brings them together.
+First a pinch is computed: the pose nearest to zero in which the thumb's tip meets the others'. It
+determines the closing direction of joints. The open hand is then turned and spread so that thumb
+and fingers face each other over an opening of slightly more than a finger's length. It closes by
+every joint that brings them together.
 """
 
 import dataclasses
@@ -18,13 +19,17 @@ from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand, chain_of, link_origin
 
-_CLOSED = 0.8  # share of the range from zero to a joint's end at which it is closed, where thumb and fingers can meet
+# Share of the range from zero to a joint's end at which it is closed, where thumb and fingers can
+# meet
+_CLOSED = 0.8
 _FLEXED = 0.15  # the same for the fingers of an open hand, unless other terms matter
 _SQUEEZE = 0.3  # rad by which motors continue after their fingers have met the palm or others
-_OPENING = (
-    1.25  # distance between the tips of an open hand in finger lengths; or as a share of that at zero, if smaller
+# Distance between the tips of an open hand in finger lengths; or as a share of that at zero, if
+# smaller
+_OPENING = 1.25
+_AHEAD = (
+    0.3  # least distance of the tips of an open hand ahead of the fingers' bases, in finger lengths
 )
-_AHEAD = 0.3  # least distance of the tips of an open hand ahead of the fingers' bases, in finger lengths
 _TOWARDS = 0.6  # least share of a tip's motion towards the hand's centre, for a closing joint
 _TURNED = 0.1  # least share of a joint's range in the pinch that determines its closing direction
 _ALIKE = 0.3  # asymmetry of a joint's range that determines it otherwise
@@ -37,7 +42,8 @@ _THUMB = re.compile(r"thumb|(^|_)th(j?\d|base|prox|hub|mid|dist)", re.IGNORECASE
 
 
 def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
-    """Returns the last link of the finger named as a thumb, or else of the one that best faces all others.
+    """Returns the last link of the finger named as a thumb, or else of the one that best faces all
+    others.
 
     Raises:
       CongraspError: `wanted` is not the last link of a finger.
@@ -45,17 +51,24 @@ def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
     tips = [link.name for link in hand.links if link.tip is not None]
     if wanted:
         if wanted not in tips:
-            raise CongraspError(f"'{wanted}' is not the last link of a finger.", f"Pass one of: {', '.join(tips)}.")
+            raise CongraspError(
+                f"'{wanted}' is not the last link of a finger.", f"Pass one of: {', '.join(tips)}."
+            )
         return wanted
     for tip in tips:
         chain = [link for link in hand.links if link.name in chain_of(hand, tip)]
-        if any(_THUMB.search(name) for link in chain for name in (link.name, *(j.name for j in link.joints))):
+        if any(
+            _THUMB.search(name)
+            for link in chain
+            for name in (link.name, *(j.name for j in link.joints))
+        ):
             return tip
     costs = [_faced(_Body(dataclasses.replace(hand, thumb=tip)), 0)[1] for tip in tips]
     best, second = np.argsort(costs)[:2]
     if len(tips) > 2:
         notes.append(
-            f"'{tips[best]}' is assumed to be the thumb, before '{tips[second]}', because none is named (--thumb)"
+            f"'{tips[best]}' is assumed to be the thumb, before '{tips[second]}', because none is "
+            f"named (--thumb)"
         )
     return tips[int(best)]
 
@@ -66,7 +79,8 @@ def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     opened, _, apart = _faced(body, _MORE)
     if apart > _APART:
         notes.append(
-            f"thumb and fingers do not meet, {100 * apart:.0f} cm remain between their tips (--thumb, or 'open_pose'"
+            f"thumb and fingers do not meet, {100 * apart:.0f} cm remain between their tips "
+            f"(--thumb, or 'open_pose'"
             " and 'closed_pose' in the hand file)"
         )
     lower, upper = body.limits
@@ -78,7 +92,9 @@ def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     target = flat + far * (ends - flat)
     target = np.where(np.sign(share) * (target - opened) > 0, target, ends)
     closed = _closed(body, opened, np.where(closing, target, opened))
-    names = [joint.name for joint in hand.joints if joint.name not in {x.joint for x in hand.couplings}]
+    names = [
+        joint.name for joint in hand.joints if joint.name not in {x.joint for x in hand.couplings}
+    ]
 
     def pose(motors: np.ndarray) -> dict[str, float]:
         """Angles of the joints that follow none by name, without zeros."""
@@ -104,13 +120,28 @@ class _Body:
         add_hand(spec, hand, self_collision=True)
         self.hand, self.limits = hand, motor_limits(hand).astype(float)
         self._model = spec.compile()
-        self._ratios = [joint_positions(hand, row) - joint_positions(hand, 0 * row) for row in np.eye(len(hand.motors))]
+        self._ratios = [
+            joint_positions(hand, row) - joint_positions(hand, 0 * row)
+            for row in np.eye(len(hand.motors))
+        ]
         self._data = mujoco.MjData(self._model)
         self._links = [self._model.body(hand.links[i].name).id for i in hand.tip_links]
-        self._local = np.array([np.subtract(hand.links[i].tip, link_origin(hand.links[i])) for i in hand.tip_links])  # type: ignore[arg-type]
+        self._local = np.array(
+            [
+                np.subtract(hand.links[i].tip, link_origin(hand.links[i]))  # type: ignore[arg-type]
+                for i in hand.tip_links
+            ]
+        )
         roots = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
-        self._finger = {self._model.body(link.name).id: root for link, root in zip(hand.links, roots, strict=True)}
-        carrier = {joint.name: root for link, root in zip(hand.links, roots, strict=True) for joint in link.joints}
+        self._finger = {
+            self._model.body(link.name).id: root
+            for link, root in zip(hand.links, roots, strict=True)
+        }
+        carrier = {
+            joint.name: root
+            for link, root in zip(hand.links, roots, strict=True)
+            for joint in link.joints
+        }
         self.fingers = [{carrier[name] for name in self._moved(m)} for m in range(len(hand.motors))]
         """Root links of the fingers moved by each motor."""
         self.thumb = np.array([hand.finger_roots[0] in fingers for fingers in self.fingers])
@@ -124,7 +155,9 @@ class _Body:
         self.across = np.eye(3) - np.outer(sideways, sideways)
         """Projection that removes the direction in which the fingers are side by side."""
         last = [list(link.joints)[-1].name for link in (hand.links[i] for i in hand.tip_links)]
-        self._last = [next(m for m in range(len(hand.motors)) if name in self._moved(m)) for name in last]
+        self._last = [
+            next(m for m in range(len(hand.motors)) if name in self._moved(m)) for name in last
+        ]
         straight = (tips - self.roots)[1:]
         self.size = float(np.linalg.norm(straight, axis=-1).mean())
         """Length of the fingers, m."""
@@ -148,13 +181,17 @@ class _Body:
         return self._data.xpos[self._links] + np.einsum("tij,tj->ti", turns, self._local)
 
     def gap(self, motors: np.ndarray) -> np.ndarray:
-        """Vectors (fingers, 3) from the thumb's tip to the others', without their lateral offsets."""
+        """Vectors (fingers, 3) from the thumb's tip to the others', without their lateral
+        offsets.
+        """
         tips = self.tips(motors)
         middle = tips[1:].mean(0) - tips[0]
         return (tips[1:] - tips[0]) @ self.across + middle @ (np.eye(3) - self.across)
 
     def pads(self, motors: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """Unit directions (tips, 3) of the tips as their last joints close, with signs `way` (M,)."""
+        """Unit directions (tips, 3) of the tips as their last joints close, with signs `way`
+        (M,).
+        """
         tips = self.tips(motors)
         mujoco.mj_comPos(self._model, self._data)
         found, jacobian = np.zeros((len(tips), 3)), np.zeros((3, self._model.nv))
@@ -165,13 +202,17 @@ class _Body:
         return found
 
     def closing(self, motors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Share (M,) of each motor's motion of its tip towards the hand's centre, and the tip's speed, m/rad.
+        """Share (M,) of each motor's motion of its tip towards the hand's centre, and the tip's
+        speed, m/rad.
 
-        With many fingers in a row the outer ones need not reach its centre: the weight decreases with their number.
+        With many fingers in a row the outer ones need not reach its centre: the weight decreases
+        with their number.
         """
         tips = self.tips(motors)
         towards = 0.5 * (tips[0] + tips[1:].mean(0)) - tips
-        towards = towards @ self.across + towards @ (np.eye(3) - self.across) / max(len(tips) - 2, 1)
+        towards = towards @ self.across + towards @ (np.eye(3) - self.across) / max(
+            len(tips) - 2, 1
+        )
         towards /= np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-9)
         share, speed = np.zeros(len(motors)), np.zeros(len(motors))
         for m in range(len(motors)):
@@ -201,21 +242,30 @@ def _faced(body: _Body, more: int) -> tuple[np.ndarray, float, float]:
     flat = np.clip(0.0, lower, upper)
     pinch = _pinch(body, flat, more)
     longer = lower + upper - 2 * flat
-    goes = (np.abs(pinch - flat) > _TURNED * (upper - lower)) | (np.abs(longer) < _ALIKE * (upper - lower))
+    goes = (np.abs(pinch - flat) > _TURNED * (upper - lower)) | (
+        np.abs(longer) < _ALIKE * (upper - lower)
+    )
     way = np.where(goes, pinch - flat, longer)
     share, _ = body.closing(0.5 * (flat + pinch))
     flexing = ~body.thumb & (share * np.sign(way) > _TOWARDS)
     rest = np.where(flexing, flat + _FLEXED * (np.where(way > 0, upper, lower) - flat), flat)
-    weight = np.where(body.thumb, 4.0, np.where(flexing, 8.0, 24.0))  # fingers spread only if it helps
+    # Fingers spread only if it helps
+    weight = np.where(body.thumb, 4.0, np.where(flexing, 8.0, 24.0))
     straight = body.tips(flat)
-    target = _OPENING * min(1.0, float(np.linalg.norm(straight[1:].mean(0) - straight[0])) / body.size)
+    target = _OPENING * min(
+        1.0, float(np.linalg.norm(straight[1:].mean(0) - straight[0])) / body.size
+    )
 
     def residuals(motors: np.ndarray) -> np.ndarray:
-        """Residuals of pads of thumb and fingers, which should face each other across the opening."""
+        """Residuals of pads of thumb and fingers, which should face each other across the
+        opening.
+        """
         tips, pads = body.tips(motors), body.pads(motors, np.sign(way))
         between = tips[1:].mean(0) - tips[0]
         wide = float(np.linalg.norm(between))
-        facing = 0.5 * np.concatenate([pads[0] - between / wide, *(pads[1:] + between / wide) / np.sqrt(len(pads) - 1)])
+        facing = 0.5 * np.concatenate(
+            [pads[0] - between / wide, *(pads[1:] + between / wide) / np.sqrt(len(pads) - 1)]
+        )
         aside = (between - body.across @ between) / body.size
         back = np.maximum(_AHEAD - (tips - body.roots) @ body.ahead / body.size, 0.0)
         spent = weight * _effort(motors - rest)
@@ -246,11 +296,18 @@ def _effort(way: np.ndarray) -> np.ndarray:
 def _least(
     body: _Body, residuals: Callable[[np.ndarray], np.ndarray], starts: list[np.ndarray], more: int
 ) -> tuple[np.ndarray, float]:
-    """Motors (M,) with the least squares of residuals, from these starts and `more` others; half the squares."""
+    """Motors (M,) with the least squares of residuals, from these starts and `more` others; half
+    the squares.
+    """
     lower, upper = body.limits
     rng = np.random.default_rng(0)
     found = [
-        least_squares(residuals, np.clip(start, lower + 1e-6, upper - 1e-6), bounds=(lower, upper), max_nfev=40)
+        least_squares(
+            residuals,
+            np.clip(start, lower + 1e-6, upper - 1e-6),
+            bounds=(lower, upper),
+            max_nfev=40,
+        )
         for start in (*starts, *(rng.uniform(lower, upper) for _ in range(more)))
     ]
     best = min(found, key=lambda result: float(result.cost))
@@ -258,7 +315,9 @@ def _least(
 
 
 def _closed(body: _Body, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Motors (M,) reached from `start` towards `end`: barely beyond contact of fingers with palm or others."""
+    """Motors (M,) reached from `start` towards `end`: barely beyond contact of fingers with palm or
+    others.
+    """
     share = np.zeros(len(start))
     going = np.ones(len(start), bool)
     before = body.touching(start)
@@ -268,4 +327,6 @@ def _closed(body: _Body, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         going &= ~np.array([bool(met & fingers) for fingers in body.fingers])
         share = np.where(going, ahead, share)
     way = end - start
-    return start + np.clip(share * way + np.where(going, 0.0, _SQUEEZE * np.sign(way)), -np.abs(way), np.abs(way))
+    return start + np.clip(
+        share * way + np.where(going, 0.0, _SQUEEZE * np.sign(way)), -np.abs(way), np.abs(way)
+    )

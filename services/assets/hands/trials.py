@@ -1,12 +1,14 @@
-"""Trials of a hand without a policy: motors follow a step, the empty hand closes, objects are gripped, lifted, pushed.
+"""Trials of a hand without a policy: motors follow a step, the empty hand closes, objects are
+gripped, lifted, pushed.
 
-In free air, motors follow steps of their targets, and the empty hand closes. In a grip, a hand closes around a ball, a
-cylinder or a box and lifts it, and the object is then pushed.
+In free air, motors follow steps of their targets, and the empty hand closes. In a grip, a hand
+closes around a ball, a cylinder or a box and lifts it, and the object is then pushed.
 
-The hand is above: its heading axis points down, and the object is in the grasp frame, with the length of cylinder and
-box across the closing plane of the fingers. Each object is tried in parallel at several positions along the heading
-axis and with several forces. It is fixed until the fingers have closed and then released, without a table. The lift and
-the pushes are those of `actors.stress`.
+The hand is above: its heading axis points down, and the object is in the grasp frame, with the
+length of cylinder and box across the closing plane of the fingers. Each object is tried in parallel
+at several positions along the heading axis and with several forces. It is fixed until the fingers
+have closed and then released, without a table. The lift and the pushes are those of
+`actors.stress`.
 """
 
 import dataclasses
@@ -35,7 +37,9 @@ from congrasp.common.task.types import Array
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)
-"""Widths of the objects as shares of the hand's opening; cylinder and box are twice as long as wide."""
+"""Widths of the objects as shares of the hand's opening; cylinder and box are twice as long as
+wide.
+"""
 DENSITY = 650.0
 """Density of the objects, the median of procedural ones, kg/m^3."""
 _PLACES = (0.0, 0.5, 1.0)
@@ -88,11 +92,14 @@ def grip_objects(width: float) -> list[GraspObject]:
         draft.cylinder((0, -width, 0), (0, width, 0), half),
         draft.box((half, width, half)),
     )
-    return [plain_object(name, (piece,), DENSITY) for name, piece in zip(OBJECTS, pieces, strict=True)]
+    return [
+        plain_object(name, (piece,), DENSITY) for name, piece in zip(OBJECTS, pieces, strict=True)
+    ]
 
 
 def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
-    """Returns the best attempt at each of `OBJECTS`, of the larger size, and of the smaller one unless all survive.
+    """Returns the best attempt at each of `OBJECTS`, of the larger size, and of the smaller one
+    unless all survive.
 
     Args:
       hand: the hand.
@@ -125,9 +132,12 @@ def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[
 
 
 def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
-    """Open hands above objects fixed at the origin of the world frame, `depth` (B,) m from the hand centre."""
+    """Open hands above objects fixed at the origin of the world frame, `depth` (B,) m from the hand
+    centre.
+    """
     frame, count = grasp_frame(hand), len(index)
-    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])  # to x, y and z
+    # To x, y and z
+    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])
     ones, turn = np.ones(count), np.asarray(rotations.from_matrix(jnp.asarray(own)))
     return ResetState(
         object_index=index,
@@ -144,7 +154,9 @@ def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
     )
 
 
-def _close(physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray) -> np.ndarray:
+def _close(
+    physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray
+) -> np.ndarray:
     """Targets (B, M) of fingers closed around the fixed object, which is then released."""
     physics.start(start)
     reach = firmness[:, None] * np.array([motor.torque_limit / motor.kp for motor in hand.motors])
@@ -168,14 +180,21 @@ def _shake(
     target: np.ndarray,
     objects: Sequence[GraspObject],
 ) -> PhysicsState:
-    """Simulates half a second without support, the lift, and the pushes; the states have a leading axis T."""
+    """Simulates half a second without support, the lift, and the pushes; the states have a leading
+    axis T.
+    """
     task = dataclasses.replace(task, approach_steps=0)
-    protocol, time = protocols.stress(task, objects, _HOLD), np.arange(_HOLD + protocols.stress_steps(task))
+    protocol, time = (
+        protocols.stress(task, objects, _HOLD),
+        np.arange(_HOLD + protocols.stress_steps(task)),
+    )
     base = np.tile(np.asarray(start.base_quaternion, np.float32)[:1], (len(time), 1))
     wrist, pushes = map(np.asarray, _disturbances(hand, task, len(objects), protocol, time, base))
     states, away = [], np.zeros(len(target), bool)
     for u, force in zip(wrist, pushes[:, start.object_index], strict=True):
-        _, state = physics.step(physics, np.concatenate([np.tile(u, (len(target), 1)), target], -1), away, force)
+        _, state = physics.step(
+            physics, np.concatenate([np.tile(u, (len(target), 1)), target], -1), away, force
+        )
         states.append(jax.tree.map(np.asarray, state))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
@@ -184,7 +203,8 @@ def _shake(
 def _disturbances(
     hand: Hand, task: TaskConfig, count: int, protocol: protocols.Protocol, time: Array, base: Array
 ) -> tuple[Array, Array]:
-    """Targets (T, 6) of a carried wrist and pushes (T, N, 3) of N objects, in N, at control steps `time` (T,).
+    """Targets (T, 6) of a carried wrist and pushes (T, N, 3) of N objects, in N, at control steps
+    `time` (T,).
 
     Args:
       hand: the hand.
@@ -197,20 +217,29 @@ def _disturbances(
     frame = protocols.frame(protocol, task, time + 0.5)
     wrist = protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame)
     which = [jnp.full(len(time), n) for n in range(count)]
-    return wrist, jnp.stack([protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1)
+    return wrist, jnp.stack(
+        [protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1
+    )
 
 
 @jax.jit
 def _in_wrist_frame(start: ResetState, states: PhysicsState) -> tuple[Array, Array]:
     """Positions (T, B, 3) and orientations (T, B, 4) of the objects in the wrist frame."""
     wrist = rotations.compose_pose(
-        start.base_position, start.base_quaternion, states.u[..., :3], rotations.euler_to_quaternion(states.u[..., 3:])
+        start.base_position,
+        start.base_quaternion,
+        states.u[..., :3],
+        rotations.euler_to_quaternion(states.u[..., 3:]),
     )
     return rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
 
 
 def _judged(
-    task: TaskConfig, start: ResetState, states: PhysicsState, objects: Sequence[GraspObject], width: float
+    task: TaskConfig,
+    start: ResetState,
+    states: PhysicsState,
+    objects: Sequence[GraspObject],
+    width: float,
 ) -> list[Grip]:
     """Results of the attempts."""
     position, quaternion = map(np.asarray, _in_wrist_frame(start, states))
@@ -240,7 +269,9 @@ class Response(NamedTuple):
     overshoot: float
     """Overshoot as a share of the step."""
     unrest: float
-    """Standard deviation of the motor's speed in the last tenth of a second, rad/s; zero for a slow one."""
+    """Standard deviation of the motor's speed in the last tenth of a second, rad/s; zero for a slow
+    one.
+    """
     error: float
     """Final distance from the target, as a share of the step."""
     diverged: bool
@@ -250,8 +281,8 @@ class Response(NamedTuple):
 def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
     """Responses (M) of the motors to steps, in turn.
 
-    A step is `STEP` or half of the range, from the open pose towards the side with more room. The other motors stay,
-    and links do not collide.
+    A step is `STEP` or half of the range, from the open pose towards the side with more room. The
+    other motors stay, and links do not collide.
     """
     task = dataclasses.replace(task, hand_self_collision=False, hand_table_collision=False)
     (lower, upper), opened = motor_limits(hand), motor_positions(hand, hand.q_open)
@@ -259,7 +290,9 @@ def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
     way = np.where(upper - opened >= opened - lower, size, -size)
     states = _states(hand, task, np.tile(opened + np.diag(way), (_STEPS, 1, 1)), threads)
     each = np.arange(len(hand.motors))
-    gone = (motor_positions(hand, states.q)[:, each, each] - opened) / way  # (T, M) as shares of the step
+    gone = (
+        motor_positions(hand, states.q)[:, each, each] - opened
+    ) / way  # (T, M) as shares of the step
     speed = motor_positions(hand, states.q_velocity)[-_SETTLED:, each, each]
     return [
         Response(
@@ -273,7 +306,9 @@ def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
 
 
 def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
-    """Greatest overlap in m of links after the empty hand has closed, as far as its contacts allow."""
+    """Greatest overlap in m of links after the empty hand has closed, as far as its contacts
+    allow.
+    """
     share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
     opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
     states = _states(hand, task, opened + share * (closed - opened), threads)
@@ -289,7 +324,9 @@ def _overlap(hand: Hand, q: Array) -> Array:
 def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:
     """States, with leading axis T, for motor targets (T, B, M) from the open pose on."""
     count = targets.shape[1]
-    start = _start(hand, np.zeros(count, int), np.zeros(count))._replace(object_position=np.tile(_FAR, (count, 1)))
+    start = _start(hand, np.zeros(count, int), np.zeros(count))._replace(
+        object_position=np.tile(_FAR, (count, 1))
+    )
     physics, found = NativePhysics(hand, task, grip_objects(0.04)[:1], threads), []
     try:
         physics.start(start)

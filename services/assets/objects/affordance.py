@@ -1,7 +1,8 @@
 """New partitions of an object into graspable region and avoid region.
 
-They come from a mesh of one part, painted vertices, a half-space, touched points, or cuts into halves that a hand can
-hold. They relabel the object's surface points and pieces; nothing else about the object changes.
+They come from a mesh of one part, painted vertices, a half-space, touched points, or cuts into
+halves that a hand can hold. They relabel the object's surface points and pieces; nothing else about
+the object changes.
 """
 
 import dataclasses
@@ -19,12 +20,21 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.shapes import halves
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
-from congrasp.services.assets.objects.mesh_files import check_triangles, load_geometry, up_of, upright
+from congrasp.services.assets.objects.mesh_files import (
+    check_triangles,
+    load_geometry,
+    up_of,
+    upright,
+)
 
 LEAST_SHARE = 0.10
-"""Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
+"""Least share of the surface that the graspable region must have (paper, section Constraint
+Setup).
+"""
 _ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
-_SAME_BOX = 0.1  # tolerance of the bounding box of a painted file, as a share of the object's length
+_SAME_BOX = (
+    0.1  # tolerance of the bounding box of a painted file, as a share of the object's length
+)
 _COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
 
 
@@ -34,7 +44,11 @@ UNCOVERED = "none of its halves can be held without the other: it has no afforda
 
 
 def relabelled(
-    obj: GraspObject, labels: np.ndarray, names: Sequence[str], graspable: Sequence[bool], name: str = ""
+    obj: GraspObject,
+    labels: np.ndarray,
+    names: Sequence[str],
+    graspable: Sequence[bool],
+    name: str = "",
 ) -> GraspObject:
     """The object with other parts.
 
@@ -53,7 +67,8 @@ def relabelled(
     if share < LEAST_SHARE:
         raise CongraspError(
             f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
-            f"It must be {LEAST_SHARE:.0%} at least: choose a larger part, or swap the parts with --invert.",
+            f"It must be {LEAST_SHARE:.0%} at least: choose a larger part, or swap the parts with "
+            f"--invert.",
         )
     return dataclasses.replace(
         obj,
@@ -65,11 +80,17 @@ def relabelled(
     )
 
 
-def with_labels(pieces: Sequence[Piece], points: np.ndarray, labels: np.ndarray) -> tuple[Piece, ...]:
-    """The pieces with the part that most of their vertices are nearest to, by labels (N,) of points (N, 3)."""
+def with_labels(
+    pieces: Sequence[Piece], points: np.ndarray, labels: np.ndarray
+) -> tuple[Piece, ...]:
+    """The pieces with the part that most of their vertices are nearest to, by labels (N,) of points
+    (N, 3).
+    """
     near = cKDTree(points)
     corners = (np.zeros((1, 3)) if piece.vertices is None else piece.vertices for piece in pieces)
-    votes = (labels[near.query(own + piece.pos)[1]] for piece, own in zip(pieces, corners, strict=True))
+    votes = (
+        labels[near.query(own + piece.pos)[1]] for piece, own in zip(pieces, corners, strict=True)
+    )
     return tuple(
         dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
         for piece, vote in zip(pieces, votes, strict=True)
@@ -77,23 +98,30 @@ def with_labels(pieces: Sequence[Piece], points: np.ndarray, labels: np.ndarray)
 
 
 def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspObject:
-    """The object with the surface points `graspable` (512,) bool as graspable region, the others as avoid region."""
+    """The object with the surface points `graspable` (512,) bool as graspable region, the others as
+    avoid region.
+    """
     return relabelled(obj, np.where(graspable, 0, 1), ("grasp", "avoid"), (True, False), name)
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
-    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame; `normal` has any length.
+    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame; `normal`
+    has any length.
 
     Raises:
       CongraspError: the normal is zero or not finite, or the offset is larger than the object.
     """
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
-        raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three finite numbers, not all zero.")
+        raise CongraspError(
+            f"The direction {tuple(normal)} has no length.",
+            "Give three finite numbers, not all zero.",
+        )
     farthest = float(np.linalg.norm(obj.points, axis=-1).max())
     if not abs(offset) <= farthest:
         raise CongraspError(
-            f"The plane at {offset:g} m misses '{obj.name}', which reaches {farthest:.3f} m from its centre of mass.",
+            f"The plane at {offset:g} m misses '{obj.name}', which reaches {farthest:.3f} m from "
+            f"its centre of mass.",
             "Give the distance from there in metres.",
         )
     return obj.points @ (np.asarray(normal, float) / length) >= offset
@@ -104,7 +132,8 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
 
     Args:
       obj: an imported object.
-      path: the part, a closed mesh, a patch of the surface or points of it, in the frame and unit of the file that the
+      path: the part, a closed mesh, a patch of the surface or points of it, in the frame and unit
+      of the file that the
         object was imported from.
 
     Raises:
@@ -121,7 +150,9 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     points = upright(points[np.isfinite(points).all(-1)], up)
     if not len(points):
         raise CongraspError(f"{path} holds no points.", "Export the part as PLY.")
-    return np.asarray(cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
+    return np.asarray(
+        cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0]
+    )
 
 
 def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
@@ -144,17 +175,22 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
 
     Args:
       obj: an imported object.
-      path: its mesh with coloured vertices, in the frame and unit of the file that it was imported from.
-      colour: red, green and blue, 0 to 255.
+      path: its mesh with coloured vertices, in the frame and unit of the file that it was imported
+      from. colour: red, green and blue, 0 to 255.
 
     Raises:
-      CongraspError: the file has no coloured vertices, none of this colour, or shows another object.
+      CongraspError: the file has no coloured vertices, none of this colour, or shows another
+      object.
     """
     mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
-    colours = getattr(visual, "vertex_colors", ()) if getattr(visual, "kind", None) == "vertex" else ()
+    colours = (
+        getattr(visual, "vertex_colors", ()) if getattr(visual, "kind", None) == "vertex" else ()
+    )
     if not len(colours):
-        raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
+        raise CongraspError(
+            f"{path} has no coloured vertices.", "Paint them and export as PLY with colours."
+        )
     vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)
     vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
@@ -163,12 +199,16 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     if not same.any():
         seen = ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in _commonest(rgb))
         given = "#{:02x}{:02x}{:02x}".format(*colour)
-        raise CongraspError(f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}.")
+        raise CongraspError(
+            f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}."
+        )
     return same[cKDTree(vertices).query(obj.points)[1]]
 
 
 def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> None:
-    """Raises a CongraspError if the bounding box of vertices (n, 3), m, object frame, is not that of the object."""
+    """Raises a CongraspError if the bounding box of vertices (n, 3), m, object frame, is not that
+    of the object.
+    """
     if not len(vertices):
         raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
     own, other = (np.stack([x.min(0), x.max(0)]) for x in (obj.visual_vertices, vertices))
@@ -181,17 +221,21 @@ def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> No
 
 
 def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarray:
-    """(512,) bool: surface points within `radius` (m) of any of the points (n, 3) of the object frame."""
+    """(512,) bool: surface points within `radius` (m) of any of the points (n, 3) of the object
+    frame.
+    """
     if len(points) == 0:
         return np.zeros(len(obj.points), bool)
     return cKDTree(points).query(obj.points)[0] <= radius
 
 
 def cut_to_hold(obj: GraspObject) -> GraspObject:
-    """An object of two halves with the first partition that is covered in all resting poses, or in the most.
+    """An object of two halves with the first partition that is covered in all resting poses, or in
+    the most.
 
-    Its current halves come first, then their exchange, then cuts across the longest axis that make the graspable half
-    larger or smaller. If no half can be held in any resting pose, a note is added.
+    Its current halves come first, then their exchange, then cuts across the longest axis that make
+    the graspable half larger or smaller. If no half can be held in any resting pose, a note is
+    added.
     """
     most = int(covered(obj, use_affordance=False).sum())
     best, score = obj, -1
@@ -205,10 +249,15 @@ def cut_to_hold(obj: GraspObject) -> GraspObject:
 
 
 def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
-    """(R,) bool, resting poses in which the human hand has a heading on the graspable region, or the whole surface."""
+    """(R,) bool, resting poses in which the human hand has a heading on the graspable region, or
+    the whole surface.
+    """
     hand = outline(HUMAN)
     found = sample_headings(
-        obj, np.random.default_rng(0), use_affordance=use_affordance, max_width=max_width(hand, HUMAN.object_scale)
+        obj,
+        np.random.default_rng(0),
+        use_affordance=use_affordance,
+        max_width=max_width(hand, HUMAN.object_scale),
     )
     if found is None:
         return np.zeros(len(obj.rest_poses), bool)

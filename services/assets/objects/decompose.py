@@ -1,11 +1,13 @@
-"""Convex pieces of an object: those of its folder, or a decomposition of its meshes if those are coarse.
+"""Convex pieces of an object: those of its folder, or a decomposition of its meshes if those are
+coarse.
 
-A convex mesh is its hull. Others are cut by CoACD under limits, by V-HACD if that fails, or else are their hull.
-The decomposers are native code, which runs in a confined process.
+A convex mesh is its hull. Others are cut by CoACD under limits, by V-HACD if that fails, or else
+are their hull. The decomposers are native code, which runs in a confined process.
 
-The pieces become fewer and simpler: joined where that preserves the shape, as thin as their walls, with few vertices.
-The hull of a bent wall fills the inner side of the bend: at a bowl of 2 mm, half of the wall's volume. Such a piece is
-thinned about its middle to the volume of the mesh in it, which leaves half of the bend on either side.
+The pieces become fewer and simpler: joined where that preserves the shape, as thin as their walls,
+with few vertices. The hull of a bent wall fills the inner side of the bend: at a bowl of 2 mm, half
+of the wall's volume. Such a piece is thinned about its middle to the volume of the mesh in it,
+which leaves half of the bend on either side.
 """
 
 import contextlib
@@ -49,14 +51,25 @@ _MEMORY = 6 << 30  # bytes of address space of a child, where there is enough fo
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
 _MESH, _PIECES = "mesh.npz", "pieces.npz"
 DEPTH = 1.5e-3
-"""Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
+"""Largest depth of the surface in a hull, or distance of the hull from it, for joins below the
+limit of pieces, m.
+"""
 GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
 _SAMPLES, _PROBES = 6000, 200  # points on the whole surface, and on the hull of two pieces
 _DIRECTIONS = 300  # of the extreme vertices that larger hulls are reduced to
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
-_INNER, _ENOUGH, _FEW = 60_000, 500, 30  # points inside of the mesh; enough, and too few of them for one piece
-_FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
+# Points inside of the mesh; enough, and too few of them for one piece
+_INNER, _ENOUGH, _FEW = (
+    60_000,
+    500,
+    30,
+)
+# Hollow shares of its hull from which on a piece is thinned, and by which it is at most
+_FULL, _MOST = (
+    0.03,
+    0.9,
+)
 _WALL = 0.02  # m; thicker pieces are not walls, and stay as thick as they are
 _LEAST = 1e-11  # m^3; smaller pieces are dropped
 
@@ -91,9 +104,15 @@ class Collision(NamedTuple):
 
 
 def convex_pieces(
-    given: Sequence[np.ndarray], surfaces: Surfaces, options: ImportOptions, notes: list[str], *, shown: bool = True
+    given: Sequence[np.ndarray],
+    surfaces: Surfaces,
+    options: ImportOptions,
+    notes: list[str],
+    *,
+    shown: bool = True,
 ) -> Collision:
-    """Returns the given pieces if their errors are small enough; else a decomposition, or the given ones if closer.
+    """Returns the given pieces if their errors are small enough; else a decomposition, or the given
+    ones if closer.
 
     Args:
       given: vertices (V, 3) of the convex pieces in the object's folder, m.
@@ -121,7 +140,10 @@ def convex_pieces(
         cut = _cut(surfaces, options, said)
         if cut.errors.excess < own.errors.excess:
             notes.extend(said)
-            notes.append(f"{cut}; they were cut from its mesh, for its own {len(own.hulls)} are coarser: {own.errors}")
+            notes.append(
+                f"{cut}; they were cut from its mesh, for its own {len(own.hulls)} are coarser: "
+                f"{own.errors}"
+            )
             return cut
     notes.append(f"its own {own}; pieces cut from its mesh are no closer")
     return own
@@ -151,10 +173,13 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
     cut = _fitted(surfaces, hulls, owners)
     if cut.errors.excess <= 1 or len(hulls) == len(meshes):
         return cut
-    filled = _fitted(surfaces, [hull.points[hull.vertices] for hull in whole], list(range(len(meshes))))
+    filled = _fitted(
+        surfaces, [hull.points[hull.vertices] for hull in whole], list(range(len(meshes)))
+    )
     if filled.errors.excess < cut.errors.excess:
         notes.append(
-            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): hollows are filled"
+            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): "
+            f"hollows are filled"
         )
         return filled
     return cut
@@ -163,7 +188,9 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
 def _fitted(surfaces: Surfaces, found: list[np.ndarray], owners: list[int]) -> Collision:
     """Pieces (V, 3) of few vertices, and their errors."""
     hulls = [simplify(piece) for piece in found]
-    return Collision(hulls, owners, fidelity(surfaces.triangles, hulls, surfaces.volume is not None))
+    return Collision(
+        hulls, owners, fidelity(surfaces.triangles, hulls, surfaces.volume is not None)
+    )
 
 
 class Decomposition(NamedTuple):
@@ -186,16 +213,19 @@ def decompose(
     max_pieces: int = MAX_MESH_PIECES,
     shown: np.ndarray | None = None,
 ) -> Decomposition:
-    """Decomposes a triangle mesh into as few convex pieces as preserve its shape, at most `max_pieces`.
+    """Decomposes a triangle mesh into as few convex pieces as preserve its shape, at most
+    `max_pieces`.
 
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      volume: volume that the approximated surface encloses if the mesh is closed (`fidelity.enclosed`), m^3; one close
+      volume: volume that the approximated surface encloses if the mesh is closed
+      (`fidelity.enclosed`), m^3; one close
         to that of the hull needs no decomposition.
       time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
-      shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its hollows; by default the
+      shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its
+      hollows; by default the
         mesh's.
 
     Raises:
@@ -209,7 +239,11 @@ def decompose(
     notes: list[str] = []
     for method, limit in (("coacd", time_limit), ("vhacd", FALLBACK_LIMIT)):
         found, failure = _in_child(
-            method, {"vertices": vertices, "faces": faces, "shown": shown}, volume, max_pieces, limit
+            method,
+            {"vertices": vertices, "faces": faces, "shown": shown},
+            volume,
+            max_pieces,
+            limit,
         )
         if found:
             return Decomposition(found, method, notes)
@@ -224,14 +258,20 @@ def _in_child(
     """Returns the pieces, or none and the reason."""
     most = min(_MEMORY, max(LEAST_MEMORY, memory() // cores()))
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
-        folder, options = pathlib.Path(name), {"method": method, "volume": volume, "max_pieces": max_pieces}
+        folder, options = (
+            pathlib.Path(name),
+            {"method": method, "volume": volume, "max_pieces": max_pieces},
+        )
         np.savez(folder / _MESH, **mesh)
         patience = STARVED * limit + STARVED
         try:
-            call_confined(write_pieces, folder, options, memory=most, seconds=limit, patience=patience)
+            call_confined(
+                write_pieces, folder, options, memory=most, seconds=limit, patience=patience
+            )
         except TimeoutError:
             raise CongraspError(
-                f"The machine is too busy: {method} got less than {limit:g} s of processor time in {patience:.0f} s.",
+                f"The machine is too busy: {method} got less than {limit:g} s of processor time in "
+                f"{patience:.0f} s.",
                 "Stop other programs and try again.",
             ) from None
         except ChildProcessError as error:
@@ -252,9 +292,19 @@ def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pi
     else:
         import vhacdx
 
-        rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
-        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=min(max_pieces, 1 << 20))]
-    solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
+        # The number of corners comes first, as in VTK
+        rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)
+        found = [
+            piece[0]
+            for piece in vhacdx.compute_vhacd(
+                vertices, rows, maxConvexHulls=min(max_pieces, 1 << 20)
+            )
+        ]
+    solid = [
+        hull
+        for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found)
+        if hull is not None
+    ]
     np.savez(folder / _PIECES, *merge([hull.points for hull in solid], max_pieces, shown, volume))
 
 
@@ -262,17 +312,27 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[
     """Vertices of the pieces of one body."""
     import coacd
 
-    if closed and _convex(hull := shapes.hull_of(vertices), vertices[faces], enclosed(vertices[faces]).volume):
+    if closed and _convex(
+        hull := shapes.hull_of(vertices), vertices[faces], enclosed(vertices[faces]).volume
+    ):
         return [hull.points[hull.vertices]]
-    # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth of the time. An open
-    # surface becomes a thin wall, which the same search would cut into hundreds of pieces: a sphere without its top
-    # took 71 s and was 4.0 mm off, and takes 18 s and is 4.1 mm off.
+    # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth
+    # of the time. An open surface becomes a thin wall, which the same search would cut into
+    # hundreds of pieces: a sphere without its top took 71 s and was 4.0 mm off, and takes 18 s and
+    # is 4.1 mm off.
     search = {"mcts_iterations": 20, "mcts_nodes": 10, "mcts_max_depth": 2}
     if not closed:
-        search = {"mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1, "preprocess_resolution": 40}
+        search = {
+            "mcts_iterations": 10,
+            "mcts_nodes": 5,
+            "mcts_max_depth": 1,
+            "preprocess_resolution": 40,
+        }
     found = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
-        threshold=min(1.0, max(_FINEST, (2 if closed else 3) * DEPTH / np.ptp(vertices, axis=0).max())),
+        threshold=min(
+            1.0, max(_FINEST, (2 if closed else 3) * DEPTH / np.ptp(vertices, axis=0).max())
+        ),
         preprocess_mode="off" if closed and is_watertight(faces_to_edges(faces))[0] else "auto",
         merge=False,
         seed=0,
@@ -295,7 +355,9 @@ class _Part(NamedTuple):
     hollow: float
     """Volume of its hull before it was thinned, without that of the mesh in it, m^3."""
     error: float
-    """Largest of the way that thinning moves a side, the depth of the surface in it, and its distance from it, m."""
+    """Largest of the way that thinning moves a side, the depth of the surface in it, and its
+    distance from it, m.
+    """
 
 
 class _Join(NamedTuple):
@@ -321,7 +383,9 @@ class _Merger:
         self._volume = sum(hull.volume for hull in hulls) if volume is None else volume
         self._inner = None if volume is None else _sorted(interior(triangles, _INNER))
         if volume is None:
-            triangles = np.concatenate([shapes.triangulate(hull.points).triangles for hull in hulls])
+            triangles = np.concatenate(
+                [shapes.triangulate(hull.points).triangles for hull in hulls]
+            )
         self._voxels = voxels(triangles, MOST_SURFACE)
         self._distance = distance_transform_edt(~self._voxels.inside, self._voxels.spacing)
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
@@ -359,7 +423,9 @@ class _Merger:
         return float(1 - share * len(near) / len(inner) * self._volume / hull.volume)
 
     def reduce(self, max_pieces: int) -> None:
-        """Makes joins, cheapest first, until none is left; below the limit of pieces only those within tolerances."""
+        """Makes joins, cheapest first, until none is left; below the limit of pieces only those
+        within tolerances.
+        """
         grown = 0.0
         while self._joins:
             join = heapq.heappop(self._joins)
@@ -395,19 +461,24 @@ class _Merger:
             self._consider(new, k)
 
 
-def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float | None) -> list[np.ndarray]:
-    """Joins neighbouring convex pieces until `max_pieces` are left, and then while the shape is preserved.
+def merge(
+    pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float | None
+) -> list[np.ndarray]:
+    """Joins neighbouring convex pieces until `max_pieces` are left, and then while the shape is
+    preserved.
 
-    The cost of a join is the volume that it adds and its deviation from the surface, each as a share of the tolerance
-    (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of the deepest surface point in the piece, the
-    way that thinning moves its sides, or the distance of its farthest point from the mesh, by samples. Pieces that
-    do not touch are never joined, so that more than `max_pieces` remain if there are more separate bodies.
+    The cost of a join is the volume that it adds and its deviation from the surface, each as a
+    share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
+    the deepest surface point in the piece, the way that thinning moves its sides, or the distance
+    of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
+    that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
       max_pieces: largest number of pieces.
       triangles: (F, 3, 3) corners of the surface that they approximate, m.
-      volume: volume of the object, m^3; None for an open surface, whose pieces stay as thick as they are.
+      volume: volume of the object, m^3; None for an open surface, whose pieces stay as thick as
+      they are.
     """
     merger = _Merger(pieces, triangles, volume)
     merger.reduce(max_pieces)
@@ -432,8 +503,8 @@ def solid_hull(vertices: np.ndarray) -> ConvexHull | None:
 def simplify(vertices: np.ndarray, max_vertices: int = MAX_MESH_VERTICES) -> np.ndarray:
     """A convex piece of at most `max_vertices` vertices (V, 3), with the same volume.
 
-    Starting from the extreme points along the axes, the point that sticks out furthest is added again and again; the
-    result is then scaled about its centroid to the volume of the original.
+    Starting from the extreme points along the axes, the point that sticks out furthest is added
+    again and again; the result is then scaled about its centroid to the volume of the original.
 
     Raises:
       scipy.spatial.QhullError: the points lie in a plane.
@@ -446,7 +517,9 @@ def simplify(vertices: np.ndarray, max_vertices: int = MAX_MESH_VERTICES) -> np.
     along = points @ axes.T
     chosen = list(dict.fromkeys([*along.argmax(0).tolist(), *along.argmin(0).tolist()]))
     while len(chosen) < max_vertices:
-        equations = shapes.hull_of(points[chosen]).equations if len(chosen) > 3 else np.zeros((1, 4))
+        equations = (
+            shapes.hull_of(points[chosen]).equations if len(chosen) > 3 else np.zeros((1, 4))
+        )
         outside = (points @ equations[:, :3].T + equations[:, 3]).max(-1)
         outside[chosen] = -np.inf
         chosen.append(int(outside.argmax()))
@@ -458,7 +531,9 @@ def simplify(vertices: np.ndarray, max_vertices: int = MAX_MESH_VERTICES) -> np.
 
 def _touch(a: ConvexHull, b: ConvexHull) -> bool:
     """True if the boxes around two hulls touch."""
-    return bool((a.min_bound < b.max_bound + _NEAR).all() and (b.min_bound < a.max_bound + _NEAR).all())
+    return bool(
+        (a.min_bound < b.max_bound + _NEAR).all() and (b.min_bound < a.max_bound + _NEAR).all()
+    )
 
 
 def _sorted(points: np.ndarray) -> np.ndarray:
@@ -474,5 +549,7 @@ def _near(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
 
 
 def _beyond(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
-    """(N,) how far points (N, 3) are beyond the facet that they are farthest beyond, m; negative inside."""
+    """(N,) how far points (N, 3) are beyond the facet that they are farthest beyond, m; negative
+    inside.
+    """
     return (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(-1)

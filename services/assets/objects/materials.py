@@ -24,7 +24,9 @@ _SHEET = 5e-4
 
 
 class Material(NamedTuple):
-    """A material of household objects. Wall and thickest are estimates for ordinary cups, bottles and boxes."""
+    """A material of household objects. Wall and thickest are estimates for ordinary cups, bottles
+    and boxes.
+    """
 
     density: float
     """kg/m^3."""
@@ -66,7 +68,8 @@ class Weight(NamedTuple):
 
 
 def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
-    """Material of each part, from a name, or from PART=NAME for each, separated by commas; a bare name is for the rest.
+    """Material of each part, from a name, or from PART=NAME for each, separated by commas; a bare
+    name is for the rest.
 
     Args:
       text: such as "steel" or "head=steel,handle=wood".
@@ -78,15 +81,22 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     entries = [_entry(entry) for entry in text.split(",")]
     if len(named := dict(entries)) < len(entries):
         raise CongraspError(
-            f"--material is '{text}', with two materials for a part.", "Name one, or PART=NAME for each."
+            f"--material is '{text}', with two materials for a part.",
+            "Name one, or PART=NAME for each.",
         )
     if unknown := sorted(named.keys() - {"", *parts}):
         known = ", ".join(filter(None, parts))
-        remedy = f"The parts are: {known}." if known else "Name the material alone: the object has no parts."
+        remedy = (
+            f"The parts are: {known}."
+            if known
+            else "Name the material alone: the object has no parts."
+        )
         raise CongraspError(f"--material names the part '{unknown[0]}'.", remedy)
     missing = [part for part in parts if part not in named and "" not in named]
     if missing:
-        raise CongraspError(f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME.")
+        raise CongraspError(
+            f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME."
+        )
     return tuple(named[part if part in named else ""] for part in parts)
 
 
@@ -100,7 +110,8 @@ def _entry(text: str) -> tuple[str, Material]:
 
 
 def mean_thickness(mesh: trimesh.Trimesh) -> float:
-    """2 V / A in metres: of a wall its thickness, of a long rod half its diameter, of a ball a third of it.
+    """2 V / A in metres: of a wall its thickness, of a long rod half its diameter, of a ball a
+    third of it.
 
     An open mesh encloses the volume of the cones from its middle to its triangles.
     """
@@ -109,7 +120,9 @@ def mean_thickness(mesh: trimesh.Trimesh) -> float:
 
 
 def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
-    """True for a body whose mass is that of its wall: thicker than objects of its material are, or a sheet."""
+    """True for a body whose mass is that of its wall: thicker than objects of its material are, or
+    a sheet.
+    """
     thickness = mean_thickness(mesh)
     return thickness > material.thickest or (not encloses(mesh) and thickness < _SHEET)
 
@@ -118,8 +131,8 @@ def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> W
     """Mass properties of several bodies together, each solid or `hollow`.
 
     Args:
-      bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which enclose the material.
-      materials: material of each body.
+      bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which
+      enclose the material. materials: material of each body.
     """
     weights = [_weigh(body, material) for body, material in zip(bodies, materials, strict=True)]
     mass = sum(weight.mass for weight in weights)
@@ -127,7 +140,9 @@ def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> W
     inertia = np.zeros((3, 3))
     for weight in weights:
         offset = weight.center - center
-        inertia += weight.inertia + weight.mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+        inertia += weight.inertia + weight.mass * (
+            offset @ offset * np.eye(3) - np.outer(offset, offset)
+        )
     return Weight(mass, center, inertia)
 
 
@@ -148,14 +163,20 @@ def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
     center = share @ mesh.triangles.mean(1)
     corners = mesh.triangles - center
     total = corners.sum(1)
-    # The integral of x x^T over a triangle is A / 12 (the sum of v v^T over its corners + s s^T of their sum).
-    second = np.einsum("f,fki,fkj->ij", share, corners, corners) + np.einsum("f,fi,fj->ij", share, total, total)
+    # The integral of x x^T over a triangle is A / 12 (the sum of v v^T over its corners + s s^T of
+    # their sum).
+    second = np.einsum("f,fki,fkj->ij", share, corners, corners) + np.einsum(
+        "f,fi,fj->ij", share, total, total
+    )
     second *= mass / 12
     return Weight(mass, center, np.trace(second) * np.eye(3) - second)
 
 
 def weigh_parts(
-    whole: Sequence[trimesh.Trimesh], parts: Sequence[trimesh.Trimesh], material: str, names: Sequence[str]
+    whole: Sequence[trimesh.Trimesh],
+    parts: Sequence[trimesh.Trimesh],
+    material: str,
+    names: Sequence[str],
 ) -> Weight:
     """Mass properties of an object by its material, or by that of each part.
 
@@ -171,7 +192,10 @@ def weigh_parts(
 
 
 def weigh_evenly(
-    mesh: trimesh.Trimesh, solid: Enclosed | None, hulls: Sequence[np.ndarray], density: float | None
+    mesh: trimesh.Trimesh,
+    solid: Enclosed | None,
+    hulls: Sequence[np.ndarray],
+    density: float | None,
 ) -> Weight:
     """Mass properties of an evenly dense body.
 
@@ -203,10 +227,15 @@ def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObjec
     Args:
       obj: an object of convex pieces, each of which is solid or `hollow`.
       mass: kg.
-      material: see `materials_of`; determines the mass if `mass` is None. Without both the object is unchanged.
+      material: see `materials_of`; determines the mass if `mass` is None. Without both the object
+      is unchanged.
     """
     if mass is None and material:
         of_part = materials_of(material, obj.part_names)
         bodies = [trimesh.Trimesh(*tessellate(piece), process=False) for piece in obj.pieces]
         mass = weigh(bodies, [of_part[piece.part] for piece in obj.pieces]).mass
-    return obj if mass is None else dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass)
+    return (
+        obj
+        if mass is None
+        else dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass)
+    )

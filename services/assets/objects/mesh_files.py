@@ -1,8 +1,10 @@
-"""Mesh files: their kind by content, limits before they are read, and what the readers of trimesh leave to the caller.
+"""Mesh files: their kind by content, limits before they are read, and what the readers of trimesh
+leave to the caller.
 
-STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices become absolute, a PLY's
-polygons triangles (`ply`), and a GLB's integers the numbers that they stand for (`gltf`). Textures, materials and
-colours of the files are sampled at points of their surface.
+STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices
+become absolute, a PLY's polygons triangles (`ply`), and a GLB's integers the numbers that they
+stand for (`gltf`). Textures, materials and colours of the files are sampled at points of their
+surface.
 """
 
 import array
@@ -35,7 +37,9 @@ MAX_BYTES = 512 << 20
 CHECK = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
 _AGAIN = "Export it again, or convert it."
 _UNPACK = "Unpack it and name the mesh inside."
-_SURFACE = "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
+_SURFACE = (
+    "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
+)
 _FOREIGN = pathlib.Path(__file__).with_name("foreign.toml")
 _STL_HEADER, _STL_TRIANGLE = 84, 50  # bytes
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
@@ -58,7 +62,9 @@ _UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
 @np.errstate(all="ignore")  # of numbers that are refused, or far out
-def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto") -> trimesh.Trimesh:
+def read_mesh(
+    path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto"
+) -> trimesh.Trimesh:
     """Reads one mesh, in the file's own unit, with merged vertices and each proper triangle once.
 
     Args:
@@ -74,18 +80,28 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
     if f".{kind}" != path.suffix.lower():
         said.append(f"its content is {kind.upper()}, whatever its name says, and was read as that")
     loaded = _geometry(path, kind, data, _AGAIN, said, skip_materials=True)
-    axis, mesh = up_of(loaded, up), loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    axis, mesh = (
+        up_of(loaded, up),
+        loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded,
+    )
     if not len(getattr(mesh, "faces", ())):
-        raise CongraspError(*_without_triangles(path, kind, data, len(getattr(mesh, "vertices", ()))))
+        raise CongraspError(
+            *_without_triangles(path, kind, data, len(getattr(mesh, "vertices", ())))
+        )
     if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
         raise CongraspError(f"{path} has points that are not of three numbers.", _AGAIN)
     check_triangles(path, mesh)
     finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
     if finite is None:
         bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
-        raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
+        raise CongraspError(
+            f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again."
+        )
     if (farthest := np.abs(finite[0]).max(initial=0.0)) > _FARTHEST:
-        raise CongraspError(f"{path} has a coordinate of {farthest:.3g}.", f"{_FARTHEST:g} is the most, in any unit.")
+        raise CongraspError(
+            f"{path} has a coordinate of {farthest:.3g}.",
+            f"{_FARTHEST:g} is the most, in any unit.",
+        )
     step, size = float(np.spacing(np.float32(farthest))), np.ptp(finite[0], axis=0).max(initial=0.0)
     if 0 < _COARSE * size < step and (finite[0].astype(np.float32) == finite[0]).all():
         raise CongraspError(
@@ -95,19 +111,30 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
     vertices, faces = repair.reduced(*finite, said)
     mesh = repair.merged(upright(vertices, axis), faces, said)
     if len(mesh.faces) < 4:
-        raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
+        raise CongraspError(
+            f"{path} has no volume: only {len(mesh.faces)} proper triangles.",
+            "Export a closed mesh.",
+        )
     mesh.metadata["kind"] = loaded.metadata["kind"]
     return mesh
 
 
 def check_triangles(path: pathlib.Path, mesh: trimesh.Trimesh) -> None:
-    """Raises a CongraspError if a triangle of a mesh refers to a vertex that it lacks, or there are too many."""
-    if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+    """Raises a CongraspError if a triangle of a mesh refers to a vertex that it lacks, or there are
+    too many.
+    """
+    if (
+        len(mesh.faces) > MAX_FACES
+        or mesh.faces.min() < 0
+        or mesh.faces.max() >= len(mesh.vertices)
+    ):
         raise CongraspError(f"{path} has triangles without vertices, or too many.", _AGAIN)
 
 
 def up_of(geometry: Any, up: Up = "auto") -> Literal["y", "z"]:
-    """The axis that points up in the file of a geometry: y in GLB by the standard of glTF, z in others, or `up`."""
+    """The axis that points up in the file of a geometry: y in GLB by the standard of glTF, z in
+    others, or `up`.
+    """
     return up if up != "auto" else "y" if geometry.metadata["kind"] == "glb" else "z"
 
 
@@ -116,7 +143,9 @@ def upright(points: np.ndarray, up: Literal["y", "z"]) -> np.ndarray:
     return points if up == "z" else np.asarray(points)[..., [0, 2, 1]] * [1, -1, 1]
 
 
-def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = None, **options: Any) -> Any:
+def load_geometry(
+    path: pathlib.Path, remedy: str, *, notes: list[str] | None = None, **options: Any
+) -> Any:
     """Loads a file with trimesh, as a mesh, a point cloud or a scene, in the file's axes and unit.
 
     Args:
@@ -134,10 +163,14 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
     return _geometry(path, *_content(path), remedy, [] if notes is None else notes, **options)
 
 
-def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any) -> Any:
+def _geometry(
+    path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any
+) -> Any:
     """The geometry of a file with this content; see `load_geometry`."""
     try:
-        if b"\0" not in data[:_START] and any(kind == "ply" or row[1] for row in _COMMA.finditer(data)):
+        if b"\0" not in data[:_START] and any(
+            kind == "ply" or row[1] for row in _COMMA.finditer(data)
+        ):
             raise ValueError("its numbers have commas for decimal points")
         if kind == "stl":
             found: Any = _stl(data, notes)
@@ -145,7 +178,9 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
             kind, data = ("glb", packed(data)) if kind == "gltf" else (kind, data)
             prepared = {"ply": plain_ply, "glb": plain_glb, "obj": _plain_obj}[kind](data, notes)
             files = _Files(path, notes)
-            found = trimesh.load(io.BytesIO(prepared), file_type=kind, resolver=files, process=False, **options)
+            found = trimesh.load(
+                io.BytesIO(prepared), file_type=kind, resolver=files, process=False, **options
+            )
     except CongraspError as error:
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
@@ -153,7 +188,11 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         if kind == "obj" and isinstance(error, IndexError):
             text = data.replace(b"\r", b"\n")
             points = len(_POINTS.findall(text))
-            if any(int(index) > points for face in _FACE.findall(text) for index in _INDEX.findall(face)):
+            if any(
+                int(index) > points
+                for face in _FACE.findall(text)
+                for index in _INDEX.findall(face)
+            ):
                 reason = _NO_POINT
         raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
     found.metadata["kind"] = kind
@@ -161,7 +200,9 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
 
 
 class _Files(trimesh.resolvers.FilePathResolver):
-    """Finds materials and pictures that a mesh file names, also by paths of Windows; notes those that are missing."""
+    """Finds materials and pictures that a mesh file names, also by paths of Windows; notes those
+    that are missing.
+    """
 
     def __init__(self, path: pathlib.Path, notes: list[str]):
         super().__init__(str(path))
@@ -180,10 +221,12 @@ class _Files(trimesh.resolvers.FilePathResolver):
 
 
 def _content(path: pathlib.Path) -> tuple[str, bytes]:
-    """The kind of a mesh file by its content, or by its name if the content is ambiguous; and the content.
+    """The kind of a mesh file by its content, or by its name if the content is ambiguous; and the
+    content.
 
     Raises:
-      CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
+      CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get
+      one.
     """
     data = read_file(path, MAX_BYTES, CHECK)
     if not data:
@@ -217,7 +260,9 @@ def _supported(start: bytes, size: int) -> str:
 
 
 def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
-    """Kind of a file that is no mesh, by its beginning and its content, and the remedy; None if it is unknown."""
+    """Kind of a file that is no mesh, by its beginning and its content, and the remedy; None if it
+    is unknown.
+    """
     inside, zipped, names = text.lower(), text.startswith(b"PK\3\4"), list[str]()
     if zipped:
         try:
@@ -229,22 +274,31 @@ def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
     for remedy, row in ((group["remedy"], row) for group in groups for row in group["files"]):
         begins = tuple(beginning.encode("latin-1") for beginning in row["begins"])
         holds = row.get("holds", [""])
-        if (text.startswith(begins) or text.lower().startswith(begins)) and any(x.encode() in inside for x in holds):
+        if (text.startswith(begins) or text.lower().startswith(begins)) and any(
+            x.encode() in inside for x in holds
+        ):
             return row["what"], remedy
     if meshes := [name for name in names if name.lower().endswith(SUFFIXES)]:
-        return f"a zip archive with {', '.join(meshes[:3])}{' …' if len(meshes) > 3 else ''} in it", _UNPACK
+        return (
+            f"a zip archive with {', '.join(meshes[:3])}{' …' if len(meshes) > 3 else ''} in it",
+            _UNPACK,
+        )
     return ("a zip archive without a mesh in it", CONVERT) if zipped else None
 
 
 def _is_text_stl(start: bytes) -> bool:
-    """True for the beginning of an STL file of text; some writers use capitals, or write a mark of the encoding."""
+    """True for the beginning of an STL file of text; some writers use capitals, or write a mark of
+    the encoding.
+    """
     text = start[:_START].removeprefix(_MARK).lstrip().lower()
     return text.startswith(b"solid") and re.search(rb"\bfacet\s", text) is not None
 
 
 @np.errstate(all="ignore")
 def _holds_records(start: bytes) -> bool:
-    """True if binary STL records with unit normals follow the header, whatever count it announces."""
+    """True if binary STL records with unit normals follow the header, whatever count it
+    announces.
+    """
     whole = max(len(start) - _STL_HEADER, 0) // _STL_TRIANGLE
     if whole < 4 or start.isascii():
         return False
@@ -256,7 +310,9 @@ def _holds_records(start: bytes) -> bool:
 def _rows_of_numbers(text: bytes) -> bool:
     """True if the first lines hold three or more numbers each."""
     lines = [line for line in text.splitlines()[:10] if line.strip()]
-    return len(lines) > 2 and all(re.fullmatch(rb"\s*([-+.\deE]+[\s,;]*){3,}", line) for line in lines[:-1])
+    return len(lines) > 2 and all(
+        re.fullmatch(rb"\s*([-+.\deE]+[\s,;]*){3,}", line) for line in lines[:-1]
+    )
 
 
 def _without_triangles(path: pathlib.Path, kind: str, data: bytes, points: int) -> tuple[str, str]:
@@ -270,11 +326,19 @@ def _without_triangles(path: pathlib.Path, kind: str, data: bytes, points: int) 
 
 
 def _stl(data: bytes, notes: list[str]) -> trimesh.Trimesh:
-    """The triangles of an STL file, each with corners of its own; raises a ValueError if there are none."""
-    corners = _text_stl(data) if _is_text_stl(data) and not _is_exact(data, len(data)) else _binary_stl(data, notes)
+    """The triangles of an STL file, each with corners of its own; raises a ValueError if there are
+    none.
+    """
+    corners = (
+        _text_stl(data)
+        if _is_text_stl(data) and not _is_exact(data, len(data))
+        else _binary_stl(data, notes)
+    )
     if not len(corners):
         raise ValueError("it has no triangles")
-    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    return trimesh.Trimesh(
+        corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
+    )
 
 
 def _announced(start: bytes) -> int:
@@ -283,13 +347,17 @@ def _announced(start: bytes) -> int:
 
 
 def _is_exact(start: bytes, size: int) -> bool:
-    """True for a binary STL file of `size` bytes with as many triangles as announced, whatever its text says."""
+    """True for a binary STL file of `size` bytes with as many triangles as announced, whatever its
+    text says.
+    """
     return len(start) >= _STL_HEADER and size == _STL_HEADER + _STL_TRIANGLE * _announced(start)
 
 
 def _text_stl(data: bytes) -> np.ndarray:
     """Corners (F, 3, 3) of text."""
-    numbers = array.array("d", (_number(word) for row in _VERTEX.finditer(data) for word in row.groups()))
+    numbers = array.array(
+        "d", (_number(word) for row in _VERTEX.finditer(data) for word in row.groups())
+    )
     if len(numbers) % 9:
         raise ValueError("it ends within a triangle, or its facets are not triangles")
     return np.frombuffer(numbers).reshape(-1, 3, 3)
@@ -303,32 +371,46 @@ def _number(word: bytes) -> float:
 
 
 def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
-    """Corners (F, 3, 3) of records; where the header's count is wrong, the whole and plausible ones."""
+    """Corners (F, 3, 3) of records; where the header's count is wrong, the whole and plausible
+    ones.
+    """
     announced, whole = _announced(data), max(len(data) - _STL_HEADER, 0) // _STL_TRIANGLE
     if not whole:
-        raise ValueError("it has no triangles: neither text with 'facet' in it, nor whole binary records")
+        raise ValueError(
+            "it has no triangles: neither text with 'facet' in it, nor whole binary records"
+        )
     rows = np.frombuffer(data, _STL_ROW, whole, _STL_HEADER)
     if announced < whole and not _plausible(rows[announced:], rows[: announced or whole]):
         whole = announced
     if whole != announced:
-        notes.append(f"its header announces {announced} triangles, but it holds {whole}, which were read")
+        notes.append(
+            f"its header announces {announced} triangles, but it holds {whole}, which were read"
+        )
     elif len(data) > _STL_HEADER + _STL_TRIANGLE * whole:
-        notes.append(f"{len(data) - _STL_HEADER - _STL_TRIANGLE * whole} bytes after its triangles were ignored")
+        notes.append(
+            f"{len(data) - _STL_HEADER - _STL_TRIANGLE * whole} bytes after its triangles were "
+            f"ignored"
+        )
     return rows["corners"][:whole].astype(float)
 
 
 @np.errstate(all="ignore")
 def _plausible(rows: np.ndarray, sound: np.ndarray) -> bool:
-    """True if records have the values of triangles: not degenerate, and of the size of sound ones."""
+    """True if records have the values of triangles: not degenerate, and of the size of sound
+    ones.
+    """
     corners, known = rows["corners"].astype(float), sound["corners"].astype(float)
     if not (np.isfinite(corners).all() and np.isfinite(known).all()):
         return False
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
     return bool((area > 0).mean() > 0.5 and np.abs(corners).max() < 100 * np.abs(known).max())
 
 
 def _plain_obj(data: bytes, notes: list[str]) -> bytes:
-    """Text with absolute indices, for negative ones count back from the points so far, and without dented polygons.
+    """Text with absolute indices, for negative ones count back from the points so far, and without
+    dented polygons.
 
     Raises:
       ValueError: a face has the index 0, or counts back to before the first point.
@@ -355,7 +437,9 @@ def _absolute_obj(data: bytes) -> bytes:
         if words and words[0] in counts:
             counts[words[0]] += 1
         elif words and words[0] == b"f":
-            corners = [list(map(_absolute, word.split(b"/"), counts.values())) for word in words[1:]]
+            corners = [
+                list(map(_absolute, word.split(b"/"), counts.values())) for word in words[1:]
+            ]
             if not all(corner[0] for corner in corners):
                 raise ValueError(_NO_POINT)
             line = b" ".join([b"f", *map(b"/".join, corners)])
@@ -364,7 +448,9 @@ def _absolute_obj(data: bytes) -> bytes:
 
 
 def _cut_polygons(data: bytes, notes: list[str]) -> bytes:
-    """An OBJ whose dented polygons are cut into triangles inside of them; readers cut all as if they had no dent."""
+    """An OBJ whose dented polygons are cut into triangles inside of them; readers cut all as if
+    they had no dent.
+    """
     numbers = [row.split()[:3] for row in _POINTS.findall(data)]
     if any(len(row) < 3 for row in numbers):
         raise ValueError("a point has fewer than three numbers")
@@ -378,12 +464,16 @@ def _cut_polygons(data: bytes, notes: list[str]) -> bytes:
     text, place = dict[int, bytes](), itertools.count()
     for some, found in zip(groups, cut, strict=True):
         for i, triangles in ((some[k], found[k]) for k in found):
-            text[i] = b"\n".join(b"f " + b" ".join(corners[i][k] for k in triangle) for triangle in triangles)
+            text[i] = b"\n".join(
+                b"f " + b" ".join(corners[i][k] for k in triangle) for triangle in triangles
+            )
     return _POLYGON.sub(lambda row: text.get(next(place), row[0]), data)
 
 
 def _absolute(index: bytes, count: int) -> bytes:
-    """The absolute index for one such as -1, among so many points or coordinates so far; empty if there is none."""
+    """The absolute index for one such as -1, among so many points or coordinates so far; empty if
+    there is none.
+    """
     if not index.startswith(b"-"):
         return index
     return b"%d" % (int(index) + 1 + count) if int(index) >= -count else b""
@@ -413,7 +503,11 @@ def sample_colours(
         rng = np.random.default_rng(seed)
         areas = np.array([mesh.area for mesh in meshes])
         counts = rng.multinomial(COLOUR_POINTS, areas / areas.sum())
-        sampled = [_sampled(mesh, int(count), rng) for mesh, count in zip(meshes, counts, strict=True) if count]
+        sampled = [
+            _sampled(mesh, int(count), rng)
+            for mesh, count in zip(meshes, counts, strict=True)
+            if count
+        ]
     except Exception as error:  # pictures and texture coordinates of files raise whatever they hold
         reason = (str(error) or type(error).__name__).splitlines()[0][:100].rstrip(" .!")
         raise CongraspError(f"The colours of {paths[0]} cannot be read: {reason}.") from None
@@ -443,9 +537,13 @@ def _image(material: Any) -> Any:
     return getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
 
 
-def _sampled(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(
+    mesh: trimesh.Trimesh, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Samples points (count, 3) on a mesh, and their colours (count, 3)."""
-    points, faces, weights = trimesh.sample.sample_surface(mesh, count, return_barycentric=True, seed=rng)
+    points, faces, weights = trimesh.sample.sample_surface(
+        mesh, count, return_barycentric=True, seed=rng
+    )
     corners = mesh.faces[faces]
     visual: Any = mesh.visual
     if visual.kind == "texture":
@@ -459,7 +557,9 @@ def _sampled(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tup
 
 
 def _material(material: Any, uv: np.ndarray | None, count: int) -> np.ndarray:
-    """(count, 3) colours from 0 to 255 of a material at texture coordinates (count, 2): its image times its colour."""
+    """(count, 3) colours from 0 to 255 of a material at texture coordinates (count, 2): its image
+    times its colour.
+    """
     image = _image(material)
     if image is None or uv is None:
         return np.broadcast_to(np.asarray(material.main_color, float)[:3], (count, 3))

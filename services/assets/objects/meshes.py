@@ -26,8 +26,20 @@ from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
-from congrasp.services.assets.objects.mesh_files import CHECK, MAX_BYTES, read_mesh, sample_colours, up_of
-from congrasp.services.assets.objects.options import METRES, ImportOptions, Up, check_options, metres_per_unit
+from congrasp.services.assets.objects.mesh_files import (
+    CHECK,
+    MAX_BYTES,
+    read_mesh,
+    sample_colours,
+    up_of,
+)
+from congrasp.services.assets.objects.options import (
+    METRES,
+    ImportOptions,
+    Up,
+    check_options,
+    metres_per_unit,
+)
 from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
@@ -65,7 +77,9 @@ class Source:
 
     @property
     def parts_are_pieces(self) -> bool:
-        """True if the part files together are the object, so that no collision piece spans two of them."""
+        """True if the part files together are the object, so that no collision piece spans two of
+        them.
+        """
         return bool(self.parts) and self.visuals == self.parts
 
     def files(self) -> tuple[MeshFile, ...]:
@@ -74,13 +88,16 @@ class Source:
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
-    """Imports one object, or reads it from the cache of finished imports; its `notes` are for the user.
+    """Imports one object, or reads it from the cache of finished imports; its `notes` are for the
+    user.
 
-    Its origin moves to the centre of mass; its orientation stays that of the file. Parts come from part files; an
-    object without them is labelled by two halves, the slimmer one graspable if a hand can close on it (`cut_to_hold`).
+    Its origin moves to the centre of mass; its orientation stays that of the file. Parts come from
+    part files; an object without them is labelled by two halves, the slimmer one graspable if a
+    hand can close on it (`cut_to_hold`).
 
     Raises:
-      CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault and the remedy.
+      CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault
+      and the remedy.
     """
     check_options(options)
     key = _key(source, options)
@@ -100,13 +117,15 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
 def import_sources(
     sources: Sequence[Source], options: ImportOptions
 ) -> Iterator[tuple[int, GraspObject | CongraspError]]:
-    """Imports objects in parallel, one for each core if memory suffices; yields each index, and the object or error.
+    """Imports objects in parallel, one for each core if memory suffices; yields each index, and the
+    object or error.
 
-    Each decomposition is a separate process with a deadline and a memory limit, for which daemon threads of this
-    process wait.
+    Each decomposition is a separate process with a deadline and a memory limit, for which daemon
+    threads of this process wait.
 
     Raises:
-      CongraspError: an option is invalid, or no import ends for much longer than the deadlines of the decompositions.
+      CongraspError: an option is invalid, or no import ends for much longer than the deadlines of
+      the decompositions.
     """
     check_options(options)
     todo = collections.deque(range(len(sources)))
@@ -133,17 +152,23 @@ def import_sources(
                 raise result
             yield i, result
     except queue.Empty:
-        raise CongraspError(f"No import has ended for {patience:.0f} s.", "Import fewer objects at once.") from None
+        raise CongraspError(
+            f"No import has ended for {patience:.0f} s.", "Import fewer objects at once."
+        ) from None
     finally:
         todo.clear()
 
 
 def _key(source: Source, options: ImportOptions) -> str:
-    """24 hex digits of the files and options of an import, which are also the seed of its surface points."""
+    """24 hex digits of the files and options of an import, which are also the seed of its surface
+    points.
+    """
     settings = dataclasses.replace(options, cache_dir="")
     content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
-        content.update(f" {file.path.name} {file.role} {file.part} ".encode(errors="surrogateescape"))
+        content.update(
+            f" {file.path.name} {file.role} {file.part} ".encode(errors="surrogateescape")
+        )
         content.update(hashlib.sha256(read_file(file.path, MAX_BYTES, CHECK)).digest())
     return content.hexdigest()[:24]
 
@@ -160,7 +185,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
         notes.append(
-            f"its surface is open: mass and inertia are those of its convex {'pieces' if source.pieces else 'hull'} "
+            f"its surface is open: mass and inertia are those of its convex "
+            f"{'pieces' if source.pieces else 'hull'} "
             "(--material weighs its wall, and --mass sets the mass)"
         )
     solid = enclosed(np.asarray(whole.triangles)) if closed else None
@@ -168,8 +194,12 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         notes.append("its bodies overlap: what lies in several of them weighs once")
     surfaces = _surfaces(meshes, solid, notes)
     names = [part.part for part in source.parts]
-    weighed = weigh_parts(meshes, parts or meshes, options.material, names) if options.material else None
-    hulls, owners, errors = _cut(source, [factor * piece - middle for piece in given], surfaces, options, notes)
+    weighed = (
+        weigh_parts(meshes, parts or meshes, options.material, names) if options.material else None
+    )
+    hulls, owners, errors = _cut(
+        source, [factor * piece - middle for piece in given], surfaces, options, notes
+    )
     hull = hulls if source.pieces else [np.asarray(whole.vertices)]
     found = weighed or weigh_evenly(whole, solid, hull, options.density)
     mass, center = found.mass if options.mass is None else options.mass, found.center
@@ -230,12 +260,18 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     up = options.up
     pieces = [read_mesh(file.path, up=up) for file in source.pieces]
     visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
-    parts = [] if source.parts_are_pieces else [read_mesh(file.path, up=up) for file in source.parts]
+    parts = (
+        [] if source.parts_are_pieces else [read_mesh(file.path, up=up) for file in source.parts]
+    )
     found = up_of((visuals or pieces)[0], up)
     kinds = [mesh.metadata["kind"] for mesh in visuals]
-    coloured = [file.path for file, kind in zip(source.visuals, kinds, strict=True) if kind != "stl"]
+    coloured = [
+        file.path for file, kind in zip(source.visuals, kinds, strict=True) if kind != "stl"
+    ]
     if found == "y":
-        notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
+        notes.append(
+            "its y axis, which points up in the file, became its z axis (--up z leaves the axes)"
+        )
     given = [np.asarray(mesh.vertices, np.float64) for mesh in pieces]
     visuals = visuals or [shapes.triangulate(piece) for piece in given]
     if not (given or source.parts):
@@ -248,29 +284,43 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     return _Files(given, visuals, parts, found, coloured)
 
 
-def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list[str]) -> decompose.Surfaces:
+def _surfaces(
+    meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list[str]
+) -> decompose.Surfaces:
     """The surfaces of meshes, closed ones without hollows that no finger enters."""
     shown = meshes if solid is None else [repair.without_hollows(mesh, notes) for mesh in meshes]
     triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in shown])
-    if solid is not None and any(some is not mesh for some, mesh in zip(shown, meshes, strict=True)):
+    if solid is not None and any(
+        some is not mesh for some, mesh in zip(shown, meshes, strict=True)
+    ):
         solid = enclosed(triangles)
     return decompose.Surfaces(meshes, shown, triangles, solid and solid.volume)
 
 
 def _cut(
-    source: Source, given: Sequence[np.ndarray], surfaces: decompose.Surfaces, options: ImportOptions, notes: list[str]
+    source: Source,
+    given: Sequence[np.ndarray],
+    surfaces: decompose.Surfaces,
+    options: ImportOptions,
+    notes: list[str],
 ) -> decompose.Collision:
     """Convex pieces of an object (`decompose.convex_pieces`)."""
     try:
         return decompose.convex_pieces(given, surfaces, options, notes, shown=bool(source.visuals))
     except QhullError:
         raise CongraspError(
-            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+            f"{source.path} has no volume: its points lie in a plane.",
+            "Give it a thickness in a modelling program.",
         ) from None
 
 
 def _colours(
-    paths: Sequence[pathlib.Path], factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]
+    paths: Sequence[pathlib.Path],
+    factor: float,
+    center: np.ndarray,
+    seed: int,
+    up: Up,
+    notes: list[str],
 ) -> Colours | None:
     """Colours of files, in the object frame; None if they have none, or cannot be read."""
     try:
@@ -292,15 +342,29 @@ def _scaled(mesh: trimesh.Trimesh, factor: float, middle: np.ndarray) -> trimesh
 
 
 def _far_middle(meshes: list[trimesh.Trimesh]) -> np.ndarray:
-    """Middle (3,) of meshes so far from the origin that products of their coordinates are inexact; else zeros."""
+    """Middle (3,) of meshes so far from the origin that products of their coordinates are inexact;
+    else zeros.
+    """
     low, high = trimesh.util.concatenate(meshes).bounds
-    return (low + high) / 2 if np.abs(low + high).max() / 2 > _FAR * (high - low).max() else np.zeros(3)
+    return (
+        (low + high) / 2
+        if np.abs(low + high).max() / 2 > _FAR * (high - low).max()
+        else np.zeros(3)
+    )
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
-    """A convex piece of vertices (V, 3), with its origin at their mean, relative to the centre of mass."""
+    """A convex piece of vertices (V, 3), with its origin at their mean, relative to the centre of
+    mass.
+    """
     middle = hull.mean(0)
-    return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
+    return Piece(
+        "mesh",
+        (0.0, 0.0, 0.0),
+        tuple((middle - center).tolist()),
+        vertices=hull - middle,
+        part=part,
+    )
 
 
 def _labels(
@@ -311,18 +375,29 @@ def _labels(
     points: np.ndarray,
     face: np.ndarray,
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Names of the parts, which of them form the graspable region, and the part (N,) of each surface point."""
+    """Names of the parts, which of them form the graspable region, and the part (N,) of each
+    surface point.
+    """
     if not source.parts:
         labels = halves(points, 0.5)
         middle = [points[labels == k] - points[labels == k].mean(0) for k in (0, 1)]
-        slim = int(np.argmin([np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]))
+        slim = int(
+            np.argmin(
+                [np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]
+            )
+        )
         return UNLABELLED, np.arange(2) == slim, labels
     if parts:
         dense = [trimesh.sample.sample_surface(part, 4000, seed=0)[0] for part in parts]
         labels = np.argmin([cKDTree(some - center).query(points)[0] for some in dense], axis=0)
     else:
-        labels = np.searchsorted(np.cumsum([len(mesh.faces) for mesh in meshes]), face, side="right")
+        labels = np.searchsorted(
+            np.cumsum([len(mesh.faces) for mesh in meshes]), face, side="right"
+        )
     graspable = np.array([bool(part.graspable) for part in source.parts])
     if graspable.all() or not graspable.any():
-        graspable = np.arange(len(source.parts)) == np.bincount(labels, minlength=len(source.parts)).argmax()
+        graspable = (
+            np.arange(len(source.parts))
+            == np.bincount(labels, minlength=len(source.parts)).argmax()
+        )
     return tuple(part.part for part in source.parts), graspable, labels

@@ -1,6 +1,8 @@
-"""Objects named by a user: object files, folders of them, meshes to import, names, and seeds of the generator.
+"""Objects named by a user: object files, folders of them, meshes to import, names, and seeds of the
+generator.
 
-The meshes at a path are those of single objects, of decomposed ones, or of objects in part files (`find_sources`).
+The meshes at a path are those of single objects, of decomposed ones, or of objects in part files
+(`find_sources`).
 """
 
 import dataclasses
@@ -20,7 +22,13 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import family_turns, generate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import parallel_map
-from congrasp.services.assets.objects.mesh_files import CHECK, CONVERT, MAX_BYTES, SUFFIXES, read_mesh
+from congrasp.services.assets.objects.mesh_files import (
+    CHECK,
+    CONVERT,
+    MAX_BYTES,
+    SUFFIXES,
+    read_mesh,
+)
 from congrasp.services.assets.objects.meshes import MeshFile, Source, import_source, import_sources
 from congrasp.services.assets.objects.options import ImportOptions
 
@@ -60,14 +68,17 @@ class ObjectAt(NamedTuple):
             return str(self.path)
         files = [file.path for file in self.source.files()] if self.source else [self.path]
         contents = (read_file(file, MAX_BYTES, CHECK) for file in files)
-        return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in contents)).hexdigest()
+        return hashlib.sha256(
+            b"".join(hashlib.sha256(content).digest() for content in contents)
+        ).hexdigest()
 
 
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:
-    """Objects at a path: an object file, the object files of a folder, or else meshes (see `find_sources`).
+    """Objects at a path: an object file, the object files of a folder, or else meshes (see
+    `find_sources`).
 
-    FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of them, unless a file has
-    that name; the families of a group, such as all:0-999, take turns.
+    FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of
+    them, unless a file has that name; the families of a group, such as all:0-999, take turns.
 
     Raises:
       CongraspError: there is no object at the path.
@@ -113,18 +124,22 @@ def load_each(
     on_error: Callable[[ObjectAt, CongraspError], None] = _refuse,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[GraspObject]:
-    """Loads objects in the given order; meshes are imported in parallel, and notes of imports go to the log.
+    """Loads objects in the given order; meshes are imported in parallel, and notes of imports go to
+    the log.
 
     Args:
       found: see `objects_at`.
       options: options of the import of meshes.
-      on_error: called with each object that cannot be read or imported, and the error; the object is skipped unless
+      on_error: called with each object that cannot be read or imported, and the error; the object
+      is skipped unless
         this raises.
       progress: called with the number of finished meshes.
     """
     sources = {i: one.source for i, one in enumerate(found) if one.source}
     indices, objects = list(sources), dict[int, GraspObject]()
-    for done, (n, obj) in enumerate(import_sources(list(sources.values()), options) if sources else (), 1):
+    for done, (n, obj) in enumerate(
+        import_sources(list(sources.values()), options) if sources else (), 1
+    ):
         if isinstance(obj, CongraspError):
             on_error(found[indices[n]], obj)
             continue
@@ -155,21 +170,29 @@ def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> G
 
 
 def located(text: str, folder: str = "objects") -> pathlib.Path:
-    """The path that a user means for `objects_at`: a file, a folder, FAMILY:SEED, or the file of a name in `folder`.
+    """The path that a user means for `objects_at`: a file, a folder, FAMILY:SEED, or the file of a
+    name in `folder`.
 
     Raises:
-      CongraspError: there is no such object, or both a path here and an object of the folder have the name.
+      CongraspError: there is no such object, or both a path here and an object of the folder have
+      the name.
     """
     path, stored = pathlib.Path(text), pathlib.Path(folder) / f"{text}{store.SUFFIX}"
     is_name = path.name == text and stored.is_file()
     if is_name and (_holds_objects(path) if path.is_dir() else path.exists()):
         raise CongraspError(
-            f"'{text}' is a {'folder' if path.is_dir() else 'file'} here, and an object in {folder}.",
+            f"'{text}' is a {'folder' if path.is_dir() else 'file'} here, and an object in "
+            f"{folder}.",
             f"Pass ./{text} or {stored}.",
         )
     if is_name:
         return stored
-    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.exists() or _generated(path):
+    if (
+        path.suffix == store.SUFFIX
+        or path.suffix.lower() in SUFFIXES
+        or path.exists()
+        or _generated(path)
+    ):
         return path
     raise CongraspError(
         f"There is no object '{text}' in {folder}, and no file or folder of that name.",
@@ -195,7 +218,8 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
 
 
 def _generated(path: pathlib.Path) -> list[ObjectAt]:
-    """The objects of the generator named by FAMILY:SEED or FAMILY:FIRST-LAST; empty for any other text.
+    """The objects of the generator named by FAMILY:SEED or FAMILY:FIRST-LAST; empty for any other
+    text.
 
     Raises:
       CongraspError: there is no such family, or the last seed comes before the first.
@@ -218,12 +242,13 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     """Finds the objects at a path.
 
     * A mesh file (STL, OBJ, PLY, GLB) is one object.
-    * A folder with `graspable.*` and `non_graspable.*` (or `top*` and `bottom*`) is one object of two parts.
-    * A folder with `contact*` files is one object that is already cut into convex pieces. Its other meshes show it:
-      `<name>.stl` the whole, `<name>_<part>.stl` its parts.
+    * A folder with `graspable.*` and `non_graspable.*` (or `top*` and `bottom*`) is one object of
+      two parts.
+    * A folder with `contact*` files is one object that is already cut into convex pieces. Its other
+      meshes show it: `<name>.stl` the whole, `<name>_<part>.stl` its parts.
     * A folder with `<name>.*` and at least two `<name>_<part>.*` is one object with labelled parts.
-    * In any other folder every mesh is an object; a folder without meshes stands for its subfolders. Names that repeat
-      have numbers.
+    * In any other folder every mesh is an object; a folder without meshes stands for its
+      subfolders. Names that repeat have numbers.
 
     Raises:
       CongraspError: there is nothing to import.
@@ -235,10 +260,17 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
         raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
     meshes = _meshes_in(path)
     if not meshes:
-        found = [source for folder in sorted(path.iterdir()) if folder.is_dir() for source in _nested(folder)]
+        found = [
+            source
+            for folder in sorted(path.iterdir())
+            if folder.is_dir()
+            for source in _nested(folder)
+        ]
         if not found:
             files = (file for depth in ("*/*/*", "*/*/*/*") for file in sorted(path.glob(depth)))
-            if deeper := next((file for file in files if _shows(file.relative_to(path)) and file.is_file()), None):
+            if deeper := next(
+                (file for file in files if _shows(file.relative_to(path)) and file.is_file()), None
+            ):
                 fault = f"The folder {path} holds meshes deeper inside alone, such as {deeper}."
                 raise CongraspError(fault, "Name the folders in which they are.")
             raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", CONVERT)
@@ -249,7 +281,9 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
 def distinct(sources: Sequence[Source]) -> list[Source]:
     """The sources with distinct names."""
     names = distinct_names(source.name for source in sources)
-    return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
+    return [
+        dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)
+    ]
 
 
 def _meshes_in(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -259,7 +293,9 @@ def _meshes_in(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def _shows(path: pathlib.Path) -> bool:
     """True for a mesh's path without hidden parts."""
-    return path.suffix.lower() in SUFFIXES and not any(part.startswith((".", "__MACOSX")) for part in path.parts)
+    return path.suffix.lower() in SUFFIXES and not any(
+        part.startswith((".", "__MACOSX")) for part in path.parts
+    )
 
 
 def _nested(folder: pathlib.Path) -> list[Source]:
@@ -276,16 +312,23 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
         return [Source(name, folder, two, (), two)]
     pieces = tuple(MeshFile(file, "piece") for file in meshes if file.stem.startswith("contact"))
     others = [file for file in meshes if not file.stem.startswith("contact")]
-    main = next((file for file in others if all(o == file or _names_part(file, o) for o in others)), None)
+    main = next(
+        (file for file in others if all(o == file or _names_part(file, o) for o in others)), None
+    )
     if not pieces and (main is None or len(others) == 2):
         return list(map(_single, others))
     if others and main is None:
         raise CongraspError(
-            f"The folder {folder} has contact pieces, but it is not clear which mesh shows the whole object.",
+            f"The folder {folder} has contact pieces, but it is not clear which mesh shows the "
+            f"whole object.",
             f"Name it {name}{others[0].suffix} and its parts {name}_<part>{others[0].suffix}.",
         )
     visuals = (MeshFile(main, "visual"),) if main else ()
-    parts = tuple(_part(file, file.stem[len(main.stem) :].strip("_- ")) for file in others if main and file != main)
+    parts = tuple(
+        _part(file, file.stem[len(main.stem) :].strip("_- "))
+        for file in others
+        if main and file != main
+    )
     return [Source(name, folder, visuals, pieces, parts if len(parts) > 1 else ())]
 
 
@@ -305,7 +348,9 @@ def _part(file: pathlib.Path, part: str) -> MeshFile:
 
 
 def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
-    """The graspable file and, if there is one, the non-graspable one; empty without a graspable file."""
+    """The graspable file and, if there is one, the non-graspable one; empty without a graspable
+    file.
+    """
     found: dict[bool, pathlib.Path] = {}
     for file in meshes:
         stem = file.stem.lower()
@@ -318,4 +363,6 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
     if False in found and np.allclose(read_mesh(found[False]).bounds.mean(0), _NO_PART, atol=0.01):
         del found[False]
     names = {True: "graspable", False: "non-graspable"}
-    return tuple(MeshFile(found[key], "part", names[key], key) for key in (True, False) if key in found)
+    return tuple(
+        MeshFile(found[key], "part", names[key], key) for key in (True, False) if key in found
+    )

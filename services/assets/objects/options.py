@@ -1,4 +1,6 @@
-"""Options for converting meshes to objects, units and sizes, apart from their use: the command line starts fast."""
+"""Options for converting meshes to objects, units and sizes, apart from their use: the command line
+starts fast.
+"""
 
 import dataclasses
 import pathlib
@@ -40,47 +42,61 @@ _COMMON = (
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """Options for converting meshes to objects; the string under a field is its help on the command line."""
+    """Options for converting meshes to objects; the string under a field is its help on the command
+    line.
+    """
 
     unit: Unit = "auto"
-    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise; guess
-    then takes the unit that fits, if only one does."""
+    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks
+    otherwise; guess then takes the unit that fits, if only one does."""
     scale: float = 1.0
     """Factor on the size, after the unit."""
     material: str = ""
-    """Material for the mass: aluminium, cardboard, ceramic, cork, glass, paper, plastic, rubber, steel or wood; or
-    PART=NAME for parts, such as head=steel,handle=wood. Objects too thick for their material are hollow."""
+    """Material for the mass: aluminium, cardboard, ceramic, cork, glass, paper, plastic, rubber,
+    steel or wood; or PART=NAME for parts, such as head=steel,handle=wood. Objects too thick for
+    their material are hollow."""
     density: float | None = None
-    """Density in kg/m^3, instead of a material. Without both, the mass is 4 kg per m^2 of surface, within 500 to 2500
-    kg/m^3, and at most 0.5 kg."""
+    """Density in kg/m^3, instead of a material. Without both, the mass is 4 kg per m^2 of surface,
+    within 500 to 2500 kg/m^3, and at most 0.5 kg."""
     mass: float | None = None
     """Mass in kg; a material or a density then only distributes it."""
     time_limit: float = 60.0
     """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
     """Largest number of convex pieces of an object; more are merged."""
-    up: Up = dataclasses.field(default="auto", repr=False)  # and so not in the seed of surface points
-    """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes, and z for others."""
+    # And so not in the seed of surface points
+    up: Up = dataclasses.field(default="auto", repr=False)
+    """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes,
+    and z for others.
+    """
     cache_dir: str = ""
     """Folder that caches finished imports; the user's cache folder if empty."""
 
 
 def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive or too large, and for both a material and a density.
+    """Raises a CongraspError for numbers that are not positive or too large, and for both a
+    material and a density.
 
     A cache that cannot be written is logged.
     """
     for name, most in _MOST.items():
         value = getattr(options, name)
         if value is not None and not 0 < value <= float(most.partition(" ")[0]):
-            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"It must be positive, and at most {most}.")
+            raise CongraspError(
+                f"--{name.replace('_', '-')} is {value}.",
+                f"It must be positive, and at most {most}.",
+            )
     if options.material and options.density is not None:
-        raise CongraspError("--material and --density both say how dense it is.", "Leave one of them out.")
+        raise CongraspError(
+            "--material and --density both say how dense it is.", "Leave one of them out."
+        )
     if options.cache_dir:
         can_cache(pathlib.Path(options.cache_dir), "--cache-dir")
 
 
-def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: float, notes: list[str]) -> float:
+def metres_per_unit(
+    path: object, sides: tuple[float, ...], unit: Unit, scale: float, notes: list[str]
+) -> float:
     """Metres per unit of a file, with the scale.
 
     Args:
@@ -91,28 +107,40 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
       notes: a guess of the unit is appended.
 
     Raises:
-      CongraspError: no hand can grasp an object of that size; the remedy is the unit that would fit.
+      CongraspError: no hand can grasp an object of that size; the remedy is the unit that would
+      fit.
     """
     taken: str = "m" if unit in ("auto", "guess") else unit
     longest = max(sides) * scale
     if not longest:
-        raise CongraspError(f"{path} is a point: all of its corners coincide.", "Check the scales of its nodes.")
+        raise CongraspError(
+            f"{path} is a point: all of its corners coincide.", "Check the scales of its nodes."
+        )
     low, high = _PLAUSIBLE if unit in ("auto", "guess") else _POSSIBLE
     if not low <= longest * METRES[taken] <= high:
         others = [other for other in ("mm", "cm", "in", "m") if other != taken]
         fitting = [other for other in others if _LIKELY[0] <= longest * METRES[other] <= _LIKELY[1]]
         size = length(longest * METRES[taken])
         if unit != "guess" or len(fitting) != 1:
-            options = [f"{UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})" for u in fitting]
+            options = [
+                f"{UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})"
+                for u in fitting
+            ]
             fault = "large" if longest * METRES[taken] > high else "small"
-            remedy = f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
+            remedy = (
+                f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
+            )
             if options:
                 where = "options of 'objects import' and 'grasp'"
                 remedy = f"If they are {'; if '.join(options)}; or set --scale ({where})."
             elif fault == "large":
-                remedy = f"If the file also shows a table or other things, delete them there. {remedy}"
+                remedy = (
+                    f"If the file also shows a table or other things, delete them there. {remedy}"
+                )
             raise CongraspError(
-                f"{path} is {size} long if its numbers are {UNIT_NAMES[taken]}: too {fault} for a hand.", remedy
+                f"{path} is {size} long if its numbers are {UNIT_NAMES[taken]}: too {fault} for a "
+                f"hand.",
+                remedy,
             )
         taken = fitting[0]
         notes.append(
@@ -122,13 +150,15 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
     factor = METRES[taken] * scale
     if min(sides) * factor < _THINNEST:
         raise CongraspError(
-            f"{path} is flat: it is {length(min(sides) * factor)} thick.", "Give it a thickness in a modelling program."
+            f"{path} is flat: it is {length(min(sides) * factor)} thick.",
+            "Give it a thickness in a modelling program.",
         )
     return factor
 
 
 def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
-    """The unit in which a mesh with these sides is an object for a hand; empty unless exactly one is likely.
+    """The unit in which a mesh with these sides is an object for a hand; empty unless exactly one
+    is likely.
 
     Raises:
       CongraspError: there is no such unit.
@@ -136,19 +166,27 @@ def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
     longest = max(sides)
     if _PLAUSIBLE[0] <= longest <= _PLAUSIBLE[1]:
         return "m"
-    fitting = [unit for unit, factor in METRES.items() if _LIKELY[0] <= longest * factor <= _LIKELY[1]]
+    fitting = [
+        unit for unit, factor in METRES.items() if _LIKELY[0] <= longest * factor <= _LIKELY[1]
+    ]
     if not fitting and not any(possible for _, possible in sizes_by_unit(sides).values()):
         raise CongraspError(
-            f"{path} is {longest:.4g} units long: in none of {', '.join(METRES)} is that an object for a hand.",
+            f"{path} is {longest:.4g} units long: in none of {', '.join(METRES)} is that an object "
+            f"for a hand.",
             "Scale it in a modelling program.",
         )
     return fitting[0] if len(fitting) == 1 else ""
 
 
 def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, bool]]:
-    """For each possible unit of a mesh with these sides: its size as text, and True if a hand could grasp it."""
+    """For each possible unit of a mesh with these sides: its size as text, and True if a hand could
+    grasp it.
+    """
     return {
-        unit: (_size([side * factor for side in sides]), _POSSIBLE[0] <= max(sides) * factor <= _POSSIBLE[1])
+        unit: (
+            _size([side * factor for side in sides]),
+            _POSSIBLE[0] <= max(sides) * factor <= _POSSIBLE[1],
+        )
         for unit, factor in METRES.items()
     }
 

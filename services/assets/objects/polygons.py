@@ -2,19 +2,27 @@
 
 import numpy as np
 
-_CORNERS, _CUT = 64, 20_000  # most corners of a dented polygon that is cut, and of all that have more than four
+# Most corners of a dented polygon that is cut, and of all that have more than four
+_CORNERS, _CUT = (
+    64,
+    20_000,
+)
 _PART = 4096  # polygons at a time, whose corners stay in the processor's cache
 _DENT = 0.01  # sine of the least turn of a corner against the others
 
 
 def alike(counts: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """The numbers of corners from three on, ascending, each with the places (m,) of the faces that have as many."""
+    """The numbers of corners from three on, ascending, each with the places (m,) of the faces that
+    have as many.
+    """
     order = np.argsort(counts, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(counts[order])) + 1)
     return [(int(counts[some[0]]), some) for some in groups if counts[some[0]] > 2]
 
 
-def cut_dented(points: np.ndarray, groups: list[np.ndarray], notes: list[str]) -> list[dict[int, list[list[int]]]]:
+def cut_dented(
+    points: np.ndarray, groups: list[np.ndarray], notes: list[str]
+) -> list[dict[int, list[list[int]]]]:
     """Cuts the polygons that a fan from their first corner would not cut.
 
     Args:
@@ -23,12 +31,15 @@ def cut_dented(points: np.ndarray, groups: list[np.ndarray], notes: list[str]) -
       notes: the number of those that could not be cut is appended.
 
     Returns:
-      Triangles of the dented polygons of each group, by their row; each has the places of three corners.
+      Triangles of the dented polygons of each group, by their row; each has the places of three
+      corners.
     """
     cut, budget, uncut = list[dict[int, list[list[int]]]](), _CUT, 0
     for group in groups:
         count, found = group.shape[1], dict[int, list[list[int]]]()
-        turns = np.concatenate([_turns(points[part]) for part in np.array_split(group, len(group) // _PART + 1)])
+        turns = np.concatenate(
+            [_turns(points[part]) for part in np.array_split(group, len(group) // _PART + 1)]
+        )
         for k in np.flatnonzero((turns < -_DENT).any(1)).tolist():
             triangles: list[list[int]] = []
             if count == 4:
@@ -43,7 +54,10 @@ def cut_dented(points: np.ndarray, groups: list[np.ndarray], notes: list[str]) -
                 found[k] = triangles
         cut.append(found)
     if uncut:
-        notes.append(f"{uncut} of its dented polygons could not be cut and may be filled (export it as triangles)")
+        notes.append(
+            f"{uncut} of its dented polygons could not be cut and may be filled (export it as "
+            f"triangles)"
+        )
     return cut
 
 

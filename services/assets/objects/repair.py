@@ -23,8 +23,12 @@ _NEAR = 0.01  # of the size: how far they may
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
-def without_gaps(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
-    """A mesh (V, 3), (F, 3) without vertices that are not finite numbers; None if too much of it would be missing."""
+def without_gaps(
+    vertices: np.ndarray, faces: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """A mesh (V, 3), (F, 3) without vertices that are not finite numbers; None if too much of it
+    would be missing.
+    """
     good = np.isfinite(vertices).all(-1)
     if good.all():
         return vertices, faces
@@ -32,29 +36,41 @@ def without_gaps(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> t
     if whole.mean() < 1 - _FEW:
         return None
     bad = int((~good).sum())
-    notes.append(f"{bad} of its points {'is' if bad == 1 else 'are'} not a number and {_was(bad)} left out")
+    notes.append(
+        f"{bad} of its points {'is' if bad == 1 else 'are'} not a number and {_was(bad)} left out"
+    )
     return np.where(good[:, None], vertices, 0.0), faces[whole]
 
 
-def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+def reduced(
+    vertices: np.ndarray, faces: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
     """A mesh of more than `_REDUCED` triangles with fewer of them, and with merged vertices."""
     if len(faces) <= _REDUCED:
         return vertices, faces
     before = len(faces)
     # Equal coordinates have equal bits, which sort much faster than rows of numbers.
     bits = (np.ascontiguousarray(vertices, np.float32) + 0.0).view(np.uint32).astype(np.uint64)
-    keys = (bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)) ^ (bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F))
+    keys = (bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)) ^ (
+        bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F)
+    )
     keys ^= (bits[:, 2] * np.uint64(0x165667B19E3779F9)) >> np.uint64(7)
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
     vertices, faces = vertices[first], merged.reshape(-1)[faces]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    proper = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
     small = with_few_faces(trimesh.Trimesh(vertices, faces[proper], process=False))
-    notes.append(f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the rest")
+    notes.append(
+        f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the "
+        f"rest"
+    )
     return np.asarray(small.vertices), np.asarray(small.faces)
 
 
 def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh.Trimesh:
-    """A mesh (V, 3), (F, 3) with merged vertices and each proper triangle once; unmerged if only that leaves it closed.
+    """A mesh (V, 3), (F, 3) with merged vertices and each proper triangle once; unmerged if only
+    that leaves it closed.
 
     The latter are bodies that touch along an edge.
     """
@@ -70,11 +86,17 @@ def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh
 
 def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with at most `MAX_FACES` triangles."""
-    return mesh if len(mesh.faces) <= MAX_FACES else mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+    return (
+        mesh
+        if len(mesh.faces) <= MAX_FACES
+        else mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+    )
 
 
 def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """The largest of several bodies that lie apart from one another; parts that lie close together are one body."""
+    """The largest of several bodies that lie apart from one another; parts that lie close together
+    are one body.
+    """
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     if (count := labels.max() + 1) == 1:
         return mesh
@@ -95,7 +117,8 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     share = float(mesh.area_faces[kept].sum() / mesh.area)
     others = len(np.unique(body)) - 1
     notes.append(
-        f"it holds {others + 1} separate bodies; the largest was taken ({share:.0%} of the surface): "
+        f"it holds {others + 1} separate bodies; the largest was taken ({share:.0%} of the "
+        f"surface): "
         "to use another one, save it as a file of its own"
     )
     used, faces = np.unique(np.asarray(mesh.faces)[kept], return_inverse=True)
@@ -105,7 +128,8 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> trimesh.Trimesh:
     """A scan longer than `LONGEST` without its table: a flat body, the longest and wide by far.
 
-    The rest, without debris, must be as long as `_SMALLEST` and lie on one side of the table; else the scan is kept.
+    The rest, without debris, must be as long as `_SMALLEST` and lie on one side of the table; else
+    the scan is kept.
 
     Args:
       mesh: the scan, in any unit.
@@ -116,7 +140,10 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
         return mesh
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     low, high = (
-        reduce.reduceat(mesh.vertices[order := np.argsort(labels, kind="stable")], np.unique(labels[order], True)[1])
+        reduce.reduceat(
+            mesh.vertices[order := np.argsort(labels, kind="stable")],
+            np.unique(labels[order], True)[1],
+        )
         for reduce in (np.minimum, np.maximum)
     )
     is_table = labels == np.linalg.norm(high - low, axis=-1).argmax()
@@ -128,7 +155,9 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
     rest = largest_body(rest, said)
     table = mesh.vertices[is_table]
     axes = np.linalg.svd(table - table.mean(0), full_matrices=False)[2]
-    (low, high), (least, most) = (((p @ axes.T).min(0), (p @ axes.T).max(0)) for p in (table, rest.vertices))
+    (low, high), (least, most) = (
+        ((p @ axes.T).min(0), (p @ axes.T).max(0)) for p in (table, rest.vertices)
+    )
     size, wide = high - low, float((most - least)[:2].max())
     flat = size[2] < _FLAT * size[1] and wide < size[1] / 2
     within = (low <= least)[:2].all() and (most <= high)[:2].all()
@@ -136,12 +165,17 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
     beside = least[2] > middle or most[2] < middle
     if not (flat and within and beside and rest.extents.max() * metres >= _SMALLEST):
         return mesh
-    notes += [f"a flat body {size[1] / wide:.1f} times as wide as the rest was left out: a table", *said]
+    notes += [
+        f"a flat body {size[1] / wide:.1f} times as wide as the rest was left out: a table",
+        *said,
+    ]
     return rest
 
 
 def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Vertices (V, 3) and faces (F, 3) of each body of a closed mesh, with the hollows inside of it."""
+    """Vertices (V, 3) and faces (F, 3) of each body of a closed mesh, with the hollows inside of
+    it.
+    """
     labels = connected_component_labels(faces_to_edges(faces), len(vertices))[faces[:, 0]]
     shells = [faces[labels == i] for i in np.unique(labels)]
     solid = [shell for shell in shells if np.linalg.det(vertices[shell]).sum() > 0]
@@ -150,7 +184,11 @@ def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np
         if np.linalg.det(vertices[shell]).sum() > 0:
             continue
         corners = vertices[shell].reshape(-1, 3)
-        around = [i for i, (low, high) in enumerate(boxes) if (low <= corners).all() and (corners <= high).all()]
+        around = [
+            i
+            for i, (low, high) in enumerate(boxes)
+            if (low <= corners).all() and (corners <= high).all()
+        ]
         if around:
             i = min(around, key=lambda i: float(np.ptp(boxes[i], axis=0).prod()))
             solid[i] = np.concatenate([solid[i], shell])
@@ -159,7 +197,8 @@ def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np
 
 
 def encloses(mesh: trimesh.Trimesh) -> bool:
-    """True if a mesh encloses a volume: its triangles pass each edge as often forwards as backwards.
+    """True if a mesh encloses a volume: its triangles pass each edge as often forwards as
+    backwards.
 
     Bodies of it may touch along edges, or intersect.
     """
@@ -177,8 +216,8 @@ def _codes(edges: np.ndarray) -> np.ndarray:
 def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """The mesh with each triangle once.
 
-    Of triangles that coincide and face one another, both are left out if the mesh is closed without them (bodies that
-    touch); otherwise one remains (a sheet with two sides).
+    Of triangles that coincide and face one another, both are left out if the mesh is closed without
+    them (bodies that touch); otherwise one remains (a sheet with two sides).
     """
     faces = np.asarray(mesh.faces)
     corners, group = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
@@ -201,7 +240,11 @@ def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 def _even(faces: np.ndarray) -> np.ndarray:
     """(F,) bool: triangles (F, 3) whose corners are an even permutation of their order."""
-    return ((faces[:, 0] < faces[:, 1]).astype(int) + (faces[:, 1] < faces[:, 2]) + (faces[:, 2] < faces[:, 0])) == 2
+    return (
+        (faces[:, 0] < faces[:, 1]).astype(int)
+        + (faces[:, 1] < faces[:, 2])
+        + (faces[:, 2] < faces[:, 0])
+    ) == 2
 
 
 def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
@@ -211,11 +254,16 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         filled = _filled(mesh, holes)
         added = filled.area - mesh.area
         if filled.is_watertight and added < _FEW * mesh.area:
-            notes.append(f"{len(holes)} hole{'s' if len(holes) > 1 else ''} in its surface {_was(len(holes))} closed")
+            notes.append(
+                f"{len(holes)} hole{'s' if len(holes) > 1 else ''} in its surface "
+                f"{_was(len(holes))} closed"
+            )
             mesh = filled
     if not mesh.is_watertight and (trimmed := _without_fins(mesh)) is not None:
         count = len(mesh.faces) - len(trimmed.faces)
-        notes.append(f"{count} of its triangles stood out from its surface and {_was(count)} left out")
+        notes.append(
+            f"{count} of its triangles stood out from its surface and {_was(count)} left out"
+        )
         mesh = trimmed
     if mesh.is_watertight and not mesh.is_winding_consistent:
         outwards = _wound_alike(mesh)
@@ -238,7 +286,9 @@ def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
     """
     faces, removed = np.asarray(mesh.faces), list[np.ndarray]()
     for _ in range(_FINS):
-        _, group, counts = np.unique(_codes(faces_to_edges(faces)), return_inverse=True, return_counts=True)
+        _, group, counts = np.unique(
+            _codes(faces_to_edges(faces)), return_inverse=True, return_counts=True
+        )
         free = (counts[group.reshape(-1)] == 1).reshape(-1, 3).any(1)
         if not free.any():
             rest = trimesh.Trimesh(mesh.vertices, faces, process=False)
@@ -247,9 +297,14 @@ def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
                 return None
             corners = mesh.vertices[np.concatenate(removed)]
             points = np.concatenate(
-                [corners, (corners + np.roll(corners, 1, 1)) / 2, corners.mean(1, keepdims=True)], axis=1
+                [corners, (corners + np.roll(corners, 1, 1)) / 2, corners.mean(1, keepdims=True)],
+                axis=1,
             )
-            return rest if closest_point(rest, points.reshape(-1, 3))[1].max() < _NEAR * mesh.scale else None
+            return (
+                rest
+                if closest_point(rest, points.reshape(-1, 3))[1].max() < _NEAR * mesh.scale
+                else None
+            )
         removed.append(faces[free])
         faces = faces[~free]
     return None
@@ -258,8 +313,8 @@ def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
 def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """A closed mesh without the walls of hollows that no finger enters, whose openings are closed.
 
-    A hollow is where a ball as wide as `OPENING` fits that cannot get out; it ends where one from outside gets to. The
-    mesh is returned unchanged if its openings cannot be closed.
+    A hollow is where a ball as wide as `OPENING` fits that cannot get out; it ends where one from
+    outside gets to. The mesh is returned unchanged if its openings cannot be closed.
     """
     cubes = voxels(np.asarray(mesh.triangles), OPENING)
     spaces, count = label(distance_transform_edt(~cubes.inside, cubes.spacing) > OPENING / 2)
@@ -269,18 +324,26 @@ def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     entered = distance_transform_edt(~outer, cubes.spacing) < OPENING / 2 + cubes.spacing
     hollow = binary_propagation((spaces > 0) & ~outer, mask=~cubes.inside & ~entered)
     centers, normals = np.asarray(mesh.triangles_center), np.asarray(mesh.face_normals)
-    inner = np.any([hollow[cubes.at(centers + step * cubes.spacing * normals)] for step in (1.0, 1.5, 2.0)], axis=0)
+    inner = np.any(
+        [hollow[cubes.at(centers + step * cubes.spacing * normals)] for step in (1.0, 1.5, 2.0)],
+        axis=0,
+    )
     rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~inner], process=False)
     filled = _filled(rest, holes) if (holes := _loops(rest)) else rest
     volume = float(hollow.sum()) * cubes.spacing**3
     if not encloses(filled) or not 0.8 < (filled.volume - mesh.volume) / volume < 1.2:
         return mesh
-    notes.append(f"its hollow of {1e6 * volume:.0f} cm^3, which no finger enters, is filled in its collision shape")
+    notes.append(
+        f"its hollow of {1e6 * volume:.0f} cm^3, which no finger enters, is filled in its "
+        f"collision shape"
+    )
     return filled
 
 
 def _loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
-    """Vertices around every hole, in the order of the triangles' edges; none where the rim has an end."""
+    """Vertices around every hole, in the order of the triangles' edges; none where the rim has an
+    end.
+    """
     edges = np.asarray(mesh.edges)
     size = len(mesh.vertices)
     forward, backward = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
@@ -325,13 +388,16 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     common = np.asarray(mesh.face_adjacency_edges)
 
     def along(side: int) -> np.ndarray:
-        """(n,) bool, True for triangles that run along the common edge from its first to its second vertex."""
+        """(n,) bool, True for triangles that run along the common edge from its first to its second
+        vertex.
+        """
         own = faces[pairs[:, side]]
         place = (own == common[:, :1]).argmax(1)
         return own[np.arange(len(own)), (place + 1) % 3] == common[:, 1]
 
     differ = along(0) == along(1)
-    # Two copies of every triangle, unchanged and turned: neighbours that run alike join the other's opposite copy.
+    # Two copies of every triangle, unchanged and turned: neighbours that run alike join the other's
+    # opposite copy.
     count = len(faces)
     first = np.concatenate([pairs[:, 0], pairs[:, 0] + count])
     second = np.concatenate([pairs[:, 1] + count * differ, pairs[:, 1] + count * ~differ])

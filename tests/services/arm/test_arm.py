@@ -1,4 +1,6 @@
-"""A hand on a made-up arm of seven joints: poses by forward kinematics come back, limits hold, refusals have names."""
+"""A hand on a made-up arm of seven joints: poses by forward kinematics come back, limits hold,
+refusals have names.
+"""
 
 import csv
 import json
@@ -26,8 +28,15 @@ from congrasp.services.export.motion_file import load_motion, pick_motion, robot
 from congrasp.services.grasp.files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
 from tests.services.conftest import quick_imports
 
-LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),
-         ("0 1 0", 0.0, 120), ("0 0 1", 0.1, 170)]  # fmt: skip
+LINKS = [
+    ("0 0 1", 0.3, 170),
+    ("0 1 0", 0.0, 120),
+    ("0 0 1", 0.4, 170),
+    (("0 1 0"), 0.0, 140),
+    ("0 0 1", 0.4, 170),
+    ("0 1 0", 0.0, 120),
+    ("0 0 1", 0.1, 170),
+]
 """Axis of each joint, length of its link (m) and range to either side (degrees)."""
 GRIPPER = """<body name="gripper" pos="0 0 0.1">
   <geom type="box" size=".02 .05 .02"/>
@@ -41,7 +50,11 @@ def mjcf(end: str = '<site name="attachment_site" pos="0 0 0.1"/>') -> str:
     body = end
     for i, (axis, length, degrees) in reversed([*enumerate(LINKS, 1)]):
         above = LINKS[i - 2][1] if i > 1 else 0.0
-        shape = f'<geom type="capsule" size=".04" fromto="0 0 0 0 0 {length}"/>' if length else '<geom size=".05"/>'
+        shape = (
+            f'<geom type="capsule" size=".04" fromto="0 0 0 0 0 {length}"/>'
+            if length
+            else '<geom size=".05"/>'
+        )
         joint = f'<joint name="j{i}" axis="{axis}" range="-{degrees} {degrees}"/>'
         body = f'<body name="link{i}" pos="0 0 {above}">{joint}{shape}{body}</body>'
     motor = '<actuator><motor name="m1" joint="j1"/></actuator>'
@@ -84,7 +97,13 @@ def path_of(robot, q: np.ndarray, at=(3.0, 0.0, 0.1), dt: float = 0.01) -> Path:
     rotation = Rotation.from_quat(turns, scalar_first=True)
     objects = np.tile(at, (count, 1))
     return Path(
-        np.array(position), rotation, np.tile(hand.q_open, (count, 1)), objects, still, np.full(count, -9.0), dt
+        np.array(position),
+        rotation,
+        np.tile(hand.q_open, (count, 1)),
+        objects,
+        still,
+        np.full(count, -9.0),
+        dt,
     )
 
 
@@ -101,8 +120,13 @@ def test_poses_of_forward_kinematics_come_back_within_every_limit(robot):
     again = path_of(robot, track.q)
     off = np.linalg.norm(again.position - path.position, axis=-1)
     turned = (again.rotation.inv() * path.rotation).magnitude()
-    assert off.max() == pytest.approx(track.position_error, abs=1e-9) and off.max() < 2e-3 < POSITION
-    assert turned.max() == pytest.approx(track.rotation_error, abs=1e-6) and turned.max() < np.radians(0.5) < ANGLE
+    assert (
+        off.max() == pytest.approx(track.position_error, abs=1e-9) and off.max() < 2e-3 < POSITION
+    )
+    assert (
+        turned.max() == pytest.approx(track.rotation_error, abs=1e-6)
+        and turned.max() < np.radians(0.5) < ANGLE
+    )
     assert (track.q >= robot.arm.lower).all() and (track.q <= robot.arm.upper).all()
     speed = np.abs(np.diff(track.q, axis=0)) / path.dt
     assert (speed <= SPEED * (1 + 1e-6)).all()
@@ -122,12 +146,18 @@ def test_a_motion_that_is_too_fast_names_the_joint(robot):
 
 
 def test_a_wrist_that_turns_on_and_on_names_the_range(robot):
-    """The last joint alone turns by 400 degrees: no other can do it in its place while the wrist stays upright."""
+    """The last joint alone turns by 400 degrees: no other can do it in its place while the wrist
+    stays upright.
+    """
     q = np.tile(np.radians([0.0, 40, 0, 80, 0, 60, 0]), (401, 1))
     path = path_of(robot, q)
     turns = path.rotation * Rotation.from_rotvec(np.outer(np.radians(np.arange(401)), [0.0, 0, 1]))
-    still = Path(path.position, turns, path.q, path.object_position, path.object_quaternion, path.table, 0.02)
-    with pytest.raises(Infeasible, match=r"the (range|speed|acceleration) of j\d|the reach|collision"):
+    still = Path(
+        path.position, turns, path.q, path.object_position, path.object_quaternion, path.table, 0.02
+    )
+    with pytest.raises(
+        Infeasible, match=r"the (range|speed|acceleration) of j\d|the reach|collision"
+    ):
         follow(robot, still, np.random.default_rng(0))
 
 
@@ -136,11 +166,17 @@ def test_what_the_arm_runs_into_is_named(robot):
     data = mujoco.MjData(robot.model)
     data.qpos[robot.joints] = swing()[0]
     mujoco.mj_kinematics(robot.model, data)
-    inside = path_of(robot, swing(), at=data.body("link3").xpos * [0.0, 0.0, 0.5] + [0.03, 0.02, 0.0])
+    inside = path_of(
+        robot, swing(), at=data.body("link3").xpos * [0.0, 0.0, 0.5] + [0.03, 0.02, 0.0]
+    )
     with pytest.raises(Infeasible, match="collision of link1 with the object"):
         follow(robot, inside, np.random.default_rng(0))
-    above = Path(*(getattr(path, name) for name in ("position", "rotation", "q", "object_position")),
-                 path.object_quaternion, np.full(len(path.q), 2.0), path.dt)  # fmt: skip
+    above = Path(
+        *(getattr(path, name) for name in ("position", "rotation", "q", "object_position")),
+        path.object_quaternion,
+        np.full(len(path.q), 2.0),
+        path.dt,
+    )
     with pytest.raises(Infeasible, match="with the table"):
         follow(robot, above, np.random.default_rng(0))
 
@@ -156,7 +192,9 @@ def test_a_gripper_makes_room_for_the_hand_and_angles_keep_their_units(folder, b
     bodies = {model.body(i).name for i in range(model.nbody)}
     assert not {"gripper", "left", "right"} & bodies and model.nq == 7 + len(hand.joints)
     fingers = [model.joint(f"hand/{joint.name}").id for joint in hand.joints]
-    np.testing.assert_allclose(model.jnt_range[fingers], np.stack([hand.lower, hand.upper], -1), atol=1e-6)
+    np.testing.assert_allclose(
+        model.jnt_range[fingers], np.stack([hand.lower, hand.upper], -1), atol=1e-6
+    )
 
 
 def test_the_fingers_point_away_from_the_flange(robot):
@@ -171,14 +209,19 @@ def test_the_fingers_point_away_from_the_flange(robot):
 def test_limits_of_a_urdf_and_of_the_user(folder):
     limit = '<limit lower="-1" upper="1" effort="9" velocity="1.5"/>'
     links = '<link name="a"/><link name="b"/><link name="c"/>'
-    inertia = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    inertia = (
+        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" '
+        'iyz="0"/></inertial>'
+    )
     joints = "".join(
         f'<joint name="{child}j" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="0 0 1"/>{limit if child == "b" else limit.replace("1.5", "0")}</joint>'
         for parent, child in (("a", "b"), ("b", "c"))
     )
     path = folder / "two.urdf"
-    path.write_text(f'<robot name="two">{links.replace("/>", f">{inertia}</link>")}{joints}</robot>')
+    path.write_text(
+        f'<robot name="two">{links.replace("/>", f">{inertia}</link>")}{joints}</robot>'
+    )
     arm = load_arm(path)
     assert arm.joints == ("bj", "cj")
     np.testing.assert_allclose(arm.speed, [1.5, SPEED])
@@ -200,12 +243,16 @@ def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
     def xml(entry):
         raise Unreachable(entry)
 
-    robot = types.SimpleNamespace(entry_names=("scene.xml", "panda.xml", "panda_nohand.xml"), xml=xml)
+    robot = types.SimpleNamespace(
+        entry_names=("scene.xml", "panda.xml", "panda_nohand.xml"), xml=xml
+    )
     known = types.SimpleNamespace(
         names=lambda: ["franka_panda", "ur5e"], get=lambda name: robot, MenagerieError=Unreachable
     )
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", known)
-    with pytest.raises(CongraspError, match="'franka_panda' of MuJoCo Menagerie could not be downloaded"):
+    with pytest.raises(
+        CongraspError, match="'franka_panda' of MuJoCo Menagerie could not be downloaded"
+    ):
         arm_file("panda")
     with pytest.raises(CongraspError, match="0 robots called 'puma'"):
         arm_file("puma")
@@ -216,12 +263,22 @@ def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
 @pytest.mark.parametrize("option", ["base", "mount"])
 def test_numbers_that_are_none(folder, option):
     with pytest.raises(CongraspError, match=rf'--{option} is \'1 2\'. Write "X Y Z'):
-        ArmPlanner(ArmOptions(arm=str(folder / "seven.xml"), **{option: "1 2"}), get_hand("allegro"))
+        ArmPlanner(
+            ArmOptions(arm=str(folder / "seven.xml"), **{option: "1 2"}), get_hand("allegro")
+        )
 
 
 @pytest.mark.slow
 def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
-    shared = [str(folder / "block.stl"), "--hand", "allegro", "--attempts", "8", "--cache-dir", str(folder)]
+    shared = [
+        str(folder / "block.stl"),
+        "--hand",
+        "allegro",
+        "--attempts",
+        "8",
+        "--cache-dir",
+        str(folder),
+    ]
     shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]
     film = ["--video", "--size", "320x240", "--fps", "2"]
     assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1", *film])() == 0
@@ -260,10 +317,17 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     assert np.asarray(Image.open(tmp_path / "block" / ARM_PICTURE)).std() > 10
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "block" / "grasp.mp4"))
     assert next(frames)["size"] == (320, 240)
-    first, *_, last = (np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in frames)
+    first, *_, last = (
+        np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in frames
+    )
     left = (np.abs(first - np.median(first, (0, 1))).sum(-1) > 60)[:, :160]
-    assert left.any() and np.abs(first - last).max() > 60  # something stands where the base is, and moves
+    # Something stands where the base is, and moves
+    assert left.any() and np.abs(first - last).max() > 60
 
     assert load("grasp")([*shared, "--base", "3 0 0 180", "--no-pictures"])() == 2
     said = capsys.readouterr().err
-    assert "seven can execute none of the" in said and "the reach" in said and "Set another --base" in said
+    assert (
+        "seven can execute none of the" in said
+        and "the reach" in said
+        and "Set another --base" in said
+    )

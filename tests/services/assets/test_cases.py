@@ -1,13 +1,15 @@
-"""Files as strangers have them: each folder of `tests/cases` is run by its command, and says what was wrong.
+"""Files as strangers have them: each folder of `tests/cases` is run by its command, and says what
+was wrong.
 
 `case.json` of a folder:
 
 * `command`, run in a copy of the folder, as after `congrasp`, and `status`, its exit code.
 * `says`, patterns in what it prints, and `never`, patterns that are not in it.
-* `objects`: the objects in `out` by name, with `size_cm`, `mass_g`, most `pieces` and their `volume_cm3`, `parts`, and
-  `outwards` for normals that point away from the middle, where they matter.
-* `files`: further inputs by name: a `text`, a `copy` of another case's, or one `from` `_hand` with `replace`, what
-  comes `before` it, and its `encoding`.
+* `objects`: the objects in `out` by name, with `size_cm`, `mass_g`, most `pieces` and their
+  `volume_cm3`, `parts`, and `outwards` for normals that point away from the middle, where they
+  matter.
+* `files`: further inputs by name: a `text`, a `copy` of another case's, or one `from` `_hand` with
+  `replace`, what comes `before` it, and its `encoding`.
 * `sign` and `remedy`: a row of the page "My file does not load".
 * `full`: shapes are cut as for users, which takes seconds.
 
@@ -42,7 +44,9 @@ NAMES = sorted(folder.parent.name for folder in CASES.glob("*/case.json"))
 
 
 def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
-    """Copies a case to a folder, with the inputs that it makes from others; returns its description."""
+    """Copies a case to a folder, with the inputs that it makes from others; returns its
+    description.
+    """
     shutil.copytree(CASES / name, folder, dirs_exist_ok=True)
     case = json.loads((folder / "case.json").read_text())
     for file, how in case.get("files", {}).items():
@@ -55,7 +59,11 @@ def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
             assert old in text, f"{name}: {old}"
             text = text.replace(old, new)
         if "before" in how:
-            text = how["before"] + text.partition("?>")[2] if text.startswith("<?xml") else how["before"] + text
+            text = (
+                how["before"] + text.partition("?>")[2]
+                if text.startswith("<?xml")
+                else how["before"] + text
+            )
         (folder / file).write_bytes(text.encode(how.get("encoding", "utf-8")))
     return case
 
@@ -94,7 +102,9 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
     for key, facts in case.get("objects", {}).items():
         obj = objects[key]
         if "size_cm" in facts:
-            np.testing.assert_allclose(100 * np.ptp(obj.visual_vertices, axis=0), facts["size_cm"], atol=0.01)
+            np.testing.assert_allclose(
+                100 * np.ptp(obj.visual_vertices, axis=0), facts["size_cm"], atol=0.01
+            )
         if "mass_g" in facts:
             assert 1000 * obj.mass == pytest.approx(facts["mass_g"], rel=0.01)
         if "pieces" in facts:
@@ -130,11 +140,18 @@ def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkey
     nested = '<replicate count="999">' * 3 + geom + "</replicate>" * 3
     (tmp_path / "a.xml").write_text(f"<mujoco><worldbody>{nested}</worldbody></mujoco>")
     for read in (import_hand, load_arm):
-        with pytest.raises(CongraspError, match=r"a\.xml cannot be read: .* the limits are 2 s and 3 GB"):
+        with pytest.raises(
+            CongraspError, match=r"a\.xml cannot be read: .* the limits are 2 s and 3 GB"
+        ):
             read(tmp_path / "a.xml")
-    large = '<mujoco><asset><hfield name="a" nrow="40000" ncol="40000" size="1 1 1 1"/></asset></mujoco>'
+    large = (
+        '<mujoco><asset><hfield name="a" nrow="40000" ncol="40000" size="1 1 1 '
+        '1"/></asset></mujoco>'
+    )
     (tmp_path / "a.xml").write_text(large)
-    with pytest.raises(CongraspError, match=r"a\.xml cannot be read: .* more than 3 GB\. Cut the hand out"):
+    with pytest.raises(
+        CongraspError, match=r"a\.xml cannot be read: .* more than 3 GB\. Cut the hand out"
+    ):
         import_hand(tmp_path / "a.xml")
 
 
@@ -142,5 +159,7 @@ def test_a_pipe_among_the_files_of_a_description_is_not_opened(tmp_path):
     prepared("hand_include", tmp_path)
     (tmp_path / "more.xml").unlink()
     os.mkfifo(tmp_path / "more.xml")
-    with pytest.raises(CongraspError, match=r"'more\.xml' that it names is no regular file\. Name one"):
+    with pytest.raises(
+        CongraspError, match=r"'more\.xml' that it names is no regular file\. Name one"
+    ):
         model_files.propose(tmp_path / "hand.xml")

@@ -1,4 +1,6 @@
-"""Datasets of grasps: the same shards whoever makes them, in whichever order, killed or not; and what they say."""
+"""Datasets of grasps: the same shards whoever makes them, in whichever order, killed or not; and
+what they say.
+"""
 
 import hashlib
 import json
@@ -31,8 +33,29 @@ ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 def arguments(out: pathlib.Path, *more: str) -> list[str]:
     """Four episodes of each of two objects, a shard each, in batches of three and one."""
-    own = ["dataset", "box:2-3", "--out", str(out), "--per-object", "4", "--shard", "1", "--batch", "3"]
-    return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
+    own = [
+        "dataset",
+        "box:2-3",
+        "--out",
+        str(out),
+        "--per-object",
+        "4",
+        "--shard",
+        "1",
+        "--batch",
+        "3",
+    ]
+    return [
+        *own,
+        "--constraints",
+        "heading",
+        "affordance",
+        "--keep",
+        "all",
+        "--physics",
+        "native",
+        *more,
+    ]
 
 
 def made(out: pathlib.Path, *more: str) -> dict:
@@ -43,7 +66,10 @@ def made(out: pathlib.Path, *more: str) -> dict:
 
 def contents(folder: pathlib.Path) -> dict[str, bytes]:
     """Bytes of the shards."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.parquet"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*.parquet"))
+    }
 
 
 def loader() -> Callable:
@@ -91,7 +117,9 @@ def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path,
     process.wait(30)
     killed = contents(tmp_path)
     assert 2 <= len(killed) < 4, "it was killed between its first shard and its last"
-    (tmp_path / "grasps" / f".00001-of-00002.parquet.{process.pid}.tmp").write_bytes(b"half a shard")
+    (tmp_path / "grasps" / f".00001-of-00002.parquet.{process.pid}.tmp").write_bytes(
+        b"half a shard"
+    )
     first = sorted(tmp_path.rglob("*.parquet"))[0]
     changed = first.stat().st_mtime_ns
     made(tmp_path, "--part", "2/2")
@@ -112,14 +140,20 @@ def test_rows_have_requests_and_outcomes(whole, columns):
         assert card["counts"][asked]["held"] == columns["held"][rows].sum()
         assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
         assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
-    assert (columns["held"] >= columns["lifted"]).all() and (columns["lifted"] >= columns["pushed"]).all()
+    assert (columns["held"] >= columns["lifted"]).all() and (
+        columns["lifted"] >= columns["pushed"]
+    ).all()
     assert columns["held"].any()
-    unit = np.linalg.norm(columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1)
+    unit = np.linalg.norm(
+        columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1
+    )
     np.testing.assert_allclose(unit, 1.0, atol=1e-5)
 
 
 def test_poses_are_in_the_frame_of_the_object(columns):
-    """A held object has its surface at the hand: the wrist is as far from it as the hand is long, not metres."""
+    """A held object has its surface at the hand: the wrist is as far from it as the hand is long,
+    not metres.
+    """
     held = columns["held"]
     assert np.linalg.norm(columns["wrist"][held, :3], axis=-1).max() < 0.35
     assert (columns["object_pose"][held, 2] > 0).all()
@@ -133,7 +167,9 @@ def test_objects_are_stored(whole):
     box = generate(2, "box")
     row = table.column("object").to_pylist().index("box_2")
     np.testing.assert_allclose(table.column("mass")[row].as_py(), box.mass, rtol=1e-6)
-    np.testing.assert_allclose(np.reshape(table.column("points")[row].as_py(), (512, 3)), box.points, atol=1e-6)
+    np.testing.assert_allclose(
+        np.reshape(table.column("points")[row].as_py(), (512, 3)), box.points, atol=1e-6
+    )
 
 
 def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
@@ -166,7 +202,9 @@ def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path
     folder = tmp_path / "copy"
     shutil.copytree(whole, folder)
     card, grasps = made(folder), folder / "grasps" / "00001-of-00002.parquet"
-    assert card["sha256"] == {name: hashlib.sha256(data).hexdigest() for name, data in contents(whole).items()}
+    assert card["sha256"] == {
+        name: hashlib.sha256(data).hexdigest() for name, data in contents(whole).items()
+    }
     data = grasps.read_bytes()
     for place in range(0, len(data), len(data) // 16):
         grasps.write_bytes(data[:place] + bytes(200) + data[place + 200 :])

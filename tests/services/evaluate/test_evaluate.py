@@ -1,4 +1,6 @@
-"""Evaluation of an untrained policy: the command from end to end, rows of every kind, and what it refuses."""
+"""Evaluation of an untrained policy: the command from end to end, rows of every kind, and what it
+refuses.
+"""
 
 import dataclasses
 import hashlib
@@ -49,15 +51,21 @@ def policy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def experiment():
-    return Experiment(task.policy(), OBJECTS, episodes=EPISODES, batch=EPISODES, hold=task.TASK.hold_steps)
+    return Experiment(
+        task.policy(), OBJECTS, episodes=EPISODES, batch=EPISODES, hold=task.TASK.hold_steps
+    )
 
 
 def test_references_are_grasps_and_made_once(experiment, monkeypatch):
     policy, told = references.reference_policy(task.policy())[0], []
     arguments = (policy, experiment.task, experiment.scaled, experiment.bank)
-    made = references.make(*arguments, physics="native", progress=lambda *counts: told.append(counts))
+    made = references.make(
+        *arguments, physics="native", progress=lambda *counts: told.append(counts)
+    )
     assert made.grasps[:, 0].sum() > 4  # most of the 8 episodes succeed
-    assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(count for count, _ in told)
+    assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(
+        count for count, _ in told
+    )
     monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
     again = references.make(*arguments, physics="native")
     assert isinstance(again, references.References)
@@ -67,67 +75,131 @@ def test_references_are_grasps_and_made_once(experiment, monkeypatch):
 
 def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
     hold = task.TASK.hold_steps
-    monkeypatch.setattr(plan, "HOLD_SECONDS", hold * task.TASK.control_dt)  # the programs are the experiment's
+    # The programs are the experiment's
+    monkeypatch.setattr(plan, "HOLD_SECONDS", hold * task.TASK.control_dt)
     monkeypatch.setattr(simulation, "two_seconds", lambda task: 0)  # without the stress test, too
     folder, out, samples = tmp_path / "objects", tmp_path / "rows.json", {}
     for obj in OBJECTS:
         Catalogue(folder).add(obj)
     row = Experiment.row
     monkeypatch.setattr(
-        Experiment, "row", lambda self, variation, sample: row(self, variation, samples.setdefault(variation, sample))
+        Experiment,
+        "row",
+        lambda self, variation, sample: row(self, variation, samples.setdefault(variation, sample)),
     )
-    arguments = ["--policy", str(policy), "--objects", str(folder), "--table", "composed", "--by", "object"]
-    assert load("evaluate")([*arguments, "--episodes", "3", "--batch", str(EPISODES), "--json", str(out)])() == 0
+    arguments = [
+        "--policy",
+        str(policy),
+        "--objects",
+        str(folder),
+        "--table",
+        "composed",
+        "--by",
+        "object",
+    ]
+    assert (
+        load("evaluate")(
+            [*arguments, "--episodes", "3", "--batch", str(EPISODES), "--json", str(out)]
+        )()
+        == 0
+    )
     read, printed = json.loads(out.read_text()), capsys.readouterr().out
     names = [(row["constraint"], row["group"]) for row in read["rows"]]
-    assert names == [("pose+trajectory", ""), ("pose+trajectory", "aligned pairs"), ("trajectory+affordance", "")]
-    assert all(row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1 for row in read["rows"])
-    assert read["physics"] == "native" and "grasps of the reference policy of the human hand" in printed
+    assert names == [
+        ("pose+trajectory", ""),
+        ("pose+trajectory", "aligned pairs"),
+        ("trajectory+affordance", ""),
+    ]
+    assert all(
+        row["hand"] == "human" and 0 <= row["held_2s"] <= row["success"] <= 1
+        for row in read["rows"]
+    )
+    assert (
+        read["physics"] == "native"
+        and "grasps of the reference policy of the human hand" in printed
+    )
     assert read["policy"]["sha256"] == hashlib.sha256(policy.read_bytes()).hexdigest()
-    assert read["version"] == importlib.metadata.version("congrasp") and read["exam"] is None and read["machine"]
+    assert (
+        read["version"] == importlib.metadata.version("congrasp")
+        and read["exam"] is None
+        and read["machine"]
+    )
     for row, sample in zip(read["rows"], samples.values(), strict=True):
         assert row["distinct"] <= row["episodes"] and row["success_all"] <= row["success"]
-        assert row["pool"] == 4 and sum(obj["episodes"] for obj in row["objects"]) == row["episodes"] >= 3
+        assert (
+            row["pool"] == 4
+            and sum(obj["episodes"] for obj in row["objects"]) == row["episodes"] >= 3
+        )
         assert {obj["episodes"] for obj in row["objects"]} == {row["episodes"] // row["covered"]}
-        assert all(obj["name"] in printed and obj.keys() >= {"success", "held_2s", "clean"} for obj in row["objects"])
+        assert all(
+            obj["name"] in printed and obj.keys() >= {"success", "held_2s", "clean"}
+            for obj in row["objects"]
+        )
         assert row["paper"] is None  # its composed rows are of captured constraints
-        assert np.all(sample.values["length"] == task.TASK.approach_steps + hold)  # with the table, and without
+        # With the table, and without
+        assert np.all(sample.values["length"] == task.TASK.approach_steps + hold)
         assert sample.link_force.shape == (row["episodes"], hold, 16)
-        assert sample.torque.shape == (row["episodes"], hold, 20) and 0.0 < sample.torque.max() <= 1.0
+        assert (
+            sample.torque.shape == (row["episodes"], hold, 20) and 0.0 < sample.torque.max() <= 1.0
+        )
 
 
 def test_rows_by_the_hand_centre_and_under_loads(experiment):
     light, heavy, center = (
         result.row
-        for result in experiment.run([Load(label="light", mass=(0.1, 0.1)), Load(label="heavy", mass=(2, 2)), Center()])
+        for result in experiment.run(
+            [Load(label="light", mass=(0.1, 0.1)), Load(label="heavy", mass=(2, 2)), Center()]
+        )
     )
-    assert center.group == CENTER_GROUP and center.episodes == EPISODES and center.paper.success == 0.96
-    assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))
+    assert (
+        center.group == CENTER_GROUP
+        and center.episodes == EPISODES
+        and center.paper.success == 0.96
+    )
+    assert (light.group, light.mass_kg, heavy.mass_kg) == (
+        "light",
+        pytest.approx(0.1),
+        pytest.approx(2.0),
+    )
     assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
-    assert center.mass_kg == pytest.approx(np.mean([obj.mass for obj in experiment.scaled])), "its own objects again"
+    assert center.mass_kg == pytest.approx(np.mean([obj.mass for obj in experiment.scaled])), (
+        "its own objects again"
+    )
 
 
 def test_shares_of_the_rules_for_headings(experiment):
     """They add up, and agree with the bank."""
     found, bank = heading_rules(experiment), experiment.bank
-    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0) and 0 <= found.moved <= 1
-    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9 and 0 < found.opposed <= 1
+    assert (
+        found.kept + found.from_below + found.no_room == pytest.approx(1.0)
+        and 0 <= found.moved <= 1
+    )
+    assert (
+        0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9
+        and 0 < found.opposed <= 1
+    )
     kept = sum(
         len(set(np.asarray(bank.heading_index)[n, 0, r]))
         for n in range(len(OBJECTS))
         for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
     )
-    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in experiment.scaled) == pytest.approx(kept)
+    assert found.kept * 256 * sum(
+        len(obj.rest_poses) for obj in experiment.scaled
+    ) == pytest.approx(kept)
 
 
 def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
-    """Equal to the last digit, whatever was simulated before it, and whether every step is recorded."""
+    """Equal to the last digit, whatever was simulated before it, and whether every step is
+    recorded.
+    """
     variations = [Variation("affordance"), Variation()]
     among = experiment.run(variations, keep=True)
     for variation, result in zip(variations, among, strict=True):
         (alone,) = experiment.run([variation])
         for key, column in result.sample.values.items():
-            np.testing.assert_array_equal(alone.sample.values[key], column, err_msg=f"{variation}: {key}")
+            np.testing.assert_array_equal(
+                alone.sample.values[key], column, err_msg=f"{variation}: {key}"
+            )
         assert alone.row.to_json() == result.row.to_json() and not alone.examples(1, 1)
     heading = among[1]
     assert len(heading.held) == heading.sample.values["held"].sum() == EPISODES - len(heading.lost)
@@ -157,7 +229,9 @@ def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, m
 
 def test_rows_of_fingers_and_of_a_force_limit(experiment):
     for result, mask in zip(
-        experiment.run([Variation("fingers"), Variation("force")]), ("mask_fingers", "mask_force_limit"), strict=True
+        experiment.run([Variation("fingers"), Variation("force")]),
+        ("mask_fingers", "mask_force_limit"),
+        strict=True,
     ):
         name, sample, row = result.variation.constraint, result.sample, result.row
         ratio = sample.values[f"{name}_ratio"]
@@ -172,8 +246,12 @@ def test_a_constraint_that_no_object_allows(experiment):
     bank = experiment.bank
     none = bank._replace(has_affordance=np.zeros_like(bank.has_affordance))
     own = dataclasses.replace(experiment, constraints=none)
-    heading, affordance, composed = map(Variation, ("heading", "affordance", "trajectory+affordance"))
-    with pytest.raises(CongraspError, match="None of the 4 objects allows the constraint 'affordance'"):
+    heading, affordance, composed = map(
+        Variation, ("heading", "affordance", "trajectory+affordance")
+    )
+    with pytest.raises(
+        CongraspError, match="None of the 4 objects allows the constraint 'affordance'"
+    ):
         own.run([heading, affordance])
     allowed, errors = own.allowed([heading, affordance])
     assert allowed == [heading] and "'affordance'" in str(errors[0])
@@ -183,7 +261,9 @@ def test_a_constraint_that_no_object_allows(experiment):
         own.plan(composed)
 
 
-@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])
+@pytest.mark.parametrize(
+    "arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]]
+)
 def test_numbers_out_of_range(policy, arguments):
     with pytest.raises(CongraspError, match="must"):
         load("evaluate")(["--policy", str(policy), *arguments])()
@@ -192,7 +272,11 @@ def test_numbers_out_of_range(policy, arguments):
 def test_nominal_mass_and_friction_and_two_seconds():
     assert Experiment(task.policy(), []).steps == plan.two_seconds(task.TASK) == 200
     ranged = dataclasses.replace(
-        task.TASK, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0), gain_range=(0.8, 1.2), sensing=TRACKERS
+        task.TASK,
+        mass_range=(0.8, 1.5),
+        friction_range=(0.6, 1.0),
+        gain_range=(0.8, 1.2),
+        sensing=TRACKERS,
     )
     found = Experiment(dataclasses.replace(task.policy(), task=ranged), []).task
     assert found.mass_range == found.friction_range == found.gain_range == (1.0, 1.0)

@@ -39,7 +39,10 @@ def test_hands_are_those_with_a_pretrained_policy_unless_policies_are_named(save
     everyone = [(hand, "ours", ("single",)) for hand in pretrained_hands()]
     assert who(line_up(["hands"], [], "human")) == everyone and len(everyone) == 3
     named = read_entrants([str(saved("ours")), str(saved("ours", "allegro"))])
-    assert who(line_up(["hands"], named, "human")) == [("human", "ours", ("single",)), ("allegro", "ours", ("single",))]
+    assert who(line_up(["hands"], named, "human")) == [
+        ("human", "ours", ("single",)),
+        ("allegro", "ours", ("single",)),
+    ]
 
 
 def test_a_method_without_a_policy_is_named_and_no_error(saved):
@@ -47,7 +50,11 @@ def test_a_method_without_a_policy_is_named_and_no_error(saved):
     found = line_up(["ablation"], given, "human")
     assert who(found) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
     absent = [(one.hand, one.method, one.reason) for one in found.missing]
-    assert absent == [("human", name, "not trained") for name in ABLATION if name not in ("ours", "no-feedforward")]
+    assert absent == [
+        ("human", name, "not trained")
+        for name in ABLATION
+        if name not in ("ours", "no-feedforward")
+    ]
 
 
 def test_a_student_stands_beside_the_pretrained_policy_of_its_hand(saved):
@@ -93,7 +100,11 @@ def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
 )
 def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
     (tmp_path / "empty").mkdir()
-    names = {"ours": saved("ours"), "other": saved("ours", folder="other"), "empty": tmp_path / "empty"}
+    names = {
+        "ours": saved("ours"),
+        "other": saved("ours", folder="other"),
+        "empty": tmp_path / "empty",
+    }
     with pytest.raises(CongraspError, match=words):
         read_entrants([text.format(**names) for text in texts])
 
@@ -101,26 +112,47 @@ def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
 def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monkeypatch):
     def evaluate_tables(own, names, pools, kept, *, keep):
         assert names == ("single",) and own.episodes == 7 and pools is None and not keep
-        return tables.Found(own, [], [row("heading", 0.9, 0.8, 0.95, method=own.policy.task.method)], [], "")
+        return tables.Found(
+            own, [], [row("heading", 0.9, 0.8, 0.95, method=own.policy.task.method)], [], ""
+        )
 
     monkeypatch.setattr(tables, "evaluate_tables", evaluate_tables)
     monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
     files = [str(saved("ours")), f"no-feedforward={saved('no-feedforward')}"]
-    command = ["--table", "ablation", "--policy", *files, "--episodes", "7", "--json", str(tmp_path / "rows.json")]
+    command = [
+        "--table",
+        "ablation",
+        "--policy",
+        *files,
+        "--episodes",
+        "7",
+        "--json",
+        str(tmp_path / "rows.json"),
+    ]
     assert load("evaluate")(command)() == 0
     printed, read = capsys.readouterr().out, json.loads((tmp_path / "rows.json").read_text())
-    assert "2 policies, on procedural objects (figures)" in printed and printed.count("not trained") == 3
+    assert (
+        "2 policies, on procedural objects (figures)" in printed
+        and printed.count("not trained") == 3
+    )
     assert [one["method"] for one in read["rows"]] == ["ours", "no-feedforward"]
     assert [one["method"] for one in read["policies"]] == ["ours", "no-feedforward"]
     missing = [(one["method"], one["reason"]) for one in read["missing"]]
-    assert missing == [(name, "not trained") for name in ("no-dynamic-center", "single-stage", "two-phase")]
+    assert missing == [
+        (name, "not trained") for name in ("no-dynamic-center", "single-stage", "two-phase")
+    ]
     assert not (tmp_path / "rows.json.parts").exists()
 
 
 def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):
     sets = tables.Captured([], None, "human", "captured")
     monkeypatch.setattr(tables, "captured", lambda folder, split, objects: sets)
-    monkeypatch.setattr("congrasp.services.assets.objects.named.objects_of", lambda *arguments, **options: [])
+    monkeypatch.setattr(
+        "congrasp.services.assets.objects.named.objects_of", lambda *arguments, **options: []
+    )
     command = ["--hand", "allegro", "--objects", str(tmp_path), "--constraints", str(tmp_path)]
-    with pytest.raises(CongraspError, match=r"sets are for the hand 'human', the policy for 'allegro'.*--hand allegro"):
+    with pytest.raises(
+        CongraspError,
+        match=r"sets are for the hand 'human', the policy for 'allegro'.*--hand allegro",
+    ):
         load("evaluate")(command)()

@@ -22,7 +22,11 @@ def conditions():
 
 def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
     asked = []
-    monkeypatch.setattr(procedural, "parallel_map", lambda make, seeds, families: asked.append((list(seeds), families)))
+    monkeypatch.setattr(
+        procedural,
+        "parallel_map",
+        lambda make, seeds, families: asked.append((list(seeds), families)),
+    )
     pools.exam_pool("figures")
     pools.exam_pool("development", 5)
     (figures, families), (development, _) = asked
@@ -42,7 +46,8 @@ def test_episodes_that_begin_alike_are_one(conditions):
     found = identity(twice)
     np.testing.assert_array_equal(found[:64], found[64:])
     assert len(np.unique(found)) == 64
-    # The limit of a force that nothing asks for does not tell episodes apart; one that is asked for does.
+    # The limit of a force that nothing asks for does not tell episodes apart; one that is asked for
+    # does.
     goal, active = conditions.goal, conditions.goal.active["force_limit"]
     other = conditions._replace(goal=goal.replace("force", limit=goal["force"].limit + 1))
     changed = identity(other) != identity(conditions)
@@ -55,13 +60,19 @@ def test_episodes_of_one_reference_are_a_cluster(conditions):
     found = reference(conditions)
     posed = goal.active["pose_finger"] | goal.active["trajectory"]
     plain = ~posed
-    assert len(np.unique(found[plain])) == len(np.unique(index[plain])), "without a reference, objects"
+    assert len(np.unique(found[plain])) == len(np.unique(index[plain])), (
+        "without a reference, objects"
+    )
     moved = conditions._replace(goal=goal.replace("pose", q=goal["pose"].q + 0.1))
-    np.testing.assert_array_equal(reference(moved) != found, goal.active["pose_finger"] | goal.active["pose_wrist"])
+    np.testing.assert_array_equal(
+        reference(moved) != found, goal.active["pose_finger"] | goal.active["pose_wrist"]
+    )
 
 
 TASK = protocol(task.TASK, task.TASK.hold_steps)
-MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory; neither fingers nor a force limit
+# Affordance, fingers of the pose, wrist of the pose, trajectory; neither fingers nor a force
+# limit
+MASKS = {
     "heading": (0, 0, 0, 0),
     "pose": (0, 1, 1, 0),
     "trajectory": (0, 0, 0, 1),
@@ -79,7 +90,8 @@ def bank():
 def _all(bank, plan, seed=0, size=task.BATCH):
     """The conditions of all episodes of a plan."""
     parts = [
-        jax.tree.map(lambda x, n=n: np.asarray(x)[:n], c) for c, n in batches(task.HAND, TASK, bank, plan, seed, size)
+        jax.tree.map(lambda x, n=n: np.asarray(x)[:n], c)
+        for c, n in batches(task.HAND, TASK, bank, plan, seed, size)
     ]
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -96,20 +108,30 @@ def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
     for obj in np.flatnonzero(plan.covered):
         rests = plan.episodes.rests[index == obj]
         of_each = np.unique(rests, return_counts=True)[1]
-        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(task.OBJECTS[obj].rest_poses)
+        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(
+            task.OBJECTS[obj].rest_poses
+        )
     for block, active in zip(blocks(TASK), (*MASKS[name], 0, 0), strict=True):
-        np.testing.assert_array_equal(conditions.goal.active[block], np.full(plan.total, bool(active)))
+        np.testing.assert_array_equal(
+            conditions.goal.active[block], np.full(plan.total, bool(active))
+        )
 
 
 def test_episodes_are_independent_of_other_objects(bank):
-    """Nor on how many there are, or in which batches they are simulated (but for the rounding of another program)."""
+    """Nor on how many there are, or in which batches they are simulated (but for the rounding of
+    another program).
+    """
     fewer = jax.tree.map(lambda x: np.asarray(x)[1:], bank)
     for name in ("affordance", "pose+trajectory"):
         among = plan_row(TASK, bank, task.OBJECTS, name, 30)
         alone = plan_row(TASK, fewer, task.OBJECTS[1:], name, 8)
         whole, part = _all(bank, among), _all(fewer, alone, size=4)
-        for i, (obj, number) in enumerate(zip(alone.episodes.objects, alone.episodes.numbers, strict=True)):
-            (at,) = np.flatnonzero((among.episodes.objects == obj + 1) & (among.episodes.numbers == number))
+        for i, (obj, number) in enumerate(
+            zip(alone.episodes.objects, alone.episodes.numbers, strict=True)
+        ):
+            (at,) = np.flatnonzero(
+                (among.episodes.objects == obj + 1) & (among.episodes.numbers == number)
+            )
             for ours, theirs in zip(
                 jax.tree.leaves((part.goal, part.reset_state.base_position)),
                 jax.tree.leaves((whole.goal, whole.reset_state.base_position)),
@@ -122,7 +144,9 @@ def test_seeds_and_rows_draw_for_themselves(bank):
     heading = plan_row(TASK, bank, task.OBJECTS, "heading", 30)
     drawn = [_all(bank, heading, seed).goal["heading"].position for seed in (0, 1)]
     drawn.append(_all(bank, heading._replace(constraint="affordance")).goal["heading"].position)
-    for other in drawn[1:]:  # of the dozens of headings that an object has, two draws may well be the same
+    for other in drawn[
+        1:
+    ]:  # of the dozens of headings that an object has, two draws may well be the same
         assert (np.abs(drawn[0] - other).max(-1) > 0).mean() > 0.8
 
 
@@ -131,7 +155,10 @@ def test_pairs_are_independent_unless_aligned(bank):
     for name in ("pose+trajectory", f"pose+trajectory{ALIGNED}"):
         plan = plan_row(TASK, bank, task.OBJECTS, name, 60)
         goal = _all(bank, plan).goal
-        q, wrist = (np.asarray(field)[plan.episodes.objects, 0] for field in (bank.pose_q, bank.pose_position))
+        q, wrist = (
+            np.asarray(field)[plan.episodes.objects, 0]
+            for field in (bank.pose_q, bank.pose_position)
+        )
         # Hands that close around nothing are alike: any pose with these fingers may be meant.
         own = np.abs(q - goal["pose"].q[:, None]).max(-1) < 1e-5
         away = np.linalg.norm(wrist - goal["trajectory"].position[:, -1:], axis=-1)
@@ -146,7 +173,9 @@ def test_trajectories_end_nearer_to_the_graspable_region(bank):
     end = conditions.goal["trajectory"].position[:, -1]
     distance = np.linalg.norm(conditions.surface.points - end[:, None], axis=-1)
     avoid = conditions.surface.avoid
-    assert np.all(np.where(avoid, np.inf, distance).min(1) < np.where(avoid, distance, np.inf).min(1))
+    assert np.all(
+        np.where(avoid, np.inf, distance).min(1) < np.where(avoid, distance, np.inf).min(1)
+    )
 
 
 def test_objects_that_allow_nothing_are_counted(bank):

@@ -26,7 +26,10 @@ def policy():
 def test_reference_policies_never_had_poses_or_trajectories():
     for hand in pretrained_hands():
         bundle = bundles.load(reference_file(hand))
-        assert bundle.spec.hand == hand and set(bundle.task.constraints) == {"heading", "affordance"}
+        assert bundle.spec.hand == hand and set(bundle.task.constraints) == {
+            "heading",
+            "affordance",
+        }
         found, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
         assert found.task == bundle.task
 
@@ -46,14 +49,30 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
     bank = bank._replace(rest=np.repeat(np.asarray(bank.rest)[:, :1], bank.rest.shape[1], 1))
     valid = np.asarray(bank.pose_valid)
     good = int(np.flatnonzero(valid[0, 0, 0])[0])
-    low = Poses(*(np.asarray(field)[0, 0, good] for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)))
-    down = [Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0]) for rest in bank.rest[:, 0]]
-    own, *below = (low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down))
-    made = references._filled(policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2])
+    low = Poses(
+        *(
+            np.asarray(field)[0, 0, good]
+            for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)
+        )
+    )
+    down = [
+        Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0])
+        for rest in bank.rest[:, 0]
+    ]
+    own, *below = (
+        low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down)
+    )
+    made = references._filled(
+        policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2]
+    )
     np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
     np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))
     closed = np.asarray(bank.pose_q)[1, 0]
-    assert all(any(np.array_equal(q, other) for other in closed) for q in np.asarray(made.bank.pose_q)[1, 0])
-    assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()  # of those that the table leaves room for
+    assert all(
+        any(np.array_equal(q, other) for other in closed)
+        for q in np.asarray(made.bank.pose_q)[1, 0]
+    )
+    # Of those that the table leaves room for
+    assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()
     for field in ("points", "heading_position", "rest"):
         np.testing.assert_array_equal(getattr(made.bank, field), getattr(bank, field))

@@ -1,4 +1,6 @@
-"""A report is one file that needs nothing beside it, and says where a policy is better or worse than the paper's."""
+"""A report is one file that needs nothing beside it, and says where a policy is better or worse
+than the paper's.
+"""
 
 import base64
 import dataclasses
@@ -54,11 +56,24 @@ def policy():
 def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     save_png(tmp_path / "p.png", np.full((6, 8, 3), 200, np.uint8))
     png = (tmp_path / "p.png").read_bytes()
-    rows = [row("heading", 0.99, 0.975, 0.995), row("pose", 0.9, 0.85, 0.95), row("trajectory", 0.96, 0.93, 0.98)]
+    rows = [
+        row("heading", 0.99, 0.975, 0.995),
+        row("pose", 0.9, 0.85, 0.95),
+        row("trajectory", 0.96, 0.93, 0.98),
+    ]
     out = tmp_path / "report.html"
     commands = Commands("congrasp evaluate --policy <mine>", "", "congrasp plot x")
     sheets = [Picture("heading", png, "2 held, 1 slipped <b>")]
-    write_report(out, policy, "p & q.safetensors", rows, "100 episodes", sheets, [Picture("Learning", png)], commands)
+    write_report(
+        out,
+        policy,
+        "p & q.safetensors",
+        rows,
+        "100 episodes",
+        sheets,
+        [Picture("Learning", png)],
+        commands,
+    )
     found = Reader(text := out.read_text())
     cells = {content: kind for kind, content in found.cells}
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
@@ -69,7 +84,10 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     for ours, paper in (("4.0", "7.8"), ("13.0", "20.0")):
         assert f'<td class="number">{ours} <span class="paper">{paper}</span></td>' in text
     assert "<th>heading, °</th><th>heading, mm</th>" in text
-    assert "300 episodes in simulation. Success is at or above the paper's in 2 of its 3 rows" in html.unescape(text)
+    assert (
+        "300 episodes in simulation. Success is at or above the paper's in 2 of its 3 rows"
+        in html.unescape(text)
+    )
     assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
     assert len(found.sources) == 2 and not found.links
     for source in found.sources:
@@ -81,27 +99,43 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
 def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkeypatch):
     save_png(tmp_path / "check.png", np.full((6, 8, 3), 200, np.uint8))
     write_findings(
-        tmp_path / "check.json", [Finding("palm", "passed", "fine"), Finding("ball", "failed", "falls", "close <it>")]
+        tmp_path / "check.json",
+        [Finding("palm", "passed", "fine"), Finding("ball", "failed", "falls", "close <it>")],
     )
     bundles.save(policy, tmp_path / "policy.safetensors")
     rows, out = [row("heading", 0.99, 0.975, 0.995)], tmp_path / "report.html"
 
     def report_on(own, name, out, *, check, subject, objects, run_dir):
-        assert subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
+        assert (
+            subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
+        )
         write_report(out, own.policy, name, rows, "8 episodes", [], [], Commands("c", ""), check)
         return Found(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
     monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
     monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
-    command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
+    command = [
+        "report",
+        str(tmp_path),
+        "--out",
+        str(out),
+        "--episodes",
+        "8",
+        "--json",
+        str(tmp_path / "rows.json"),
+    ]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
     found = Reader(text := out.read_text())
     cells = {content: kind for kind, content in found.cells}
     assert cells["passed"] == "better" and cells["failed"] == "worse" and "close &lt;it&gt;" in text
     assert len(found.sources) == 1
     written = json.loads((tmp_path / "rows.json").read_text())
-    assert written["content"] == bundles.content_hash((tmp_path / "policy.safetensors").read_bytes())
-    assert [one["constraint"] for one in written["rows"]] == ["heading"] and written["episodes"] == 8
+    assert written["content"] == bundles.content_hash(
+        (tmp_path / "policy.safetensors").read_bytes()
+    )
+    assert [one["constraint"] for one in written["rows"]] == ["heading"] and written[
+        "episodes"
+    ] == 8
     (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
     with pytest.raises(CongraspError, match=r"check\.json holds no self-check"):
         main.run([*command, "--check", str(tmp_path / "check.json")])
@@ -109,7 +143,8 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
 
 @pytest.mark.slow
 def test_the_command_evaluates_draws_and_writes(tmp_path):
-    config = dataclasses.replace(task.CONFIG, task=TaskConfig(constraints=("heading",)))  # a table of one row
+    # A table of one row
+    config = dataclasses.replace(task.CONFIG, task=TaskConfig(constraints=("heading",)))
     bundles.save(untrained(config), tmp_path / "mine.safetensors")
     command = ["report", str(tmp_path / "mine.safetensors"), "--out", str(tmp_path / "report.html")]
     assert main.run([*command, "--episodes", "1", "--pool", "2", "--physics", "native"]) == 0
@@ -135,7 +170,10 @@ def test_causes_are_counted():
 def test_limits_name_what_is_bad_by_the_figures():
     good = row("heading", 0.99, 0.975, 0.995)
     assert limits([good]) == ["No row is below the paper's success, or below 80 %."]
-    worst = [{"name": "can", "episodes": 10, "success": 0.5}, {"name": "box", "episodes": 10, "success": 0.9}]
+    worst = [
+        {"name": "can", "episodes": 10, "success": 0.5},
+        {"name": "box", "episodes": 10, "success": 0.9},
+    ]
     bad = dataclasses.replace(
         row("pose", 0.75, 0.7, 0.8),
         held_2s=0.6,
@@ -156,7 +194,9 @@ def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
     assert "It observes exact poses, velocities and contact forces." in card["limits"]
     assert card["data"][1].endswith("; mass x 1, sliding friction 0.5 to 1.2.")
     trackers = SensingConfig(delay=(0.0, 0.1), dropout=(0.0, 0.3))
-    tracked = dataclasses.replace(ranged, observation="tracked", history=8, gain_range=(0.8, 1.2), sensing=trackers)
+    tracked = dataclasses.replace(
+        ranged, observation="tracked", history=8, gain_range=(0.8, 1.2), sensing=trackers
+    )
     card = model_card(dataclasses.replace(policy, task=tracked), [])
     (observed,) = [text for text in card["limits"] if text.startswith("It observes")]
     assert "last 8 control steps" in observed and "no velocities and no contact forces" in observed
@@ -176,7 +216,9 @@ def test_few_episodes_are_a_warning(tmp_path, policy):
 
 
 def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
-    """What the page's script computes, bones times weights, is the skin, the object and the table of the episode."""
+    """What the page's script computes, bones times weights, is the skin, the object and the table
+    of the episode.
+    """
     recorded = episode(9)
     made = turntable(recorded)
     data = json.loads(made["data"])
@@ -185,7 +227,9 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
         return np.frombuffer(base64.b64decode(data[name]), kind).reshape(-1, *shape)
 
     frames = array("frames", "<f4", data["count"], 3, 4)
-    assert len(frames) == len(range(0, len(recorded.arrays["table"]), round(data["seconds"] / 0.01)))
+    assert len(frames) == len(
+        range(0, len(recorded.arrays["table"]), round(data["seconds"] / 0.01))
+    )
     step, which = round(data["seconds"] / 0.01), 1
     bones, weights = array("bones", "u1", 4), array("weights", "u1", 4) / 255
     points = np.column_stack([array("position", "<f4", 3), np.ones(len(bones))])
@@ -196,9 +240,22 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     solid = moved[bones[:, 0] == data["count"] - 2]
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     corners = turn.apply(arrays["visual_vertices"]) + arrays["object_position"][step]
-    np.testing.assert_allclose([solid.min(0), solid.max(0)], [corners.min(0), corners.max(0)], atol=1e-5)
-    assert array("faces", "<u4", 3).max() < len(points) and data["table"][1] == array("faces", "<u4").size
+    np.testing.assert_allclose(
+        [solid.min(0), solid.max(0)], [corners.min(0), corners.max(0)], atol=1e-5
+    )
+    assert (
+        array("faces", "<u4", 3).max() < len(points)
+        and data["table"][1] == array("faces", "<u4").size
+    )
     write_report(
-        tmp_path / "r.html", policy, "p", [], "", [], [], Commands("c", ""), motion={**made, "constraint": "x"}
+        tmp_path / "r.html",
+        policy,
+        "p",
+        [],
+        "",
+        [],
+        [],
+        Commands("c", ""),
+        motion={**made, "constraint": "x"},
     )
     assert "A grasp to turn around" in (tmp_path / "r.html").read_text()

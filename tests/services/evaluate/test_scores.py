@@ -29,15 +29,42 @@ from tests.rows import row as made_row
 TASK = TaskConfig()
 BLOCKS = blocks(TASK)
 REQUIRED = (
-    *("constraint", "hand", "method", "episodes", "success", "heading_rad", "heading_m", "pose_rad", "pose_m"),
-    *("traj_rad", "traj_m", "affordance_ratio", "fingers_ratio", "force_ratio", "success_low", "success_high"),
+    *(
+        "constraint",
+        "hand",
+        "method",
+        "episodes",
+        "success",
+        "heading_rad",
+        "heading_m",
+        "pose_rad",
+        "pose_m",
+    ),
+    *(
+        "traj_rad",
+        "traj_m",
+        "affordance_ratio",
+        "fingers_ratio",
+        "force_ratio",
+        "success_low",
+        "success_high",
+    ),
     *("success_all", "held_all", "distinct", "mass_kg"),
 )
 
 
 def _sample(success, held, **columns) -> Sample:
     count = len(success)
-    names = ("return", "links_at_removal", "diverged", "object_index", "heading_rad", "heading_m", "pose_rad", "pose_m")
+    names = (
+        "return",
+        "links_at_removal",
+        "diverged",
+        "object_index",
+        "heading_rad",
+        "heading_m",
+        "pose_rad",
+        "pose_m",
+    )
     names += (
         "trajectory_rad",
         "trajectory_m",
@@ -49,7 +76,10 @@ def _sample(success, held, **columns) -> Sample:
     values = {name: np.zeros(count, np.float32) for name in names}
     values |= {"identity": np.arange(count, dtype=np.uint32), "mass_kg": np.full(count, 0.2)}
     values |= {"success": np.array(success, np.float32), "held": np.array(held, np.float32)}
-    values |= {name: np.array(column, values.get(name, np.zeros(0)).dtype) for name, column in columns.items()}
+    values |= {
+        name: np.array(column, values.get(name, np.zeros(0)).dtype)
+        for name, column in columns.items()
+    }
     return Sample(values, np.zeros((count, 1, 2), np.float16), np.zeros((count, 1, 3), np.float16))
 
 
@@ -66,9 +96,13 @@ def test_a_row_averages_over_successful_episodes():
     )
     sample.link_force[:, 0] = [[2, 0], [4, 6], [100, 100], [0, 0]]
     sample.torque[:, 0] = [[0.5, 0.5, 0.5], [0.0, 0.0, 1.0], [1, 1, 1], [0.0, 0.0, 0.5]]
-    row = summarise("pose+trajectory", "human", sample, held_2s=True, objects=list("abcdefg"), paper="captured")
+    row = summarise(
+        "pose+trajectory", "human", sample, held_2s=True, objects=list("abcdefg"), paper="captured"
+    )
     assert (row.episodes, row.covered, row.pool, row.success, row.held_2s) == (4, 3, 7, 0.75, 0.5)
-    assert row.diverged == 0.25 and [(of["name"], of["episodes"], of["success"]) for of in row.objects] == [
+    assert row.diverged == 0.25 and [
+        (of["name"], of["episodes"], of["success"]) for of in row.objects
+    ] == [
         ("d", 2, 1.0),
         ("e", 1, 1.0),
         ("f", 1, 0.0),
@@ -76,7 +110,9 @@ def test_a_row_averages_over_successful_episodes():
     objects = sample.values["object_index"]
     assert (row.success_low, row.success_high) == clustered(np.array([1, 1, 0, 1]), objects)
     assert (row.held_2s_low, row.held_2s_high) == clustered(np.array([1, 0, 0, 1]), objects)
-    assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(0.02)
+    assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(
+        0.02
+    )
     assert row.errors["traj_rad"] == pytest.approx(0.5)
     assert row.errors["heading_rad"] is None and row.errors["affordance_ratio"] is None
     assert row.forces["link_force_mean"] == pytest.approx(4.0)  # of the links that touch: 2, 4, 6
@@ -87,23 +123,37 @@ def test_a_row_averages_over_successful_episodes():
 
 
 def test_uncovered_objects_count_as_failures():
-    """Five objects, of which three are covered: rates 1, 1/2 and 0 are 0.5 of three, and 0.3 of five."""
+    """Five objects, of which three are covered: rates 1, 1/2 and 0 are 0.5 of three, and 0.3 of
+    five.
+    """
     sample = _sample([1, 1, 1, 0, 0, 0], [1, 0, 1, 0, 0, 0], object_index=[0, 0, 2, 2, 4, 4])
     row = summarise("affordance", "human", sample, held_2s=True, objects=list("abcde"))
     assert (row.covered, row.pool, row.success, row.success_all) == (3, 5, 0.5, pytest.approx(0.3))
     assert row.held_2s == pytest.approx(1 / 3) and row.held_all == pytest.approx(0.2)
     assert RATE["of all objects"](row) == "30.0 %, 20.0 %"
     # Of a group of three of the five there is no uncovered object.
-    assert summarise("heading", "human", sample, held_2s=True, objects=list("abcde"), pool=3).success_all == 0.5
+    assert (
+        summarise(
+            "heading", "human", sample, held_2s=True, objects=list("abcde"), pool=3
+        ).success_all
+        == 0.5
+    )
 
 
 def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
-    repeated = _sample([1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8)
+    repeated = _sample(
+        [1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8
+    )
     row = summarise("pose", "human", repeated, held_2s=True, objects=["a", "b"])
     assert (row.episodes, row.distinct, row.independent) == (16, 2, pytest.approx(1.0))
     assert RATE["episodes"](row) == "16 (2 different)"
-    spread = summarise("pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"])
-    assert spread.distinct == 16 and row.success_low < spread.success_low < spread.success_high < row.success_high
+    spread = summarise(
+        "pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"]
+    )
+    assert (
+        spread.distinct == 16
+        and row.success_low < spread.success_low < spread.success_high < row.success_high
+    )
     # Sequences of one object are the clusters where references are.
     own = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
     row = summarise("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
@@ -133,26 +183,39 @@ def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
         ("", "human", "ours", "heading", "", None),
     ],
 )
-def test_rows_stand_beside_those_that_were_made_alike(source, hand, method, constraint, group, success):
+def test_rows_stand_beside_those_that_were_made_alike(
+    source, hand, method, constraint, group, success
+):
     row = paper_row(source, hand, method, constraint, group)
     assert (row and row.success) == success
 
 
 def test_joined_samples_keep_forces_beside_their_episodes():
-    parts = [_sample([1] * 3, [1] * 3).first(2), _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5))]
+    parts = [
+        _sample([1] * 3, [1] * 3).first(2),
+        _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5)),
+    ]
     parts[0].link_force[:] = 1.0
     whole = joined(parts)
-    assert len(whole.values["success"]) == PROBED_EPISODES + 7 and len(whole.link_force) == PROBED_EPISODES
+    assert (
+        len(whole.values["success"]) == PROBED_EPISODES + 7
+        and len(whole.link_force) == PROBED_EPISODES
+    )
     assert whole.link_force[:2].min() == 1.0 and whole.link_force[2:].max() == 0.0
     # What follows a sample without all its forces must not move up to another episode's place.
     late = joined([whole, parts[0]])
-    assert len(late.values["success"]) == PROBED_EPISODES + 9 and len(late.link_force) == PROBED_EPISODES
+    assert (
+        len(late.values["success"]) == PROBED_EPISODES + 9
+        and len(late.link_force) == PROBED_EPISODES
+    )
     odd = late.where(np.arange(PROBED_EPISODES + 9) % 2 == 1)
     assert len(odd.link_force) == PROBED_EPISODES // 2 and odd.link_force[0].min() == 1.0
 
 
 def test_peak_and_mean_of_the_strongest_links_force():
-    """By hand: two episodes of two steps and two links; peaks 4 and 8 N, strongest links 3, 4, 8 and 1 N."""
+    """By hand: two episodes of two steps and two links; peaks 4 and 8 N, strongest links 3, 4, 8
+    and 1 N.
+    """
     force = np.array([[[3, 1], [0, 4]], [[8, 2], [1, 0]]], np.float16)
     sample = dataclasses.replace(_sample([1, 1], [1, 1]), link_force=force)
     row = summarise("heading", "human", sample, held_2s=True, objects=["a"]).to_json()
@@ -160,9 +223,17 @@ def test_peak_and_mean_of_the_strongest_links_force():
 
 
 def test_objects_are_grouped_by_terciles_and_family():
-    sizes, masses = np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]), np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
-    groups = dict(object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"])))
-    by_word = {label.split(" (")[0]: set(np.flatnonzero(members).tolist()) for label, members in groups.items()}
+    sizes, masses = (
+        np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]),
+        np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1]),
+    )
+    groups = dict(
+        object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"]))
+    )
+    by_word = {
+        label.split(" (")[0]: set(np.flatnonzero(members).tolist())
+        for label, members in groups.items()
+    }
     assert by_word["small"] == {0, 2} and by_word["medium"] == {1, 3} and by_word["large"] == {4, 5}
     assert by_word["light"] == {4, 5} and by_word["heavy"] == {0, 1}
     assert by_word["family mug"] == {0, 2, 3} and by_word["family ball"] == {1, 4, 5}
@@ -171,7 +242,10 @@ def test_objects_are_grouped_by_terciles_and_family():
 def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     names = dict.fromkeys(name for names in TABLES.values() for name in names)
     objects = list("abcdefgh")
-    rows = [summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects) for name in names]
+    rows = [
+        summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects)
+        for name in names
+    ]
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
     write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
     read = json.loads((tmp_path / "new" / "rows.json").read_text())
@@ -179,11 +253,17 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     for row in read["rows"]:
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
-    assert all(table.terminal().row_count == len(table.rows) == 10 for table in tables_of(rows, "title"))
+    assert all(
+        table.terminal().row_count == len(table.rows) == 10 for table in tables_of(rows, "title")
+    )
 
 
 def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
-    rows = [made_row(name, 0.9, 0.8, 0.95, method=method) for method in ("ours", "pd") for name in ("heading", "pose")]
+    rows = [
+        made_row(name, 0.9, 0.8, 0.95, method=method)
+        for method in ("ours", "pd")
+        for name in ("heading", "pose")
+    ]
     rates, *_ = tables_of(rows, "title", [("human", "graspxl", "not trained")])
     assert rates.columns[:3] == ["constraint", "hand", "method"]
     assert [row[0] for row in rates.rows] == ["heading", "heading", "pose", "pose", "not trained"]
@@ -196,7 +276,10 @@ def test_a_terminal_shows_every_figure_of_several_policies():
     """A long title is broken, and not the figures."""
     held = {"held_2s": 1.0, "held_2s_low": 0.342, "held_2s_high": 1.0}
     rows = [
-        dataclasses.replace(made_row("heading", 1.0, 0.342, 1.0, hand=hand, method=method, group=CENTER_GROUP), **held)
+        dataclasses.replace(
+            made_row("heading", 1.0, 0.342, 1.0, hand=hand, method=method, group=CENTER_GROUP),
+            **held,
+        )
         for hand, method in (("human", "no-dynamic-center"), ("allegro", "ours"))
     ]
     console = Console(width=160, file=io.StringIO())
@@ -207,7 +290,9 @@ def test_a_terminal_shows_every_figure_of_several_policies():
 
 
 def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
-    sample = _sample([1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0])
+    sample = _sample(
+        [1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0]
+    )
     found = summarise("heading", "human", sample, held_2s=True, objects=["box"])
     # Standard deviation 0.1 of three values: 1.96 x 0.1 / sqrt(3).
     assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
@@ -216,7 +301,8 @@ def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
 
 
 def test_wilson_interval():
-    # n = 10, p = 0.8, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half width 1.96 sqrt(0.016 + 0.0096036) / 1.38415.
+    # n = 10, p = 0.8, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half width 1.96 sqrt(0.016 +
+    # 0.0096036) / 1.38415.
     assert wilson(0.8, 10) == pytest.approx((0.49016, 0.94332), abs=1e-5)
     # No success: 0 to z^2 / (n + z^2).
     assert wilson(0.0, 10) == pytest.approx((0.0, 3.84146 / 13.84146), abs=1e-5)
@@ -225,9 +311,11 @@ def test_wilson_interval():
 
 
 def test_clusters_count_by_the_design_effect():
-    """By hand: rates 1, 1/2, 1/2 and 0 of four clusters of four, p = 1/2, sums off the mean 2, 0, 0 and -2.
+    """By hand: rates 1, 1/2, 1/2 and 0 of four clusters of four, p = 1/2, sums off the mean 2, 0, 0
+    and -2.
 
-    The robust variance is 4/3 * 8 / 16^2 = 1/24, that of 16 independent episodes 1/64: the design effect is 8/3.
+    The robust variance is 4/3 * 8 / 16^2 = 1/24, that of 16 independent episodes 1/64: the design
+    effect is 8/3.
     """
     outcomes = np.array([1, 1, 1, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 0, 0, 0], bool)
     clusters = np.repeat([7, 3, 5, 1], 4)
@@ -239,7 +327,8 @@ def test_clusters_count_by_the_design_effect():
 def test_an_interval_is_never_narrower_than_that_of_independent_episodes():
     alternating, clusters = np.tile([1, 0], 8), np.repeat(np.arange(8), 2)
     assert independent_episodes(alternating, clusters) == 16.0
-    assert independent_episodes(alternating, np.arange(16)) == 15.0  # G / (G - 1), as of a sample's variance
+    # G / (G - 1), as of a sample's variance
+    assert independent_episodes(alternating, np.arange(16)) == 15.0
 
 
 def test_clusters_that_end_alike_count_once():
@@ -257,7 +346,10 @@ def episode(heights, **metrics) -> Message:
     position[:, 2] = heights
     table = np.arange(len(heights)) < 2
     known = {"diverged": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
-    return Message({"object_position": position, "table": table}, {"metrics": known | metrics, "control_dt": 0.01})
+    return Message(
+        {"object_position": position, "table": table},
+        {"metrics": known | metrics, "control_dt": 0.01},
+    )
 
 
 @pytest.mark.parametrize(

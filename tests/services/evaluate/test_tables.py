@@ -1,4 +1,6 @@
-"""Tables whose rows are levels: what each level changes, and that all have the same episodes otherwise."""
+"""Tables whose rows are levels: what each level changes, and that all have the same episodes
+otherwise.
+"""
 
 import contextlib
 import dataclasses
@@ -81,7 +83,9 @@ def test_curves_show_every_kind_of_noise(tmp_path):
 
 
 def test_a_level_is_what_it_says(bank):
-    """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than one a step."""
+    """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than
+    one a step.
+    """
     sensed = SENSING[0].task(TASK)
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
     sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
@@ -90,7 +94,10 @@ def test_a_level_is_what_it_says(bank):
     assert len(found) == len(SENSING)
     true, nominal = (found[level.label] for level in SENSING[:2])
     errors = set(true.sensors._fields) - {"key", "period", "phase", "eye"}
-    assert not any(np.any(getattr(true.sensors, name)) for name in errors) and (true.sensors.period == 1.0).all()
+    assert (
+        not any(np.any(getattr(true.sensors, name)) for name in errors)
+        and (true.sensors.period == 1.0).all()
+    )
     assert (nominal.sensors.delay == 6).all() and nominal.sensors.delay.dtype == np.int32
     np.testing.assert_allclose(nominal.sensors.period, 10 / 3, rtol=1e-6)
     np.testing.assert_allclose(nominal.sensors.position_noise, 0.005)
@@ -106,11 +113,16 @@ def test_a_level_is_what_it_says(bank):
             name
             for part in ("sensors", "reset_state")
             for name, a, b in zip(
-                getattr(nominal, part)._fields, getattr(nominal, part), getattr(found[level.label], part), strict=True
+                getattr(nominal, part)._fields,
+                getattr(nominal, part),
+                getattr(found[level.label], part),
+                strict=True,
             )
             if not np.array_equal(a, b)
         ]
-        assert len(changed) == (2 if "noise" in level.label or "6\N{DEGREE SIGN}" in level.label else 1), level.label
+        assert len(changed) == (
+            2 if "noise" in level.label or "6\N{DEGREE SIGN}" in level.label else 1
+        ), level.label
 
 
 def test_a_policy_observes_trackers_only_there():
@@ -121,7 +133,11 @@ def test_a_policy_observes_trackers_only_there():
 def test_friction_is_stiff_whatever_the_training_s_was():
     """One option of the scene, in training alone."""
     soft = dataclasses.replace(TASK, impratio=1.0)
-    assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [100.0, 1.0, 100.0]
+    assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [
+        100.0,
+        1.0,
+        100.0,
+    ]
     policy = dataclasses.replace(task.policy(), task=soft)
     with contextlib.closing(Grasper(policy, attempts=1)) as grasper:
         assert grasper.task.impratio == 100.0
@@ -158,7 +174,9 @@ def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass)
 
 
 def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
-    """Objects and initial conditions are those of the first level but for its change; progress is that of all."""
+    """Objects and initial conditions are those of the first level but for its change; progress is
+    that of all.
+    """
     seen, told, variations = [], [], [*NOISE, *SENSING, *PEERS]
 
     class Running:
@@ -179,9 +197,15 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
             return mock.Mock()
 
     monkeypatch.setattr(Experiment, "simulator", lambda self, task, traced: Running())
-    monkeypatch.setattr(Experiment, "row", lambda self, variation, sample: mock.Mock(group=variation.label, episodes=4))
+    monkeypatch.setattr(
+        Experiment,
+        "row",
+        lambda self, variation, sample: mock.Mock(group=variation.label, episodes=4),
+    )
     monkeypatch.setattr(experiments, "joined", lambda samples: None)
-    results = dataclasses.replace(experiment, track=lambda label, total: told.append).run(variations)
+    results = dataclasses.replace(experiment, track=lambda label, total: told.append).run(
+        variations
+    )
     assert [result.row.group for result in results] == [variation.label for variation in variations]
     assert told == [4 * (i + 1) for i in range(len(variations))]  # one of each object
     first = {}
@@ -189,16 +213,29 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
         same = ("object_index", "object_position", "object_quaternion", "mass_scale")
         for name in same if isinstance(variation, Noise) else (*same, "q", "base_position"):
             other = getattr(first.setdefault(variation.constraint, begun).reset_state, name)
-            np.testing.assert_array_equal(getattr(begun.reset_state, name), other, err_msg=f"{variation}: {name}")
+            np.testing.assert_array_equal(
+                getattr(begun.reset_state, name), other, err_msg=f"{variation}: {name}"
+            )
         assert isinstance(variation, Load) or masses == [obj.mass for obj in OBJECTS]
-    keys = [begun.sensors.key for variation, (begun, _) in zip(variations, seen, strict=True) if variation in SENSING]
+    keys = [
+        begun.sensors.key
+        for variation, (begun, _) in zip(variations, seen, strict=True)
+        if variation in SENSING
+    ]
     assert all(np.array_equal(key, keys[0]) for key in keys), "the same random numbers"
 
 
 def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
     sets = constraint_sets
     back = stored_sets.bank_of(sets)
-    for name in ("points", "avoid", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
+    for name in (
+        "points",
+        "avoid",
+        "heading_position",
+        "pose_q",
+        "trajectory_position",
+        "pose_quaternion",
+    ):
         np.testing.assert_array_equal(getattr(back, name), getattr(bank, name))
     for n in range(len(OBJECTS)):
         rests = len(sets[n].arrays["rest"])
@@ -207,9 +244,13 @@ def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
             if v == 0 or bank.has_affordance[n, r]:
                 asked, found = bank.heading_index[n, v, r], back.heading_index[n, v, r]
                 assert set(np.asarray(asked)) == set(np.asarray(found))
-                back_of = dict(zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True))
+                back_of = dict(
+                    zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True)
+                )
                 np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
-        np.testing.assert_array_equal(back.has_affordance[n, :rests], bank.has_affordance[n, :rests])
+        np.testing.assert_array_equal(
+            back.has_affordance[n, :rests], bank.has_affordance[n, :rests]
+        )
     held = stored_sets.bank_of(sets, "held-out")
     training = stored_sets.bank_of(sets, "training")
     assert not np.any(held.pose_valid[:, 0, 0] & training.pose_valid[:, 0, 0])

@@ -1,4 +1,6 @@
-"""Objects in pools: each gets its share, what cannot be used is counted, and a stopped evaluation goes on."""
+"""Objects in pools: each gets its share, what cannot be used is counted, and a stopped evaluation
+goes on.
+"""
 
 import contextlib
 import dataclasses
@@ -15,7 +17,14 @@ from congrasp.services.evaluate import experiment
 from congrasp.services.evaluate import pools as of_objects
 from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.experiment import Experiment
-from congrasp.services.evaluate.pools import FAMILIES, Loaded, Pools, evaluate_pools, folder_pools, procedural_pools
+from congrasp.services.evaluate.pools import (
+    FAMILIES,
+    Loaded,
+    Pools,
+    evaluate_pools,
+    folder_pools,
+    procedural_pools,
+)
 from tests.task import TASK, policy
 
 OBJECTS = procedural.generate_many(5, 1_000_000)
@@ -39,9 +48,17 @@ def simulated(monkeypatch):
         done.append(([obj.name for obj in self.objects], stressed))
         progress(plan.total)
         values = {name: np.ones(plan.total, np.float32) for name in metric_names(TASK)}
-        values |= {"object_index": plan.episodes.astype(np.float32), "clean": np.zeros(plan.total, np.float32)}
-        values |= {"mass_kg": np.full(plan.total, 0.2, np.float32), "identity": np.arange(plan.total, dtype=np.uint32)}
-        return Sample(values, np.ones((plan.total, 1, 2), np.float16), np.ones((plan.total, 1, 3), np.float16))
+        values |= {
+            "object_index": plan.episodes.astype(np.float32),
+            "clean": np.zeros(plan.total, np.float32),
+        }
+        values |= {
+            "mass_kg": np.full(plan.total, 0.2, np.float32),
+            "identity": np.arange(plan.total, dtype=np.uint32),
+        }
+        return Sample(
+            values, np.ones((plan.total, 1, 2), np.float16), np.ones((plan.total, 1, 3), np.float16)
+        )
 
     monkeypatch.setattr(experiment, "build_bank", build_bank)
     monkeypatch.setattr(Experiment, "plan", plan)
@@ -52,12 +69,17 @@ def simulated(monkeypatch):
 
 def evaluated(pools, episodes, kept=None, *, seed=0, track=lambda label, total: lambda done: None):
     """Rows of the test's policy."""
-    return evaluate_pools(dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, kept)
+    return evaluate_pools(
+        dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, kept
+    )
 
 
 def pools_of(*groups, left_out=()):
     """Pools of these objects; `left_out` belongs to the first."""
-    makes = [lambda i=i, group=group: Loaded(group, [] if i else list(left_out)) for i, group in enumerate(groups)]
+    makes = [
+        lambda i=i, group=group: Loaded(group, [] if i else list(left_out))
+        for i, group in enumerate(groups)
+    ]
     return Pools("test", max(map(len, groups)), makes)
 
 
@@ -70,7 +92,9 @@ def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
     assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
     assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
-    assert sum(row.episodes for row in by_size) == 10 and {row.success_all for row in by_size} == {1.0}
+    assert sum(row.episodes for row in by_size) == 10 and {row.success_all for row in by_size} == {
+        1.0
+    }
     assert whole.success_all == pytest.approx(5 / 6)
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
     assert whole.paper.success == 0.927
@@ -102,10 +126,15 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
     again = first._replace(make=[stop, first.make[1]])  # the first is not even made
     rows = evaluated(again, 8, tmp_path)
     assert [row.to_json() for row in rows] == [row.to_json() for row in whole]
-    assert [names for names, _ in simulated] == [[o.name for o in OBJECTS[:2]], [o.name for o in OBJECTS[2:4]]]
+    assert [names for names, _ in simulated] == [
+        [o.name for o in OBJECTS[:2]],
+        [o.name for o in OBJECTS[2:4]],
+    ]
     evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 4  # other settings: both anew
-    max(tmp_path.glob("*-00001.safetensors"), key=lambda file: file.stat().st_mtime_ns).write_bytes(b"cut off")
+    max(tmp_path.glob("*-00001.safetensors"), key=lambda file: file.stat().st_mtime_ns).write_bytes(
+        b"cut off"
+    )
     evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 5
 
@@ -118,11 +147,15 @@ def test_no_more_than_the_next_pool_is_made_ahead(simulated):
         return Loaded(OBJECTS[:1], [])
 
     pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
-    evaluated(pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated)))
+    evaluated(
+        pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated))
+    )
     assert made == [0, 1, 2, 3, 4] and max(ahead) <= 1
 
 
-def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulated, monkeypatch, caplog):
+def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
+    simulated, monkeypatch, caplog
+):
     lost = OBJECTS[1].name
 
     def build_bank(hand, task, objects, seed):
@@ -151,7 +184,9 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
     (tmp_path / f"{sorted(obj.name for obj in OBJECTS)[-1]}.safetensors").write_bytes(b"damaged")
-    assert folder_pools(tmp_path, "native").source != pools.source, "results of other files are not resumed"
+    assert folder_pools(tmp_path, "native").source != pools.source, (
+        "results of other files are not resumed"
+    )
     loaded = [make() for make in pools.make]
     assert pools.size == 2 and [len(one.objects) for one in loaded] == [2, 2, 0]
     assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]

@@ -1,4 +1,6 @@
-"""A motion whose hand is on an arm: every file has the arm where MuJoCo has it, with its meshes, colours and joints."""
+"""A motion whose hand is on an arm: every file has the arm where MuJoCo has it, with its meshes,
+colours and joints.
+"""
 
 import dataclasses
 import json
@@ -51,12 +53,16 @@ ARM = """<mujoco><compiler angle="radian"/><asset><material name="orange" rgba="
       <inertial mass="1" pos="0 0 0" diaginertia=".1 .1 .1"/>
       <site name="attachment_site" pos="0 .01 .05" quat=".7 .7 .1 0"/>
 </body></body></body></worldbody></mujoco>"""
-"""A slide, a link of two joints off its frame's origin, a link without name or shape, and names that the hand has."""
+"""A slide, a link of two joints off its frame's origin, a link without name or shape, and names
+that the hand has.
+"""
 
 
 @pytest.fixture(scope="module")
 def motion(tmp_path_factory: pytest.TempPathFactory) -> GraspMotion:
-    """Any joints of arm and hand, on a base that stands askew; the wrist is where the arm takes it."""
+    """Any joints of arm and hand, on a base that stands askew; the wrist is where the arm takes
+    it.
+    """
     hand, rng = get_hand("allegro"), np.random.default_rng(0)
     file = tmp_path_factory.mktemp("arm") / "odd.xml"
     file.write_text(ARM.replace("JOINT", hand.joints[0].name))
@@ -95,14 +101,21 @@ def test_links_have_the_names_parents_and_colours_of_the_file(motion: GraspMotio
     assert arm is not None and arm.name == "odd"
     assert arm.link_names.tolist() == ["odd_base", "sledge", "arm_palm", "body_3"]
     assert arm.link_parent.tolist() == [-1, 0, 1, 2] and arm.joint_link.tolist() == [1, 2, 2, 3]
-    assert arm.joint_limits[1].tolist() == [-1000, 1000] and arm.joint_slides.tolist() == [True, False, False, False]
+    assert arm.joint_limits[1].tolist() == [-1000, 1000] and arm.joint_slides.tolist() == [
+        True,
+        False,
+        False,
+        False,
+    ]
     assert [(m.link, m.colour) for m in arm.meshes] == [
         (0, pytest.approx(BLUE, abs=1e-6)),
         (1, pytest.approx(ORANGE, abs=1e-6)),
         (1, pytest.approx(BLUE, abs=1e-6)),
         (2, pytest.approx((0.5, 0.5, 0.5), abs=1e-6)),
     ]
-    np.testing.assert_allclose([np.ptp(m.vertices, axis=0) for m in arm.meshes][1], [0.1] * 3, atol=1e-6)
+    np.testing.assert_allclose(
+        [np.ptp(m.vertices, axis=0) for m in arm.meshes][1], [0.1] * 3, atol=1e-6
+    )
     first = get_hand("allegro").joints[0].name
     assert robot_joints(motion)[:5] == ["rail", "turn", "bend", first, f"hand_{first}"]
 
@@ -112,9 +125,15 @@ WRITTEN = ("glb", "usd", "lerobot")
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in motion_file.FORMATS]
+    "kind",
+    [
+        pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN))
+        for kind in motion_file.FORMATS
+    ],
 )
-def test_every_reader_finds_the_arm_where_it_was(motion: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+def test_every_reader_finds_the_arm_where_it_was(
+    motion: GraspMotion, kind: str, tmp_path: pathlib.Path
+) -> None:
     path = tmp_path / f"motion{motion_file.FORMATS[kind]}"
     motion_file.export_motions([motion], kind, path)
     (track,) = READERS[kind](path)
@@ -151,19 +170,26 @@ def test_a_motions_file_keeps_its_arm(motion: GraspMotion, tmp_path: pathlib.Pat
         ("joint_position", motion.arm.joint_position[:3], "arm_joint_position has shape"),
     ):
         save_motion(
-            tmp_path / "bad.npz", dataclasses.replace(motion, arm=dataclasses.replace(motion.arm, **{name: values}))
+            tmp_path / "bad.npz",
+            dataclasses.replace(motion, arm=dataclasses.replace(motion.arm, **{name: values})),
         )
         with pytest.raises(CongraspError, match=words):
             load_motion(tmp_path / "bad.npz")
 
 
-def test_a_dataset_has_the_arms_joints_before_the_hands(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_dataset_has_the_arms_joints_before_the_hands(
+    motion: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     arm = motion.arm
     assert arm is not None
     farther = dataclasses.replace(arm, link_position=arm.link_position + 0.1)
-    other = dataclasses.replace(motion, arm=farther, **{  # the whole robot elsewhere
-        name: getattr(motion, name) + 0.1 for name in ("link_position", "wrist_position")
-    })  # fmt: skip
+    other = dataclasses.replace(
+        motion,
+        arm=farther,
+        **{  # the whole robot elsewhere
+            name: getattr(motion, name) + 0.1 for name in ("link_position", "wrist_position")
+        },
+    )
     path = tmp_path / "data"
     motion_file.export_motions([motion, other], "lerobot", path)
     for one, track in zip([motion, other], READERS["lerobot"](path), strict=True):
@@ -176,15 +202,25 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(motion: GraspMotion, tmp
         "wrist_y",
         "wrist_z",
     ]
-    assert action[:5] == ["rail_next", "turn_next", "bend_next", f"{first}_next", f"hand_{first}_target"]
+    assert action[:5] == [
+        "rail_next",
+        "turn_next",
+        "bend_next",
+        f"{first}_next",
+        f"hand_{first}_target",
+    ]
     assert info["robot_type"] == "congrasp_odd_allegro"
     rows = pq.read_table(path / "data").slice(0, T)
-    np.testing.assert_allclose(np.array(rows["observation.state"].to_pylist())[:, :4], arm.joint_position, atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(rows["observation.state"].to_pylist())[:, :4], arm.joint_position, atol=1e-6
+    )
     following = np.concatenate([arm.joint_position[1:], arm.joint_position[-1:]])
     np.testing.assert_allclose(np.array(rows["action"].to_pylist())[:, :4], following, atol=1e-6)
     assert [file.name for file in (path / "meta").glob("*.urdf")] == ["robot.urdf"]
     with pytest.raises(CongraspError, match="one robot"):
-        motion_file.export_motions([motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed")
+        motion_file.export_motions(
+            [motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed"
+        )
 
 
 def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
@@ -196,14 +232,20 @@ def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pa
     seen = {name: scene.graph.get(name)[0] for name in ("odd_base", "sledge", "arm_palm")}
     for i, pose in enumerate(seen.values()):
         np.testing.assert_allclose((FROM_Y_UP @ pose)[:3, 3], arm.link_position[0, i], atol=1e-6)
-    colours = [mesh.visual.material.baseColorFactor[:3] for name, mesh in scene.geometry.items() if "sledge" in name]
+    colours = [
+        mesh.visual.material.baseColorFactor[:3]
+        for name, mesh in scene.geometry.items()
+        if "sledge" in name
+    ]
     linear = np.array([ORANGE, BLUE]) ** 2.2
     np.testing.assert_allclose(colours, 255 * linear, atol=1)
     stage = Usd.Stage.Open(str(tmp_path / "motion.usda"))
     sledge = stage.GetPrimAtPath("/grasp/odd_base/sledge")
     pose = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(sledge)).T
     np.testing.assert_allclose(pose[:3, 3], arm.link_position[3, 1], atol=1e-6)
-    shown = [UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)]
+    shown = [
+        UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)
+    ]
     np.testing.assert_allclose(shown, linear, atol=1e-6)
 
 
@@ -222,19 +264,34 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotio
     recorded = motion_of_episode(whole)
     again = recorded.arm
     assert "rail" in urdf.robot_urdf(recorded)
-    assert again is not None and again.name == "odd" and again.joint_names.tolist() == arm.joint_names.tolist()
+    assert (
+        again is not None
+        and again.name == "odd"
+        and again.joint_names.tolist() == arm.joint_names.tolist()
+    )
     for name, values in arm.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values)
     entries = [*episode_entries("a0", whole, 0, 0, JsonChannels())]
-    (scene,) = [SceneUpdate.FromString(entry.data) for entry in entries if entry.channel.topic == "/episode/a0/scene"]
+    (scene,) = [
+        SceneUpdate.FromString(entry.data)
+        for entry in entries
+        if entry.channel.topic == "/episode/a0/scene"
+    ]
     shown = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
     assert [entity.frame_id for entity in shown.values()] == [
         f"a0/arm/{name}" for name in ("odd_base", "sledge", "sledge", "arm_palm")
     ]
-    assert shown["arm/1"].triangles[0].color.r == pytest.approx(1.0) and len(shown["arm/1"].triangles[0].indices) == 36
-    frame = next(FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf")
+    assert (
+        shown["arm/1"].triangles[0].color.r == pytest.approx(1.0)
+        and len(shown["arm/1"].triangles[0].indices) == 36
+    )
+    frame = next(
+        FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf"
+    )
     sledge = next(t.translation for t in frame.transforms if t.child_frame_id == "a0/arm/sledge")
     np.testing.assert_allclose([sledge.x, sledge.y, sledge.z], arm.link_position[0, 1], atol=1e-6)
     short = Message({**whole.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, whole.meta)
-    with pytest.raises(CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"):
+    with pytest.raises(
+        CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"
+    ):
         check_episode(short)

@@ -30,7 +30,13 @@ def panels(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib.Path) -> None:
-    values = {"episode/success": 0.5, "episode/return": 3.0, "steps_per_second": 9.0, "kl": 0.01, "other": 1.0}
+    values = {
+        "episode/success": 0.5,
+        "episode/return": 3.0,
+        "steps_per_second": 9.0,
+        "kl": 0.01,
+        "other": 1.0,
+    }
     record(
         tmp_path / "logs",
         ("episode/actor/actor-0", episode()),
@@ -52,7 +58,10 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
     assert (kinds.count("ThreeDee"), kinds.count("Log"), kinds.count("Plot")) == (1, 1, 5)
     for panel in shown:
         config = panel["config"]
-        topics = [*config.get("topics", {}), *([config["topicToRender"]] if "topicToRender" in config else [])]
+        topics = [
+            *config.get("topics", {}),
+            *([config["topicToRender"]] if "topicToRender" in config else []),
+        ]
         assert set(topics) <= set(fields)
         for series in config.get("paths", []):
             topic, _, field = series["value"].partition(".")
@@ -62,6 +71,9 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
 
 
 def test_a_recording_with_nothing_to_show_is_an_error(tmp_path: pathlib.Path) -> None:
-    record(tmp_path / "logs", ("event/learner/0", Message({}, {"time": 0.0, "level": "info", "text": "hello"})))
+    record(
+        tmp_path / "logs",
+        ("event/learner/0", Message({}, {"time": 0.0, "level": "info", "text": "hello"})),
+    )
     with pytest.raises(CongraspError, match="neither episodes nor metrics"):
         export_layout(tmp_path / "logs", tmp_path / "layout.json")

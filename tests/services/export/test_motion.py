@@ -47,8 +47,12 @@ ANGLES = ("ros2", "lerobot")
 """Formats with joint angles."""
 
 
-def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int) -> GraspMotion:
-    """A wild motion of the same hand: any wrist, any fingers within their limits, any object pose."""
+def posed(
+    motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int
+) -> GraspMotion:
+    """A wild motion of the same hand: any wrist, any fingers within their limits, any object
+    pose.
+    """
     rng, count = np.random.default_rng(seed), len(motion.time)
     q = rng.uniform(*motion.joint_limits.T, (count, len(motion.joint_names)))
     wrist, place = Rotation.random(count, rng=rng), rng.normal(scale=0.3, size=(count, 3))
@@ -85,14 +89,18 @@ def robot(human: GraspMotion) -> GraspMotion:
 
 @pytest.fixture(scope="module")
 def odd_hand(human: GraspMotion) -> GraspMotion:
-    """A hand with what URDF has no single joint for: two joints of one link at two places, a link without joints, and
-    names that other formats do not take."""
+    """A hand with what URDF has no single joint for: two joints of one link at two places, a link
+    without joints, and names that other formats do not take."""
     axes = Rotation.random(3, rng=np.random.default_rng(3)).as_matrix()[:, 0]
     anchors = np.array([[0.02, 0.0, 0.03], [0.03, 0.01, 0.05], [0.05, 0.0, 0.09]])
     names, parents, joint_link = ["palm", "1st phalanx", "plate", "tip/1"], [-1, 0, 1, 1], [1, 1, 3]
 
     def link(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        turns, places = [Rotation.identity()], [np.zeros(3)]  # x = turn x0 + place for points of the zero pose
+        # X = turn x0 + place for points of the zero pose
+        turns, places = (
+            [Rotation.identity()],
+            [np.zeros(3)],
+        )
         for i in range(1, 4):
             turn, place = turns[parents[i]], places[parents[i]]
             for j in np.flatnonzero(np.array(joint_link) == i):
@@ -102,7 +110,9 @@ def odd_hand(human: GraspMotion) -> GraspMotion:
             turns.append(turn)
             places.append(place)
         origins = [np.zeros(3), anchors[0], np.zeros(3), anchors[2]]
-        position = [turn.apply(o) + place for turn, o, place in zip(turns, origins, places, strict=True)]
+        position = [
+            turn.apply(o) + place for turn, o, place in zip(turns, origins, places, strict=True)
+        ]
         return np.array(position), np.array([turn.as_quat(scalar_first=True) for turn in turns])
 
     hand = dataclasses.replace(
@@ -129,7 +139,8 @@ def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> p
 
 @pytest.mark.parametrize("kind", motion_file.FORMATS)
 @pytest.mark.parametrize(
-    "which", ["odd_hand", *(pytest.param(one, marks=pytest.mark.slow) for one in ("human", "robot"))]
+    "which",
+    ["odd_hand", *(pytest.param(one, marks=pytest.mark.slow) for one in ("human", "robot"))],
 )
 def test_every_reader_finds_hand_and_object_where_they_were(which, kind, tmp_path, request):
     motion = request.getfixturevalue(which)
@@ -137,7 +148,10 @@ def test_every_reader_finds_hand_and_object_where_they_were(which, kind, tmp_pat
     (track,) = READERS[kind](path)
     assert error_mm(motion, track) < 0.01 and bool(track.triangles) == (kind in MESHES)
     beside = [".json"] if kind == "bvh" else []
-    assert {p.name for p in path.parent.iterdir()} == {path.name, *(path.name + suffix for suffix in beside)}
+    assert {p.name for p in path.parent.iterdir()} == {
+        path.name,
+        *(path.name + suffix for suffix in beside),
+    }
     # The measure sees what is off: a shift, and a rotation the other way round.
     shifted = dataclasses.replace(motion, object_position=motion.object_position + 2e-4)
     inverse = motion.object_quaternion * np.array([1, -1, -1, -1])
@@ -159,19 +173,32 @@ def test_links_are_where_the_joint_angles_take_them(odd_hand, kind, tmp_path):
 
 def beginning(motion: GraspMotion, count: int) -> GraspMotion:
     """The first frames of a motion."""
-    moving = ("link_pos", "link_q", "wrist_", "object_pos", "object_q", "joint_pos", "joint_t", "time")
+    moving = (
+        "link_pos",
+        "link_q",
+        "wrist_",
+        "object_pos",
+        "object_q",
+        "joint_pos",
+        "joint_t",
+        "time",
+    )
     cut = {name: getattr(motion, name)[:count] for name in vars(motion) if name.startswith(moving)}
     return dataclasses.replace(motion, table=motion.table[:count], **cut)
 
 
 @pytest.mark.parametrize("kind", motion_file.FORMATS)
-def test_a_single_frame_is_a_motion(odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+def test_a_single_frame_is_a_motion(
+    odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
+) -> None:
     motion = beginning(odd_hand, 1)
     (track,) = READERS[kind](export([motion], kind, tmp_path))
     assert error_mm(motion, track) < 0.01
 
 
-def test_a_controller_can_take_the_trajectory_of_a_bag(robot: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_controller_can_take_the_trajectory_of_a_bag(
+    robot: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     """It begins after time zero, and is at rest at both ends."""
     path = export([robot], "ros2", tmp_path)
     (file,) = path.glob("*.mcap")
@@ -181,24 +208,36 @@ def test_a_controller_can_take_the_trajectory_of_a_bag(robot: GraspMotion, tmp_p
     speeds = np.array([point.velocities for point in message.points])
     inside = np.gradient(robot.joint_position, robot.control_dt, axis=0)[1:-1]
     np.testing.assert_allclose(speeds, np.pad(inside, ((1, 1), (0, 0))), rtol=1e-6)
-    since = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    since = [
+        point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points
+    ]
     np.testing.assert_allclose(since, 1.0 + robot.time, atol=1e-9)
 
 
-def test_a_usd_has_the_rate_that_is_asked_for(odd_hand: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_usd_has_the_rate_that_is_asked_for(
+    odd_hand: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     slower = at_rate(odd_hand, 24.0)
     assert len(slower.time) == int((T - 1) * 24 / 100) + 1
     motion_file.export_motions([slower], "usd", tmp_path / "m.usda")
     stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
-    assert stage.GetTimeCodesPerSecond() == pytest.approx(24) and stage.GetEndTimeCode() == len(slower.time) - 1
-    np.testing.assert_array_equal(slower.object_position[1], odd_hand.object_position[4])  # 1/24 s is 4.2 steps
+    assert (
+        stage.GetTimeCodesPerSecond() == pytest.approx(24)
+        and stage.GetEndTimeCode() == len(slower.time) - 1
+    )
+    # 1/24 s is 4.2 steps
+    np.testing.assert_array_equal(slower.object_position[1], odd_hand.object_position[4])
     with pytest.raises(CongraspError, match="--fps is 200"):
         at_rate(odd_hand, 200.0)
 
 
-def test_quaternions_that_are_no_rotations_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_quaternions_that_are_no_rotations_are_refused(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     wrong = dataclasses.replace(human, object_quaternion=np.zeros_like(human.object_quaternion))
-    with pytest.raises(CongraspError, match="object_quaternion has quaternions that are not normalised"):
+    with pytest.raises(
+        CongraspError, match="object_quaternion has quaternions that are not normalised"
+    ):
         export([wrong], "glb", tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -214,14 +253,25 @@ def test_a_file_that_fails_midway_leaves_nothing_behind(human, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_glb_is_y_up_for_others_and_names_its_units(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     path = export([human], "glb", tmp_path)
     content = path.read_bytes()
-    assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(content)
+    assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(
+        content
+    )
     file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     root, skinned = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
-    assert set(skinned) == {"name", "mesh", "skin"}  # it stands at the origin, and its joints move it
-    np.testing.assert_allclose(Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12)
+    # It stands at the origin, and its joints move it
+    assert set(skinned) == {
+        "name",
+        "mesh",
+        "skin",
+    }
+    np.testing.assert_allclose(
+        Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12
+    )
     assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
     assert root["extras"]["joints"] == human.joint_names.tolist()
     assert all("matrix" not in node for node in file["nodes"])
@@ -238,7 +288,9 @@ def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pa
         np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
     skin = skin_of(get_hand("human"))
     flat = unwrapped(skin.points, skin.faces)
-    np.testing.assert_allclose(scene.geometry[frames.SKIN].vertices, skin.points[flat.source], atol=1e-6)
+    np.testing.assert_allclose(
+        scene.geometry[frames.SKIN].vertices, skin.points[flat.source], atol=1e-6
+    )
     np.testing.assert_allclose(scene.geometry[frames.SKIN].visual.uv, flat.uv, atol=1e-6)
     flat = unwrapped(human.object_vertices, human.object_faces)
     shape = scene.geometry[frames.OBJECT]
@@ -295,12 +347,15 @@ def test_pixars_library_moves_the_skin_of_a_usd(which, request, tmp_path):
     (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
     skeleton, (target,) = cache.GetSkelQuery(binding.GetSkeleton()), binding.GetSkinningTargets()
     mesh, surface = UsdGeom.Mesh(target.GetPrim()), frames.skin_of_motion(motion)
-    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())  # one a corner, v upwards
+    # One a corner, v upwards
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
     flat = unwrapped(surface.points, surface.faces)
     np.testing.assert_allclose(st, flat.uv[flat.faces.ravel()], atol=1e-6)
     for t in (0, T - 1):
         points = mesh.GetPointsAttr().Get()
-        assert target.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(float(t)), points, float(t))
+        assert target.ComputeSkinnedPoints(
+            skeleton.ComputeSkinningTransforms(float(t)), points, float(t)
+        )
         np.testing.assert_allclose(np.array(points), expected_surface(motion, t), atol=2e-6)
 
 
@@ -337,11 +392,15 @@ def test_glb_and_usd_have_the_colours_of_the_object(
     assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(shown.Get()))
 
 
-def test_colours_of_a_hand_are_linear_in_glb_and_usd(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_colours_of_a_hand_are_linear_in_glb_and_usd(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     flesh = np.array(COLOURS["flesh"]) ** 2.2
     file = pygltflib.GLTF2().load(str(export([human], "glb", tmp_path)))
     (material,) = (material for material in file.materials if material.name == "flesh")
-    np.testing.assert_allclose(material.pbrMetallicRoughness.baseColorFactor, [*flesh, 1.0], atol=1e-6)
+    np.testing.assert_allclose(
+        material.pbrMetallicRoughness.baseColorFactor, [*flesh, 1.0], atol=1e-6
+    )
     stage = Usd.Stage.Open(str(export([human], "usd", tmp_path)))
     meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
     shown = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
@@ -352,12 +411,15 @@ def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathli
     path = export([human], "bvh", tmp_path)
     lines = [line.split() for line in path.read_text().splitlines()]
     offsets = {
-        line[1]: np.array(lines[i + 2][1:], float) for i, line in enumerate(lines) if line and line[0] == "JOINT"
+        line[1]: np.array(lines[i + 2][1:], float)
+        for i, line in enumerate(lines)
+        if line and line[0] == "JOINT"
     }
     assert list(offsets) == [*human.link_names, "object"]
     origins = skin_of(get_hand("human")).origins
     for i, parent in enumerate(human.link_parent[1:], 1):
-        expected = 100 * (origins[i] - origins[parent])  # cm; a link's frame is turned as its parent's at zero
+        # Cm; a link's frame is turned as its parent's at zero
+        expected = 100 * (origins[i] - origins[parent])
         np.testing.assert_allclose(offsets[human.link_names[i]], expected, atol=1e-4)
 
 
@@ -367,12 +429,19 @@ def test_neighbouring_quaternions_do_not_jump() -> None:
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 
-def test_pixars_library_finds_the_shapes_in_a_usd(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_pixars_library_finds_the_shapes_in_a_usd(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
     path = export([human], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
-    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert (
+        UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+        and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    )
     assert stage.GetTimeCodesPerSecond() == pytest.approx(1 / human.control_dt)
-    assert "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
+    assert (
+        "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
+    )
     prims = {prim.GetName(): prim for prim in stage.Traverse()}
     k = 9
     link, prim = int(human.capsule_link[k]), prims[f"capsule_{k}"]
@@ -380,58 +449,91 @@ def test_pixars_library_finds_the_shapes_in_a_usd(human: GraspMotion, tmp_path: 
     matrix = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(prim)).T
     ends = (matrix @ [[0, 0], [0, 0], [-half, half], [1, 1]])[:3].T
     turn = Rotation.from_quat(human.link_quaternion[3, link], scalar_first=True)
-    np.testing.assert_allclose(ends, turn.apply(human.capsule_ends[k]) + human.link_position[3, link], atol=1e-6)
+    np.testing.assert_allclose(
+        ends, turn.apply(human.capsule_ends[k]) + human.link_position[3, link], atol=1e-6
+    )
 
 
 def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     hand = get_hand("human")
     other = dataclasses.replace(
-        posed(human, lambda q: mujoco_link_poses(hand, q), 9), object="mug", constraints=("heading",)
+        posed(human, lambda q: mujoco_link_poses(hand, q), 9),
+        object="mug",
+        constraints=("heading",),
     )
     motions = [human, other, human]
     path = export(motions, "lerobot", tmp_path)
     for motion, track in zip(motions, READERS["lerobot"](path), strict=True):
         assert error_mm(motion, track) < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
-    assert (info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]) == (3, 3 * T, 2, 100)
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]) == (
+        3,
+        3 * T,
+        2,
+        100,
+    )
     table = pq.read_table(path / "data")
     assert table["index"].to_pylist() == list(range(3 * T))
     assert table["task_index"].to_pylist() == [0] * T + [1] * T + [0] * T
     action = np.array(table["action"].to_pylist())[T : 2 * T]
     np.testing.assert_allclose(action[:-1, -7:-4], other.wrist_position[1:], atol=1e-6)
     names = info["features"]["action"]["names"]
-    assert names[:2] == ["thumb_cmc_abduction_target", "thumb_cmc_flexion_target"] and len(names) == action.shape[1]
+    assert (
+        names[:2] == ["thumb_cmc_abduction_target", "thumb_cmc_flexion_target"]
+        and len(names) == action.shape[1]
+    )
     pose = names.index("index_pip_target")
     joint = human.joint_names.tolist().index("index_pip")
     np.testing.assert_allclose(action[:, pose], other.joint_target[:, joint], atol=1e-6)
     stats = json.loads((path / "meta" / "stats.json").read_text())
-    np.testing.assert_allclose(stats["action"]["mean"], np.array(table["action"].to_pylist()).mean(0), atol=1e-6)
+    np.testing.assert_allclose(
+        stats["action"]["mean"], np.array(table["action"].to_pylist()).mean(0), atol=1e-6
+    )
     # pandas finds the tasks as its index
     schema = json.loads(pq.read_schema(path / "meta" / "tasks.parquet").metadata[b"pandas"])
     assert schema["index_columns"] == ["task"]
 
 
-def test_a_dataset_with_a_camera_has_a_frame_for_every_row(human: GraspMotion, tmp_path: pathlib.Path) -> None:
-    count, near = 2, beginning(dataclasses.replace(human, object_position=human.wrist_position + 0.1), 2)
+def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
+    count, near = (
+        2,
+        beginning(dataclasses.replace(human, object_position=human.wrist_position + 0.1), 2),
+    )
     path = tmp_path / "filmed"
     motion_file.export_motions([near, near], "lerobot", path, camera=True)
     info = json.loads((path / "meta" / "info.json").read_text())
     feature = info["features"]["observation.images.front"]
     assert feature["dtype"] == "video" and feature["shape"] == [240, 320, 3]
-    video = path / info["video_path"].format(video_key="observation.images.front", chunk_index=0, file_index=0)
+    video = path / info["video_path"].format(
+        video_key="observation.images.front", chunk_index=0, file_index=0
+    )
     frames = list(imageio_ffmpeg.read_frames(str(video)))
-    assert frames[0]["size"] == (320, 240) and frames[0]["fps"] == 100 and len(frames[1:]) == 2 * count
-    first, second = (np.frombuffer(frames[1 + i], np.uint8).reshape(240, 320, 3).astype(int) for i in (0, count))
+    assert (
+        frames[0]["size"] == (320, 240) and frames[0]["fps"] == 100 and len(frames[1:]) == 2 * count
+    )
+    first, second = (
+        np.frombuffer(frames[1 + i], np.uint8).reshape(240, 320, 3).astype(int) for i in (0, count)
+    )
     assert np.abs(first - second).mean() < 2  # the same motion twice
     rows = pq.read_table(path / "meta" / "episodes").to_pylist()
-    spans = [[row[f"videos/observation.images.front/{end}_timestamp"] for end in ("from", "to")] for row in rows]
+    spans = [
+        [row[f"videos/observation.images.front/{end}_timestamp"] for end in ("from", "to")]
+        for row in rows
+    ]
     np.testing.assert_allclose(spans, [[0, count / 100], [count / 100, 2 * count / 100]])
     stats = json.loads((path / "meta" / "stats.json").read_text())["observation.images.front"]
-    np.testing.assert_allclose(np.ravel(stats["mean"]), np.mean([first, second], (0, 1, 2)) / 255, atol=0.03)
+    np.testing.assert_allclose(
+        np.ravel(stats["mean"]), np.mean([first, second], (0, 1, 2)) / 255, atol=0.03
+    )
     assert np.shape(stats["mean"]) == (3, 1, 1) and stats["count"] == [2 * count]
     # The object is seen where the calibration says.
     calibration = json.loads((path / "meta" / "camera.json").read_text())
-    to_world, intrinsics = np.array(calibration["camera_to_world"]), np.array(calibration["intrinsics"])
+    to_world, intrinsics = (
+        np.array(calibration["camera_to_world"]),
+        np.array(calibration["intrinsics"]),
+    )
     turn = Rotation.from_quat(near.object_quaternion[0], scalar_first=True)
     corners = turn.apply(near.object_vertices) + near.object_position[0]
     seen = ((corners - to_world[:3, 3]) @ to_world[:3, :3]) @ intrinsics.T
@@ -440,20 +542,30 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(human: GraspMotion, t
         near, link_position=near.link_position + np.array([0, 0, 50.0]), table=np.zeros(count, bool)
     )
     nothing = dataclasses.replace(alone, object_position=near.object_position + 50.0)
-    shown, blank = (next(pictures(motion, camera_for([near]))).astype(int) for motion in (alone, nothing))
+    shown, blank = (
+        next(pictures(motion, camera_for([near]))).astype(int) for motion in (alone, nothing)
+    )
     changed = np.argwhere(np.abs(shown - blank).sum(-1) > 20)
-    np.testing.assert_allclose([changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5)
+    np.testing.assert_allclose(
+        [changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5
+    )
     with pytest.raises(CongraspError, match="A glb file holds no video"):
         motion_file.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
 
 
-def test_lerobots_own_reader_gives_the_frame_of_each_row(human: GraspMotion, tmp_path: pathlib.Path) -> None:
-    reader = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+def test_lerobots_own_reader_gives_the_frame_of_each_row(
+    human: GraspMotion, tmp_path: pathlib.Path
+) -> None:
+    reader = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
+    )
     motion_file.export_motions([human, human], "lerobot", tmp_path / "filmed", camera=True)
     data = reader.LeRobotDataset("congrasp/test", root=tmp_path / "filmed", video_backend="pyav")
     assert len(data) == 2 * T and data.meta.camera_keys == ["observation.images.front"]
     first, second = data[1], data[T + 1]
-    np.testing.assert_allclose(first["observation.state"][: len(human.joint_names)], human.joint_position[1], atol=1e-6)
+    np.testing.assert_allclose(
+        first["observation.state"][: len(human.joint_names)], human.joint_position[1], atol=1e-6
+    )
     assert tuple(first["observation.images.front"].shape) == (3, 240, 320)
     assert abs(first["observation.images.front"] - second["observation.images.front"]).mean() < 0.01
 
@@ -464,7 +576,9 @@ def run(*arguments: str) -> int:
     return int(end.value.code or 0)
 
 
-def test_recorded_episodes_and_motion_files_are_exported_by_the_command(tmp_path, capsys, monkeypatch):
+def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
+    tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     entries: list[Entry] = Converter()("congrasp/run/log/episode/actor/a0", episode(T), 10**15)
     with_log = LogWriter(tmp_path / "logs", "log")
@@ -477,7 +591,10 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(tmp_path
     changed = tmp_path / "cylinder-0.glb"
     changed.write_bytes(b"mine")
     assert run("mug.npz") == 2
-    assert changed.read_bytes() == b"mine" and "cylinder-0.glb exists already" in capsys.readouterr().err
+    assert (
+        changed.read_bytes() == b"mine"
+        and "cylinder-0.glb exists already" in capsys.readouterr().err
+    )
     assert run("mug.npz", "--force") == 0 and changed.read_bytes().startswith(b"glTF")
     (tmp_path / "cylinder-0.bvh").rename(tmp_path / "taken.bvh")
     assert run("mug.npz", "--to", "bvh") == 2  # what goes beside the file is there already, too
@@ -505,6 +622,12 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(tmp_path
 def test_a_motions_file_has_no_other_number(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path = tmp_path / "grasp.npz"
     save_motion(path, human)
-    assert motion_file.pick_motion(path, 0).object == motion_file.pick_motion(path).object == human.object
-    with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 99. Remove --index"):
+    assert (
+        motion_file.pick_motion(path, 0).object
+        == motion_file.pick_motion(path).object
+        == human.object
+    )
+    with pytest.raises(
+        CongraspError, match=r"grasp\.npz is one motion and has no number 99. Remove --index"
+    ):
         motion_file.pick_motion(path, 99)

@@ -1,4 +1,6 @@
-"""An exported policy answers as the Flax policy does, says what its numbers mean, and runs without JAX."""
+"""An exported policy answers as the Flax policy does, says what its numbers mean, and runs without
+JAX.
+"""
 
 import dataclasses
 import json
@@ -50,7 +52,9 @@ def bundle() -> PolicyBundle:
 
 
 @pytest.mark.parametrize("kind", ["onnx", "stablehlo"])
-def test_exported_policies_answer_as_the_flax_policy(bundle: PolicyBundle, kind: str, tmp_path: pathlib.Path) -> None:
+def test_exported_policies_answer_as_the_flax_policy(
+    bundle: PolicyBundle, kind: str, tmp_path: pathlib.Path
+) -> None:
     path = tmp_path / "policy"
     exports.export_policy(bundle, kind, path)
     assert difference(bundle, path) <= 3e-6
@@ -63,24 +67,40 @@ def test_exported_policies_answer_as_the_flax_policy(bundle: PolicyBundle, kind:
 def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
     exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
-    meta = {name: json.loads(text) for name, text in session.get_modelmeta().custom_metadata_map.items()}
+    meta = {
+        name: json.loads(text) for name, text in session.get_modelmeta().custom_metadata_map.items()
+    }
     hand = get_hand("human")
     for block, size in bundle.spec.layout:
-        assert sum(field["size"] for field in meta["observation"] if field["block"] == block) == size
-    assert [entry["joint"] for entry in meta["action"]] == [*(j.name for j in hand.joints), *meta["wrist_joints"]]
-    assert session.get_inputs()[0].shape == ["batch", sum(field["size"] for field in meta["observation"])]
+        assert (
+            sum(field["size"] for field in meta["observation"] if field["block"] == block) == size
+        )
+    assert [entry["joint"] for entry in meta["action"]] == [
+        *(j.name for j in hand.joints),
+        *meta["wrist_joints"],
+    ]
+    assert session.get_inputs()[0].shape == [
+        "batch",
+        sum(field["size"] for field in meta["observation"]),
+    ]
     assert session.get_outputs()[0].shape == ["batch", len(meta["action"])]
     assert "w, x, y, z" in meta["units"] and meta["version"] == 7
     units = [entry["unit"] for entry in meta["action"]]
     assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3 and meta["rate_hz"] == 100.0
 
 
-def test_the_file_s_limits_and_gains_are_those_of_the_hand(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_the_file_s_limits_and_gains_are_those_of_the_hand(
+    bundle: PolicyBundle, tmp_path: pathlib.Path
+) -> None:
     exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
-    stored = onnxruntime.InferenceSession(tmp_path / "policy.onnx").get_modelmeta().custom_metadata_map
+    stored = (
+        onnxruntime.InferenceSession(tmp_path / "policy.onnx").get_modelmeta().custom_metadata_map
+    )
     limits, joints = JointLimits(**json.loads(stored["robot_limits"])), get_hand("human").joints
     for name, wanted in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
-        np.testing.assert_allclose(getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints])
+        np.testing.assert_allclose(
+            getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints]
+        )
     q_open = np.append(get_hand("human").q_open, np.zeros(6))
     limited = Limiter(limits, q_open).limit(np.full(26, np.nan), q_open, np.zeros(26), 0.0)
     assert np.isfinite(limited.target).all() and limited.by == ("not_finite",)
@@ -88,15 +108,23 @@ def test_the_file_s_limits_and_gains_are_those_of_the_hand(bundle: PolicyBundle,
 
 @pytest.fixture(scope="module")
 def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    path, pretrained = tmp_path_factory.mktemp("onnx") / "policy.onnx", bundles.load(policy_file(None))
+    path, pretrained = (
+        tmp_path_factory.mktemp("onnx") / "policy.onnx",
+        bundles.load(policy_file(None)),
+    )
     exports.export_policy(pretrained, "onnx", path)
     assert difference(pretrained, path) <= 3e-6
     return path
 
 
-def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_the_example_grasps_with_onnxruntime_alone(
+    pretrained_onnx: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
     absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'congrasp'])); "
-    code = f"{absent}sys.argv[1:] = [{str(pretrained_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
+    code = (
+        f"{absent}sys.argv[1:] = [{str(pretrained_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, "
+        f"run_name='__main__')"
+    )
     done = python("-c", code, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the cylinder is held" in done.stdout
@@ -147,18 +175,27 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     rows = [grasp.read(), *grasp.readings][: task.history]
     *read, matrices = (np.array(field) for field in zip(*rows, strict=True))
     readings = Readings(*read, np.array([turn(m) for m in matrices]))
-    heading = {"position": grasp.heading_position, "direction": example.HEADING, "cross": np.zeros(3)}
+    heading = {
+        "position": grasp.heading_position,
+        "direction": example.HEADING,
+        "cross": np.zeros(3),
+    }
     goal = goal_of(hand, task, GraspRequest({"heading": heading}))
     goal = dataclasses.replace(goal, active=dict.fromkeys(blocks(task), np.bool_(False)))
 
     def batch(tree: Any) -> Any:
-        return jax.tree.map(lambda x: np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4"), tree)
+        return jax.tree.map(
+            lambda x: np.asarray(x)[None].astype(bool if np.asarray(x).dtype == bool else "f4"),
+            tree,
+        )
 
     def observe(state: SceneState, surface: Surface, goal: Goal, readings: Readings) -> Any:
         return observation.observe(scene_of(hand, task, state, surface, goal, readings))
 
     surface = Surface(grasp.points, np.zeros(len(grasp.points), bool), grasp.normals)
-    return np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal), batch(readings)))[0]
+    return np.asarray(jax.jit(observe)(batch(state), batch(surface), batch(goal), batch(readings)))[
+        0
+    ]
 
 
 def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
@@ -181,8 +218,18 @@ def test_the_example_looks_back_as_a_student_does(tmp_path: pathlib.Path) -> Non
     assert not {"force", "q_velocity"} & {field["field"] for field in grasp.meta["observation"]}
     for _ in range(8):
         grasp.step()
-        grasp.data.qvel[grasp.free : grasp.free + 6] += [0.1, 0.0, 0.2, 0.5, 0.0, 1.0]  # so that the object moves
-    names = np.repeat(*zip(*((field["field"], field["size"]) for field in grasp.meta["observation"]), strict=True))
+        # So that the object moves
+        grasp.data.qvel[grasp.free : grasp.free + 6] += [
+            0.1,
+            0.0,
+            0.2,
+            0.5,
+            0.0,
+            1.0,
+        ]
+    names = np.repeat(
+        *zip(*((field["field"], field["size"]) for field in grasp.meta["observation"]), strict=True)
+    )
     assert (names == "past object_rotation").sum() == 9
     one = names != "nearest"  # of two surface points that are as near as each other either will do
     np.testing.assert_allclose(grasp.observe()[one], observed(example, grasp, task)[one], atol=2e-5)

@@ -23,10 +23,16 @@ def test_a_box_has_six_charts_with_the_proportions_of_its_sides():
     found = areas(flat.uv[flat.faces])
     np.testing.assert_allclose(found / found.sum(), box.area_faces / box.area, rtol=1e-6)
     assert (found > 0).all()  # seen from outside, none mirrored
-    boxes = sorted({(tuple(c.min(0)), tuple(c.max(0))) for c in flat.uv[flat.faces].reshape(-1, 3, 2)})
+    boxes = sorted(
+        {(tuple(c.min(0)), tuple(c.max(0))) for c in flat.uv[flat.faces].reshape(-1, 3, 2)}
+    )
     corners = np.array(boxes).reshape(-1, 2, 2)
-    apart = (corners[:, None, 0] >= corners[None, :, 1]).any(-1) | (corners[:, None, 1] <= corners[None, :, 0]).any(-1)
-    assert (apart | np.eye(len(corners), dtype=bool)).all()  # the two triangles of a side have the same bounds
+    apart = (corners[:, None, 0] >= corners[None, :, 1]).any(-1) | (
+        corners[:, None, 1] <= corners[None, :, 0]
+    ).any(-1)
+    assert (
+        apart | np.eye(len(corners), dtype=bool)
+    ).all()  # the two triangles of a side have the same bounds
 
 
 @pytest.mark.parametrize("name", ["human", "allegro", "ball", "flat"])
@@ -45,16 +51,17 @@ def test_no_face_is_lost_or_mirrored_and_no_texel_belongs_to_two(name):
     assert flat.uv.min() >= 0 and flat.uv.max() <= 1
     triangles = flat.uv[flat.faces]
     assert (areas(triangles) >= -1e-12).all()
-    # Middles of faces lie in their own face alone, of the convex meshes; of hands in few others, within a chart.
+    # Middles of faces lie in their own face alone, of the convex meshes; of hands in few others,
+    # within a chart.
     middles = triangles.mean(1)
     chosen = np.random.default_rng(0).choice(len(faces), min(len(faces), 400), replace=False)
     chosen = chosen[areas(triangles)[chosen] > 0]
     a, b, c = (triangles[None, :, i] for i in range(3))
     inside = np.stack(
         [
-            areas(np.stack(np.broadcast_arrays(x, y, middles[chosen][:, None]), 2).reshape(-1, 3, 2)).reshape(
-                len(chosen), -1
-            )
+            areas(
+                np.stack(np.broadcast_arrays(x, y, middles[chosen][:, None]), 2).reshape(-1, 3, 2)
+            ).reshape(len(chosen), -1)
             > 0
             for x, y in ((a, b), (b, c), (c, a))
         ]

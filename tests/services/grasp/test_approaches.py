@@ -22,7 +22,9 @@ def test_an_object_that_lies_too_flat(tmp_path: pathlib.Path, quick_import: None
     trimesh.creation.box((0.085, 0.054, 0.008)).export(tmp_path / "phone.stl")
     phone = one_object(tmp_path / "phone.stl", ImportOptions(cache_dir=str(tmp_path)))
     request, rng = GraspRequest({"heading": {}}), np.random.default_rng(0)
-    with pytest.raises(CongraspError, match=r"lies too flat .* 8 mm high .* Set --rest (\d)") as error:
+    with pytest.raises(
+        CongraspError, match=r"lies too flat .* 8 mm high .* Set --rest (\d)"
+    ) as error:
         headings(get_hand("human"), phone, request, 8, rng)
     rest = int(str(error.value).split("--rest ")[1][0]) - 1
     rests = headings(get_hand("human"), phone, GraspRequest({"heading": {}}, rest=rest), 8, rng)[3]
@@ -30,9 +32,13 @@ def test_an_object_that_lies_too_flat(tmp_path: pathlib.Path, quick_import: None
 
 
 def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
-    """A bar of 9 mm, 25 mm before a block: fingertips have no room behind it at the usual depth of 2 cm."""
+    """A bar of 9 mm, 25 mm before a block: fingertips have no room behind it at the usual depth of
+    2 cm.
+    """
     rods = [box((0.017, 0.0045, 0.0045), (0.052, 0.0, z)) for z in (0.03, -0.03)]
-    draft = Draft((box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0))))
+    draft = Draft(
+        (box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0)))
+    )
     cup = procedural._build("cup", "mug", draft, np.random.default_rng(0))
     assert cup is not None
     face = cup.pieces[0].pos[0] + 0.04
@@ -51,7 +57,10 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
         (GraspRequest(), "Scale it."),
         (GraspRequest(rest=2), "Leave out --rest, or scale it."),
         (GraspRequest(above=True), "Leave out --heading, or scale it."),
-        (GraspRequest({"heading": {"position": np.zeros(3)}}, rest=0), "Leave out --rest or --at, or scale it."),
+        (
+            GraspRequest({"heading": {"position": np.zeros(3)}}, rest=0),
+            "Leave out --rest or --at, or scale it.",
+        ),
     ],
 )
 def test_a_remedy_names_the_options_that_were_given(asked: GraspRequest, remedy: str) -> None:

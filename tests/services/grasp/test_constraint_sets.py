@@ -36,9 +36,14 @@ def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
             letters = words[1 : words.index(")")].replace(",", " ").split()
             assert len(letters) == arrays[name].ndim, name
             for letter, size in zip(letters, arrays[name].shape, strict=True):
-                assert size == (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)), name
+                assert size == (
+                    int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
+                ), name
         assert get_hand(meta["hand_reference"]) is HAND
-        assert meta["finger_joints"][0] == HAND.joints[0].name and meta["quaternions"] == "(w, x, y, z)"
+        assert (
+            meta["finger_joints"][0] == HAND.joints[0].name
+            and meta["quaternions"] == "(w, x, y, z)"
+        )
 
 
 def test_a_set_equals_the_bank_of_training(constraint_sets):
@@ -55,13 +60,19 @@ def test_a_set_equals_the_bank_of_training(constraint_sets):
         for r, cleared in enumerate(all_cleared):
             moved = np.linalg.norm(cleared.position - headings.position, axis=-1)
             allowed = arrays["heading/allowed"][0, r]
-            np.testing.assert_allclose(arrays["heading/back"][0, r][allowed], moved[allowed], atol=1e-6)
-        np.testing.assert_allclose(arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4)
+            np.testing.assert_allclose(
+                arrays["heading/back"][0, r][allowed], moved[allowed], atol=1e-6
+            )
+        np.testing.assert_allclose(
+            arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4
+        )
 
 
 def test_files_round_trip(constraint_sets, file):
     read = stored_sets.load(file)
-    assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(constraint_sets[2].meta)
+    assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(
+        constraint_sets[2].meta
+    )
     for name, array in constraint_sets[2].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
 
@@ -83,7 +94,9 @@ def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        sets, "make_sets", lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or []
+        sets,
+        "make_sets",
+        lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or [],
     )
     store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
@@ -100,10 +113,17 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
 
 def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file, tmp_path):
     request = read_request(MUG, HAND, 15, pose=f"{file}:3")
-    np.testing.assert_array_equal(request.given("pose", "q"), constraint_sets[2].arrays["pose/q"][0, 3])
-    with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
+    np.testing.assert_array_equal(
+        request.given("pose", "q"), constraint_sets[2].arrays["pose/q"][0, 3]
+    )
+    with pytest.raises(
+        CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"
+    ):
         read_request(BOX, HAND, 15, trajectory=str(file))
     larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})
     file = sets.save(larger, tmp_path)
-    with pytest.raises(CongraspError, match=r"human hand is trained on objects 1\.4 times as large: add --scale 1\.4"):
+    with pytest.raises(
+        CongraspError,
+        match=r"human hand is trained on objects 1\.4 times as large: add --scale 1\.4",
+    ):
         read_request(MUG.scaled(1 / 1.4), HAND, 15, pose=str(file))

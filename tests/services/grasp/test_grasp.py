@@ -29,7 +29,15 @@ from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
-from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
+from congrasp.services.grasp.files import (
+    MOTION,
+    OBJECT,
+    PICTURE,
+    PORTRAIT,
+    RECORDING,
+    RESULT,
+    save_grasp,
+)
 from congrasp.services.grasp.grasper import Grasper, _places
 from congrasp.services.grasp.jobs import Result, _identity
 from congrasp.services.grasp.motion import Grasp, costs
@@ -51,7 +59,9 @@ def block(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def grasper():
-    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(hold=0.25), threads=2)
+    grasper = Grasper(
+        bundles.load(policy_file(None)), attempts=4, phases=Phases(hold=0.25), threads=2
+    )
     yield grasper
     grasper.close()
 
@@ -68,13 +78,18 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     minus = block.points[:, 2] < 0
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
     request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
-    found = grasper.grasp(block, request, lambda what, done, total: reports.append((what, done, total)))
+    found = grasper.grasp(
+        block, request, lambda what, done, total: reports.append((what, done, total))
+    )
     steps = grasper.task.approach_steps + 25
     assert reports[0][0].startswith("Compiling") and reports[1] == ("Attempting", 1, steps)
     assert reports[-1][1:] == (steps, steps)
     assert 1 <= found.held <= found.attempts <= 12 and found.success
     motion = found.motion
-    assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
+    assert (
+        motion.constraints == ("heading", "affordance")
+        and motion.about["attempts"] == found.attempts
+    )
     assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
@@ -85,7 +100,10 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     # The held block keeps its height although there is no table.
     assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
     facts = found.facts()
-    assert facts["heading_rad"] < 0.5 and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
+    assert (
+        facts["heading_rad"] < 0.5
+        and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
+    )
 
     again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
@@ -93,16 +111,24 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
 
 def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
     begun, given = [], attempts._given
-    monkeypatch.setattr(attempts, "_given", lambda *arguments: begun.append(given(*arguments)) or begun[-1])
+    monkeypatch.setattr(
+        attempts, "_given", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
+    )
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
-    found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
+    found = grasper.grasp(
+        block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
+    )
     arrays = {name: np.asarray(value) for name, value in found.episode.arrays.items()}
     assert found.motion.hand == "human_left" and found.success
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
     np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
-    start = mirror.fields({name: np.asarray(x) for name, x in begun[-1][0].reset_state._asdict().items()})
-    chosen = np.linalg.norm(start["base_position"] - arrays["link_position"][0, 0], axis=-1).argmin()
+    start = mirror.fields(
+        {name: np.asarray(x) for name, x in begun[-1][0].reset_state._asdict().items()}
+    )
+    chosen = np.linalg.norm(
+        start["base_position"] - arrays["link_position"][0, 0], axis=-1
+    ).argmin()
     physics = NativePhysics(get_hand("human:left"), grasper.task, [block], 1)
     physics.start(ResetState(**{name: x[[chosen]] for name, x in start.items()}))
     for step, target in enumerate(np.concatenate([arrays["u_target"], arrays["q_target"]], -1)):
@@ -132,7 +158,9 @@ def test_costs_of_attempts():
 
 
 def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
-    """Attempts hold objects that are light or narrow enough; the cause is the limit that was exceeded."""
+    """Attempts hold objects that are light or narrow enough; the cause is the limit that was
+    exceeded.
+    """
     four = Grasper(bundles.load(policy_file(None)), attempts=4)
 
     def cause(request, may_be_held):
@@ -144,19 +172,23 @@ def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
 
     free, light, narrow = GraspRequest(), 0.3 * block.mass, 0.8 * SIDES[0]
     assert cause(free, lambda obj: obj.mass < light) == (
-        f"Its weight is the cause: with a quarter of its {1000 * block.mass:.0f} g 4 of 4 attempts hold it."
+        f"Its weight is the cause: with a quarter of its {1000 * block.mass:.0f} g 4 of 4 attempts "
+        f"hold it."
     )
-    assert cause(free, lambda obj: np.ptp(obj.points[:, 0]) < narrow and obj.mass == block.mass) == (
-        "Its width is the cause: with 70 % of its size 4 of 4 attempts hold it."
-    )
+    assert cause(
+        free, lambda obj: np.ptp(obj.points[:, 0]) < narrow and obj.mass == block.mass
+    ) == ("Its width is the cause: with 70 % of its size 4 of 4 attempts hold it.")
     assert cause(free, lambda obj: False) == ""
-    placed = GraspRequest({"heading": {"position": np.zeros(3)}})  # in the frame of an object of this size
+    # In the frame of an object of this size
+    placed = GraspRequest({"heading": {"position": np.zeros(3)}})
     assert cause(placed, lambda obj: np.ptp(obj.points[:, 0]) < narrow) == ""
 
 
 def test_a_grasp_lifts_the_block_off_the_table(block):
     """In the simulation the hand rises, and the block with it; the table stays."""
-    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2)
+    lifting = Grasper(
+        bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2
+    )
     upright = int(np.argmax(block.rest_poses[:, 2]))
     found = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()
@@ -165,22 +197,33 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
     seconds = lifting.task.approach_steps * lifting.task.control_dt
     assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + seconds)
     assert motion.table.all() and found.success
-    grasped, lifted, held = (round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold"))
+    grasped, lifted, held = (
+        round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold")
+    )
     assert len(motion.time) == held + 25
     np.testing.assert_allclose(motion.object_position[:grasped, 2], SIDES[2] / 2, atol=2e-3)
-    assert motion.object_position[-1, 2] - motion.object_position[lifted, 2] == pytest.approx(0.1, abs=0.02)
+    assert motion.object_position[-1, 2] - motion.object_position[lifted, 2] == pytest.approx(
+        0.1, abs=0.02
+    )
     assert (np.linalg.norm(motion.link_force[held:], axis=-1).sum(-1) > 0.5).all()
-    assert np.linalg.norm(np.diff(motion.wrist_position[lifted:held], axis=0), axis=-1).max() < 0.6 * motion.control_dt
+    assert (
+        np.linalg.norm(np.diff(motion.wrist_position[lifted:held], axis=0), axis=-1).max()
+        < 0.6 * motion.control_dt
+    )
 
 
 def test_impossible_requests(block, grasper):
     lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
-    with pytest.raises(CongraspError, match=f'come through the table.* straight down is --heading "{words}"'):
+    with pytest.raises(
+        CongraspError, match=f'come through the table.* straight down is --heading "{words}"'
+    ):
         grasper.grasp(lying, GraspRequest({"heading": {"direction": -down}}))
     below = {"q": grasper.hand.q_open, "position": down, "quaternion": np.array([1.0, 0, 0, 0])}
-    with pytest.raises(CongraspError, match="would be in the table in every resting pose of 'block'"):
+    with pytest.raises(
+        CongraspError, match="would be in the table in every resting pose of 'block'"
+    ):
         grasper.grasp(lying, GraspRequest({"heading": {}, "pose": below}))
 
 
@@ -194,9 +237,14 @@ def fake_grasps(monkeypatch, quick_import):
         made = episode(success=obj.name != "loose")
         made.meta.update(object=obj.name, phases={"grasp": 0.0, "hold": 0.04})
         made.meta["metrics"] |= dict.fromkeys(
-            ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"), 0.01
+            ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"),
+            0.01,
         )
-        made.meta["metrics"] |= {"affordance_ratio": 0.0, "moved_at_removal": 0.0, "force_link_max": 3.0}
+        made.meta["metrics"] |= {
+            "affordance_ratio": 0.0,
+            "moved_at_removal": 0.0,
+            "force_link_max": 3.0,
+        }
         made.meta["metrics"]["held"] = float(made.meta["success"])
         made.meta["metrics"]["push_survival"] = float(made.meta["object"] == "a")
         return Grasp(made, motion_of_episode(made), 4, 3, 0, ("The heading guides the wrist.",))
@@ -226,7 +274,9 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
     size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
-    assert f"{size}; held, also against pushes of 1 N; best of 4 attempts, 3 of which hold it" in line
+    assert (
+        f"{size}; held, also against pushes of 1 N; best of 4 attempts, 3 of which hold it" in line
+    )
     assert f"b: {size}; held; best of" in captured.out
     assert "2 of 3 objects are held; 1 could not be used" in captured.out
     summary = json.loads((out / "summary.json").read_text())
@@ -266,7 +316,10 @@ def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):
     assert "not held" in capsys.readouterr().out
     assert command(tmp_path / "nothing.stl", "--out", tmp_path / "out") == 2
     assert "There is no file" in capsys.readouterr().err
-    assert command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again") == 2
+    assert (
+        command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again")
+        == 2
+    )
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
 
@@ -281,8 +334,13 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
         red, _, blue = np.moveaxis(image, -1, 0)
-        orange, skin = (red > 90) & (blue < 0.5 * red), (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red)
-        for part in np.array_split(np.arange(image.shape[1]), columns)[: 2 if name == OBJECT else columns]:
+        orange, skin = (
+            (red > 90) & (blue < 0.5 * red),
+            (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red),
+        )
+        for part in np.array_split(np.arange(image.shape[1]), columns)[
+            : 2 if name == OBJECT else columns
+        ]:
             assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
     assert (tmp_path / "out" / "summary.png").exists()
 
@@ -297,7 +355,9 @@ def test_a_grasp_is_a_constraint_of_the_next(tmp_path, block, grasper, monkeypat
 
 
 def test_an_upright_resting_pose_is_preferred():
-    """The mug's likeliest resting pose is on its side; upright precedes it, unless the request names a pose."""
+    """The mug's likeliest resting pose is on its side; upright precedes it, unless the request
+    names a pose.
+    """
     mug = procedural.generate(0, "mug")
     upright = upright_rest(mug)
     assert upright is not None and upright > 0

@@ -31,7 +31,9 @@ def block(tmp_path_factory):
     mesh.apply_scale(1000)
     mesh.export(folder / "block.stl")
     with quick_imports():
-        return objects_of(folder / "block.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
+        return objects_of(
+            folder / "block.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache"))
+        )[0]
 
 
 def asked(obj, **constraints):
@@ -56,7 +58,12 @@ def test_headings_are_numbers_or_a_word(block):
     with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
         asked(block, at="0 0 40")
     uneven = [np.zeros((2, 3)), np.zeros((2, 2))]
-    bad = ("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction"), (uneven, "not 3")
+    bad = (
+        ("down", "'down', not 3 numbers"),
+        ("1 2", "'1 2', not 3"),
+        ("0 0 0", "has no direction"),
+        (uneven, "not 3"),
+    )
     for text, complaint in bad:
         with pytest.raises(CongraspError, match=complaint):
             asked(block, heading=text)
@@ -69,21 +76,37 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     upper.export(tmp_path / "upper.ply")
     high = block.points[:, 2] > 0.01
     clear = np.abs(block.points[:, 2] - 0.01) > 0.005
-    np.testing.assert_array_equal(asked(block, affordance=str(tmp_path / "upper.ply")).avoid[clear], ~high[clear])
-    np.testing.assert_array_equal(asked(block, avoid=tmp_path / "upper.ply").avoid[clear], high[clear])
+    np.testing.assert_array_equal(
+        asked(block, affordance=str(tmp_path / "upper.ply")).avoid[clear], ~high[clear]
+    )
+    np.testing.assert_array_equal(
+        asked(block, avoid=tmp_path / "upper.ply").avoid[clear], high[clear]
+    )
     trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
-    np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear])
+    np.testing.assert_array_equal(
+        asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear]
+    )
     np.testing.assert_array_equal(asked(block, affordance="near half").avoid, block.labels == 1)
-    with pytest.raises(CongraspError, match=r"--affordance 'near half' and --avoid 'near half' contradict each other"):
+    with pytest.raises(
+        CongraspError,
+        match=r"--affordance 'near half' and --avoid 'near half' contradict each other",
+    ):
         asked(block, affordance="near half", avoid="near half")
-    with pytest.raises(CongraspError, match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid"):
+    with pytest.raises(
+        CongraspError,
+        match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid",
+    ):
         asked(block, colour="red")
-    with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
+    with pytest.raises(
+        CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"
+    ):
         asked(block, affordance="handle")
     with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):
         asked(block, affordance=str(tmp_path / "none.ply"))
     trimesh.creation.box(SIDES).export(tmp_path / "metres.ply")
-    with pytest.raises(CongraspError, match=r"Nothing of .*metres\.ply' lies on the surface of 'block'"):
+    with pytest.raises(
+        CongraspError, match=r"Nothing of .*metres\.ply' lies on the surface of 'block'"
+    ):
         asked(block, affordance=str(tmp_path / "metres.ply"))
 
 
@@ -94,7 +117,11 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
     given = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
     np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
     np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
-    upper = trimesh.creation.box((0.04, 0.05, 0.05)).apply_translation(np.add(CENTER, [0, 0, 0.035])).apply_scale(1000)
+    upper = (
+        trimesh.creation.box((0.04, 0.05, 0.05))
+        .apply_translation(np.add(CENTER, [0, 0, 0.035]))
+        .apply_scale(1000)
+    )
     upper.vertices = upper.vertices[:, [0, 2, 1]] * [1, 1, -1]
     high, clear = block.points[:, 2] > 0.01, np.abs(block.points[:, 2] - 0.01) > 0.005
     for suffix in ("ply", "glb", "stl"):
@@ -115,10 +142,14 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     pose = given.constraints["pose"]
     last = 7  # the last moment with the table
     np.testing.assert_array_equal(pose["q"], motion.joint_position[last])
-    np.testing.assert_allclose(pose["position"], motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6)
+    np.testing.assert_allclose(
+        pose["position"], motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6
+    )
     path, turns = given.constraints["trajectory"].values()
     assert path.shape == (15, 3) and turns.shape == (15, 4)
-    np.testing.assert_allclose(path[[0, -1]], motion.wrist_position[[0, last]] - [0, 0, HEIGHT / 2], atol=1e-6)
+    np.testing.assert_allclose(
+        path[[0, -1]], motion.wrist_position[[0, last]] - [0, 0, HEIGHT / 2], atol=1e-6
+    )
     steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
     np.testing.assert_allclose(steps, steps[0], rtol=1e-4)
 
@@ -129,13 +160,19 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     np.testing.assert_allclose(pose["quaternion"], [1, 0, 0, 0])
     assert pose["q"][3] == pytest.approx(0.3) and not pose["q"][:3].any()
 
-    (tmp_path / "path.csv").write_text("x,y,z,w,x,y,z\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n")
-    path, turns = asked(block, trajectory=str(tmp_path / "path.csv")).constraints["trajectory"].values()
+    (tmp_path / "path.csv").write_text(
+        "x,y,z,w,x,y,z\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n"
+    )
+    path, turns = (
+        asked(block, trajectory=str(tmp_path / "path.csv")).constraints["trajectory"].values()
+    )
     np.testing.assert_allclose(path[:, 2], np.linspace(0.4, 0.2, 15), atol=1e-6)
     np.testing.assert_allclose(np.abs(turns[:, 0]), 1)
     assert (turns[:, 0] > 0).all() or (turns[:, 0] < 0).all()
     for written in (";", "\t", " ", " , "):  # as spreadsheets write it, with a byte order mark
-        text = "x,y,z,w,x,y,z\r\n0.1,-0.2,0.7,1,0,0,0\r\n0.1,-0.2,0.5,-1,0,0,0\r\n".replace(",", written)
+        text = "x,y,z,w,x,y,z\r\n0.1,-0.2,0.7,1,0,0,0\r\n0.1,-0.2,0.5,-1,0,0,0\r\n".replace(
+            ",", written
+        )
         (tmp_path / "sheet.csv").write_text(text, "utf-8-sig")
         again = asked(block, trajectory=str(tmp_path / "sheet.csv")).constraints["trajectory"]
         np.testing.assert_array_equal(again["position"], path)
@@ -146,12 +183,30 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     [
         ("nothing", "is not JSON"),
         ("{}", "lacks 'joints'"),
-        ('{"joints": {"elbow": 1}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "has no joint 'elbow'"),
-        ('{"joints": {}, "position": [0,0], "quaternion": [1,0,0,0]}', "'position' of .* must be 3 finite"),
-        ('{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}', "the wrist of .* lies 5.* m from 'block'"),
-        ('{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}', "is at 45. Angles are in rad"),
-        ('{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}', "quaternion has no direction"),
-        ('{"joints": {}, "position": [0,0,1e999], "quaternion": [1,0,0,0]}', "'position' of .* must be 3 finite"),
+        (
+            '{"joints": {"elbow": 1}, "position": [0,0,0], "quaternion": [1,0,0,0]}',
+            "has no joint 'elbow'",
+        ),
+        (
+            '{"joints": {}, "position": [0,0], "quaternion": [1,0,0,0]}',
+            "'position' of .* must be 3 finite",
+        ),
+        (
+            '{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}',
+            "the wrist of .* lies 5.* m from 'block'",
+        ),
+        (
+            '{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}',
+            "is at 45. Angles are in rad",
+        ),
+        (
+            '{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}',
+            "quaternion has no direction",
+        ),
+        (
+            '{"joints": {}, "position": [0,0,1e999], "quaternion": [1,0,0,0]}',
+            "'position' of .* must be 3 finite",
+        ),
         (
             '{"joints": {}, "position": [0,0,1' + 400 * "0" + '], "quaternion": [1,0,0,0]}',
             "'position' of .* must be 3 finite",
@@ -182,7 +237,9 @@ def test_errors_name_the_fault_of_a_trajectory(block, tmp_path):
         ("0,1;0;0,2;1;0;0\n", 1),
     ):
         path.write_text(text)
-        with pytest.raises(CongraspError, match=rf"line {line} of .*path\.csv is not 7 finite numbers"):
+        with pytest.raises(
+            CongraspError, match=rf"line {line} of .*path\.csv is not 7 finite numbers"
+        ):
             asked(block, trajectory=str(path))
     for content, complaint in (
         (b"", "path.csv has no numbers"),
@@ -209,7 +266,10 @@ def test_huge_numbers_are_valid_directions_but_not_places(block):
 
 def test_a_motion_takes_no_number(block):
     for name in ("pose", "trajectory"):
-        with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 3. Leave the number out"):
+        with pytest.raises(
+            CongraspError,
+            match=r"grasp\.npz is one motion and has no number 3. Leave the number out",
+        ):
             asked(block, **{name: "grasp.npz:3"})
 
 

@@ -19,7 +19,15 @@ from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.files import _steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose
 from congrasp.services.grasp.parse import grasp_part
-from congrasp.services.grasp.reach import ACCELERATION, CLEARANCE, SPEED, TURNING, Reach, plan_reach, with_reach
+from congrasp.services.grasp.reach import (
+    ACCELERATION,
+    CLEARANCE,
+    SPEED,
+    TURNING,
+    Reach,
+    plan_reach,
+    with_reach,
+)
 from congrasp.services.viz.render import grasp_steps
 from tests.episodes import CONTROL_DT, episode
 
@@ -46,11 +54,15 @@ def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
 def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) exact distances of the hand's capsules from a ball, and from the table."""
     ball, table = [], []
-    origins = np.array([link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links])
+    origins = np.array(
+        [link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links]
+    )
     for q, turn, place in zip(reach.q, reach.rotation, reach.position, strict=True):
         position, quaternion = mujoco_link_poses(hand, q)
         links = Rotation.from_quat(quaternion, scalar_first=True)
-        for ends, radius, link in zip(hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True):
+        for ends, radius, link in zip(
+            hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True
+        ):
             a, b = turn.apply(links[int(link)].apply(ends - origins[link]) + position[link]) + place
             share = np.clip((center - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
             ball.append(np.linalg.norm(a + share * (b - a) - center) - BALL - radius)
@@ -60,14 +72,19 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 @pytest.mark.parametrize(
-    ("name", "heading", "speed"), [("human", (-1.0, 0.2, -0.4), 0.36), ("allegro", (0.0, 0.0, -1.0), 0.0)]
+    ("name", "heading", "speed"),
+    [("human", (-1.0, 0.2, -0.4), 0.36), ("allegro", (0.0, 0.0, -1.0), 0.0)],
 )
-def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(name, heading, speed, ball) -> None:
+def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
+    name, heading, speed, ball
+) -> None:
     hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
     reach = plan_reach(hand, ball, rest, way, first, 0.2, DT, speed)
-    away, end = (np.linalg.norm((place - rest[:3])[:2]) for place in (reach.position[0], first.position[0]))
+    away, end = (
+        np.linalg.norm((place - rest[:3])[:2]) for place in (reach.position[0], first.position[0])
+    )
     assert away == pytest.approx(max(0.45, end + 0.22), abs=1e-6)
     whole = Reach(
         np.concatenate([reach.position, first.position]),
@@ -92,7 +109,9 @@ def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(name, head
 
 def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
     hand, task = get_hand("human"), TaskConfig()
-    further = dataclasses.replace(task, control=dataclasses.replace(task.control, approach_position_limit=0.04))
+    further = dataclasses.replace(
+        task, control=dataclasses.replace(task.control, approach_position_limit=0.04)
+    )
     found = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
     assert found == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
 
@@ -101,9 +120,18 @@ def test_an_unreachable_grasp_is_an_error(ball) -> None:
     hand = get_hand("human")
     first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
     with pytest.raises(
-        CongraspError, match=r"Every planned approach to a grasp of .* touches .* Leave out the approach"
+        CongraspError,
+        match=r"Every planned approach to a grasp of .* touches .* Leave out the approach",
     ):
-        plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
+        plan_reach(
+            hand,
+            ball,
+            np.asarray(ball.rest_poses[0], float),
+            np.array([0.0, 0.0, 1.0]),
+            first,
+            1.0,
+            DT,
+        )
 
 
 def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
@@ -111,27 +139,44 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     made.meta["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
     hand = get_hand("human")
     first = Rotation.from_quat(made.arrays["link_quaternion"][0, 0], scalar_first=True)
-    turns = Rotation.concatenate([first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)])
+    turns = Rotation.concatenate(
+        [first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)]
+    )
     place = made.arrays["link_position"][0, 0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
     longer = with_reach(made, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
-    assert longer.meta["phases"] == {"approach": 0.0, "grasp": pytest.approx(0.03), "hold": pytest.approx(0.11)}
+    assert longer.meta["phases"] == {
+        "approach": 0.0,
+        "grasp": pytest.approx(0.03),
+        "hold": pytest.approx(0.11),
+    }
     motion = motion_of_episode(longer)
     assert len(motion.time) == 15 and motion.table[:11].all() and not motion.table[11:].any()
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
     np.testing.assert_allclose(motion.link_position[3:], made.arrays["link_position"])
-    assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[:3].any()
+    assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[
+        :3
+    ].any()
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
     u = longer.arrays["u"]
     for t in range(3):
         own = first * Rotation.from_euler("XYZ", u[t, 3:])
         assert (own.inv() * turns[t]).magnitude() < 1e-5
-        np.testing.assert_allclose(first.apply(u[t, :3]) + made.arrays["link_position"][0, 0], place[t], atol=1e-6)
+        np.testing.assert_allclose(
+            first.apply(u[t, :3]) + made.arrays["link_position"][0, 0], place[t], atol=1e-6
+        )
     # Used as a reference, such a motion is cut to its grasp.
     assert grasp_part(motion) == (3, 10) and grasp_steps(longer) == (3, 11)
-    lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}})
+    lifted = dataclasses.replace(
+        motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}}
+    )
     assert grasp_part(lifted) == (3, 7)
     # Files of other programs may hold any phases.
-    for odd in ("soon", {"lift": "soon", "grasp": -1.0}, {"lift": 1e300, "grasp": float("nan")}, {"grasp": 9e3}):
+    for odd in (
+        "soon",
+        {"lift": "soon", "grasp": -1.0},
+        {"lift": 1e300, "grasp": float("nan")},
+        {"grasp": 9e3},
+    ):
         first, end = grasp_part(dataclasses.replace(motion, about={"phases": odd}))
         assert 0 <= first <= end < len(motion.time)
         longer.meta["phases"] = odd
@@ -151,7 +196,9 @@ def test_resting_poses_by_name_and_number() -> None:
         with pytest.raises(CongraspError, match=f"--rest is '{text}'"):
             rest_pose(mug, text)
     lying = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
-    with pytest.raises(CongraspError, match="does not rest with its z axis up in any of its 1 resting poses"):
+    with pytest.raises(
+        CongraspError, match="does not rest with its z axis up in any of its 1 resting poses"
+    ):
         rest_pose(lying, "upright")
 
 

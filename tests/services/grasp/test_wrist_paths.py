@@ -16,7 +16,9 @@ ROTATION = Rotation.from_rotvec(np.outer(T, [0.4, -0.3, 0.8]))
 
 
 def bvh(path, order="ZXY", unit=0.01):
-    """Writes a skeleton of three joints, y up, whose hand follows the path; the angles of the arm are arbitrary."""
+    """Writes a skeleton of three joints, y up, whose hand follows the path; the angles of the arm
+    are arbitrary.
+    """
     up = Rotation.from_euler("X", -90, degrees=True)
     place, turn = up.apply(POSITION) / unit, up * ROTATION
     shoulder = Rotation.from_rotvec(np.outer(T, [0.2, 0.5, -0.1]))
@@ -70,7 +72,9 @@ def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
     found = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
     check(found)
     assert found.seconds == 0.02
-    file.write_text(file.read_text().replace("position", "POSITION").replace("rotation", "Rotation"))
+    file.write_text(
+        file.read_text().replace("position", "POSITION").replace("rotation", "Rotation")
+    )
     check(read_wrist_path(file, joint="Hand"))
 
 
@@ -113,21 +117,31 @@ ROS = "x,y,z,qx,qy,qz,qw"
             "vpq",
             ",",
         ),
-        ("wrist_x,wrist_y,wrist_z,acc_x,acc_y,acc_z,wrist_rot_x,wrist_rot_y,wrist_rot_z,wrist_rot_w", "pvq", ","),
+        (
+            "wrist_x,wrist_y,wrist_z,acc_x,acc_y,acc_z,wrist_rot_x,wrist_rot_y,wrist_rot_z,wrist_rot_w",
+            "pvq",
+            ",",
+        ),
         ("x_mm,y_mm,z_mm,qx,qy,qz,qw", "mq", ","),
         (
             "wrist_x,wrist_y,wrist_z,wrist_qx,wrist_qy,wrist_qz,wrist_qw,target_pos_x,target_pos_y,target_pos_z",
             "pqv",
             ",",
         ),
-        ("targetPosX,targetPosY,targetPosZ,wristPosX,wristPosY,wristPosZ,wristQX,wristQY,wristQZ,wristQW", "vpq", ","),
+        (
+            "targetPosX,targetPosY,targetPosZ,wristPosX,wristPosY,wristPosZ,wristQX,wristQY,wristQZ,wristQW",
+            "vpq",
+            ",",
+        ),
         (",".join(f"end_effector_{name}" for name in ROS.split(",")), "pq", ","),
         (",".join(f"torso_{name}" for name in ROS.split(",")), "pq", ","),
         ("title,of,the,file,and,its,cells,written\n" + ROS, "pq", ","),
         (ROS, "pq", " "),
         (
-            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_x [], q_RS_y [], q_RS_z [], q_RS_w [], "
-            "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_x [], q_RS_y [], "
+            "q_RS_z [], q_RS_w [], "
+            "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], "
+            "b_w_RS_S_y [rad s^-1], "
             "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]",
             "tpqvvv",
             ",",
@@ -149,8 +163,17 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
         check(read_wrist_path(tmp_path / name))
 
     rows = np.c_[POSITION, ROTATION.as_quat()].tolist()
-    save("ros.csv", f"stamp,frame_id,note,{ROS}", [[i, "", '"a, b"', *row] for i, row in enumerate(rows)])
-    save("dec.csv", ROS.replace(",", ";"), [[str(x).replace(".", ",") for x in row] for row in rows], ";")
+    save(
+        "ros.csv",
+        f"stamp,frame_id,note,{ROS}",
+        [[i, "", '"a, b"', *row] for i, row in enumerate(rows)],
+    )
+    save(
+        "dec.csv",
+        ROS.replace(",", ";"),
+        [[str(x).replace(".", ",") for x in row] for row in rows],
+        ";",
+    )
     save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
     with pytest.raises(CongraspError, match="quaternions that are not of length one"):
         save("turned.csv", "X,Y,Z,W,X,Y,Z", [row[3:] + row[:3] for row in rows])
@@ -161,7 +184,10 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
     [
         ("vx,vy,vz,qx,qy,qz,qw", "no position"),
         ("p_v_x,p_v_y,p_v_z,qx,qy,qz,qw", "no position"),
-        ("x [m map],y [m map],z [m map],goal_x,goal_y,goal_z,qx,qy,qz,qw", "several positions: x, y, z, goal"),
+        (
+            "x [m map],y [m map],z [m map],goal_x,goal_y,goal_z,qx,qy,qz,qw",
+            "several positions: x, y, z, goal",
+        ),
         ("x,y,z,q1,q2,q3,q4", "no quaternion"),
         ("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]", "no quaternion"),
         ("x,y,z,roll,pitch,yaw,grip", "no quaternion"),
@@ -181,7 +207,9 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
 )
 def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, header, complaint):
     (tmp_path / "a.csv").write_text(f"{header}\n0,0,0,1,0,0,0\n")
-    with pytest.raises(CongraspError, match=rf"line 1 of .*a\.csv names {complaint}.*\. Name them x, y, z, qw"):
+    with pytest.raises(
+        CongraspError, match=rf"line 1 of .*a\.csv names {complaint}.*\. Name them x, y, z, qw"
+    ):
         read_wrist_path(tmp_path / "a.csv")
 
 
@@ -192,15 +220,35 @@ def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, h
         ("1,2,3,,x,y,z\n0,0,0,1,0,0,0", "line 1 of .* is not 7 finite numbers"),
         (f"{ROS}\nm,m,m,,,,\n0,0,0,0,0,0,1", "line 2 of .* is not 7 finite numbers"),
         (f"note,{ROS}\n{'a' * 200_000},0,0,0,0,0,0,1", "line 2 of .* cannot be read: field larger"),
-        ("Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 1 of .*export z up"),
-        ("Rotation,,,,Position,,\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 2 of .* names columns twice below another"),
-        (f"t,{ROS}\n0.0,0,0,0,0,0,0,1\n0.1,0,0,1,0,0,0,1\n0.1,0,0,2,0,0,0,1\n0,0,0,3,0,0,0,1", "line 5 .*earlier"),
+        (
+            "Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0",
+            "line 1 of .*export z up",
+        ),
+        (
+            "Rotation,,,,Position,,\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0",
+            "line 2 of .* names columns twice below another",
+        ),
+        (
+            f"t,{ROS}\n0.0,0,0,0,0,0,0,1\n0.1,0,0,1,0,0,0,1\n0.1,0,0,2,0,0,0,1\n0,0,0,3,0,0,0,1",
+            "line 5 .*earlier",
+        ),
         *(
             (f"{clock},{ROS}\n2,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1", "line 3 .*earlier")
-            for clock in ("Time (s)", "%time", "timestamp_ns", "timeStamp", "t_ms", "seconds", "stamp.sec")
+            for clock in (
+                "Time (s)",
+                "%time",
+                "timestamp_ns",
+                "timeStamp",
+                "t_ms",
+                "seconds",
+                "stamp.sec",
+            )
         ),
         (f"stamp_sec,stamp_ns,{ROS}\n7,5,0,0,0,0,0,0,1\n7,4,0,0,0,0,0,0,1", "line 3 .*earlier"),
-        (f"header.stamp.secs,{ROS}\n-1,0,0,0,0,0,0,1\n-2,0,0,1,0,0,0,1", "line 3 of .* is earlier .*Sort the lines"),
+        (
+            f"header.stamp.secs,{ROS}\n-1,0,0,0,0,0,0,1\n-2,0,0,1,0,0,0,1",
+            "line 3 of .* is earlier .*Sort the lines",
+        ),
         ("a" + "[ " * 300 + "_" * 40_000 + "\n", "has no numbers"),
     ],
 )
@@ -213,12 +261,20 @@ def test_lines_that_could_be_misread_are_refused(tmp_path, text, complaint):
 @pytest.mark.parametrize(
     "name",
     (
-        *("delta_time", "deltaTime", "frame_time", "exposure_time", "latency_seconds", "time_offset"),
+        *(
+            "delta_time",
+            "deltaTime",
+            "frame_time",
+            "exposure_time",
+            "latency_seconds",
+            "time_offset",
+        ),
         *("time_to_contact", "time_left", "header.stamp.nanosec"),
     ),
 )
 def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
-    lines = [f"{9 - i},{t},0,0,0,0,0,0,1" for i, t in enumerate((0.0, 1.0, 0.9995))]  # the last is jitter
+    # The last is jitter
+    lines = [f"{9 - i},{t},0,0,0,0,0,0,1" for i, t in enumerate((0.0, 1.0, 0.9995))]
     (tmp_path / "a.csv").write_text("\n".join([f"{name},header.stamp.sec,{ROS}", *lines]))
     assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
 
@@ -238,7 +294,9 @@ def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
     ],
 )
 def test_a_clock_has_one_or_two_columns_and_jitter_from_its_first_line_on(tmp_path, clock, times):
-    (tmp_path / "a.csv").write_text("\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)]))
+    (tmp_path / "a.csv").write_text(
+        "\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)])
+    )
     assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
 
 
@@ -254,7 +312,9 @@ def test_a_clock_has_one_or_two_columns_and_jitter_from_its_first_line_on(tmp_pa
     ],
 )
 def test_a_clock_that_runs_back_is_refused_however_long_the_file_is(tmp_path, clock, times):
-    (tmp_path / "a.csv").write_text("\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)]))
+    (tmp_path / "a.csv").write_text(
+        "\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)])
+    )
     with pytest.raises(CongraspError, match="is earlier than one before"):
         read_wrist_path(tmp_path / "a.csv")
 
@@ -269,7 +329,10 @@ def test_another_wrist_frame_is_converted(tmp_path):
 
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
-    [("Xrotation", "Xscale", "it has the channel Xscale"), ("CHANNELS 6", "CHANNELS 999", "it was cut")],
+    [
+        ("Xrotation", "Xscale", "it has the channel Xscale"),
+        ("CHANNELS 6", "CHANNELS 999", "it was cut"),
+    ],
 )
 def test_a_skeleton_that_could_be_misread_is_refused(tmp_path, old, new, complaint):
     file = bvh(tmp_path / "motion.bvh")
@@ -280,8 +343,12 @@ def test_a_skeleton_that_could_be_misread_is_refused(tmp_path, old, new, complai
 
 def test_a_joint_without_channels_moves_with_its_parents(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
-    file.write_text(file.read_text().replace("    JOINT Hand", "JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand"))
-    np.testing.assert_allclose(read_bvh(file, "Held")[1].as_matrix(), read_bvh(file, "Arm")[1].as_matrix())
+    file.write_text(
+        file.read_text().replace("    JOINT Hand", "JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand")
+    )
+    np.testing.assert_allclose(
+        read_bvh(file, "Held")[1].as_matrix(), read_bvh(file, "Arm")[1].as_matrix()
+    )
 
 
 def test_unreadable_files_are_errors(tmp_path):

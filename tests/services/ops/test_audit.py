@@ -1,4 +1,6 @@
-"""The audit finds what it is there to find: journals of a run in which something went wrong, by hand."""
+"""The audit finds what it is there to find: journals of a run in which something went wrong, by
+hand.
+"""
 
 import itertools
 import json
@@ -38,7 +40,14 @@ def learner(run_dir, *lines):
 
 
 def life(name="x", version=0):
-    return {"session_id": name, "run_id": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
+    return {
+        "session_id": name,
+        "run_id": "e",
+        "version": version,
+        "max_staleness": 1,
+        "kept": True,
+        "taken": [],
+    }
 
 
 def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
@@ -48,7 +57,11 @@ def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
 
 def faults(run_dir):
     report = audit(run_dir)
-    return {name: count for name, count in report.counts.items() if count and name not in ("made", "accepted", "used")}
+    return {
+        name: count
+        for name, count in report.counts.items()
+        if count and name not in ("made", "accepted", "used")
+    }
 
 
 def test_a_pipe_in_the_folder_holds_nobody_up(run_dir):
@@ -61,7 +74,14 @@ def test_a_pipe_in_the_folder_holds_nobody_up(run_dir):
 
 
 def test_all_is_well(run_dir):
-    learner(run_dir, life(), used(0, 1, lag=1), used(2, 3), {"dropped": [["a", "1", 4]]}, {"end": [["a", "1", 5]]})
+    learner(
+        run_dir,
+        life(),
+        used(0, 1, lag=1),
+        used(2, 3),
+        {"dropped": [["a", "1", 4]]},
+        {"end": [["a", "1", 5]]},
+    )
     report = audit(run_dir)
     assert faults(run_dir) == {"dropped": 1, "waiting": 1}
     assert (report.counts["made"], report.counts["accepted"], report.counts["used"]) == (6, 6, 4)
@@ -71,17 +91,42 @@ def test_all_is_well(run_dir):
 
 def test_lost_duplicated_corrupted_and_unmatched(run_dir, capsys):
     learner(
-        run_dir, life(), used(0), used(1), used(1, version=2), used(2, checksum="c9"), used(4),
-        {"version": 4, "used": [["a", "1", 77, 0, "c"]]}, {"end": [["a", "1", 5]]},
-    )  # fmt: skip
-    assert faults(run_dir) == {"lost": 1, "duplicated": 1, "corrupted": 1, "unmatched": 1, "waiting": 1}
+        run_dir,
+        life(),
+        used(0),
+        used(1),
+        used(1, version=2),
+        used(2, checksum="c9"),
+        used(4),
+        {"version": 4, "used": [["a", "1", 77, 0, "c"]]},
+        {"end": [["a", "1", 5]]},
+    )
+    assert faults(run_dir) == {
+        "lost": 1,
+        "duplicated": 1,
+        "corrupted": 1,
+        "unmatched": 1,
+        "waiting": 1,
+    }
     assert "a/1/3: accepted, but missing afterwards" in audit(run_dir).faults
     assert command(run_dir) == 1 and "a/1/3" in capsys.readouterr().out
 
 
 def test_what_a_resume_undid_is_no_duplicate_and_no_loss(run_dir):
-    """The checkpoint is of version 2: uses from there on are undone; 2 and 3 came again, 4 and 5 did not."""
-    learner(run_dir, life(), used(0), used(1), used(2), used(3), used(4), life("y", version=2), used(2, 3, version=6))
+    """The checkpoint is of version 2: uses from there on are undone; 2 and 3 came again, 4 and 5
+    did not.
+    """
+    learner(
+        run_dir,
+        life(),
+        used(0),
+        used(1),
+        used(2),
+        used(3),
+        used(4),
+        life("y", version=2),
+        used(2, 3, version=6),
+    )
     assert faults(run_dir) == {"undone": 1, "too old after a restart": 1}
 
 
@@ -119,7 +164,12 @@ def test_empty_and_malformed_journals_are_damage_and_no_traceback(run_dir, capsy
         path.write_bytes(content)
         assert faults(run_dir) == {"not in the journals": 6}
         assert command(run_dir) == (6 if content.endswith(b"\n") and content.strip(b"\n") else 7)
-    odd = ({"session_id": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
+    odd = (
+        {"session_id": "x"},
+        {"used": 7, "version": 0},
+        {"used": [[1]], "version": 0},
+        {"end": [["a", "1", 10**30]]},
+    )
     path.write_text("".join(f"{json.dumps(line)}\n" for line in odd))
     (run_dir / AUDIT / "b.jsonl").write_text('{"actor": 5}\n{"made": [1]}\n{"answer": 0}\n')
     assert (faults(run_dir), audit(run_dir).damaged) == ({"not in the journals": 6}, 7)
@@ -138,7 +188,9 @@ def test_loss_surplus_and_damage_have_exit_codes_of_their_own(run_dir, tmp_path)
 
 
 def test_what_a_torn_line_told_is_no_surplus(run_dir):
-    """The disk was full for two lines of an actor's journal, and took a part of the first: it is among the two."""
+    """The disk was full for two lines of an actor's journal, and took a part of the first: it is
+    among the two.
+    """
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
     path = run_dir / AUDIT / "a.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -152,31 +204,52 @@ def test_what_a_torn_line_told_is_no_surplus(run_dir):
 
 
 def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
-    """Its writer comes back: its next line counts the unfinished one, and what it told is not judged."""
+    """Its writer comes back: its next line counts the unfinished one, and what it told is not
+    judged.
+    """
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
     path = run_dir / AUDIT / "a.jsonl"
     path.write_bytes(path.read_bytes()[:-30])
     assert (audit(run_dir).holes, audit(run_dir).damaged) == (1, 0)
     Journal(path).write(actor="a", incarnation="2")
     report = audit(run_dir)
-    assert (report.holes, report.damaged, report.exit_code, report.counts["accepted"]) == (1, 0, 0, 5)
+    assert (report.holes, report.damaged, report.exit_code, report.counts["accepted"]) == (
+        1,
+        0,
+        0,
+        5,
+    )
 
 
 def test_lines_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
     for path in (run_dir / AUDIT).iterdir():
         lines = [json.loads(line) for line in path.read_text().split("\n") if line]
-        texts = [json.dumps({k: v for k, v in line.items() if k not in ("after", "crc32")})[:-1] for line in lines]
-        path.write_text("".join(f'{text}, "crc32": "{zlib.crc32(text.encode()):08x}"}}\n' for text in texts))
+        texts = [
+            json.dumps({k: v for k, v in line.items() if k not in ("after", "crc32")})[:-1]
+            for line in lines
+        ]
+        path.write_text(
+            "".join(f'{text}, "crc32": "{zlib.crc32(text.encode()):08x}"}}\n' for text in texts)
+        )
     Journal(run_dir / AUDIT / "a.jsonl").write(actor="a", incarnation="2")
     report = audit(run_dir)
-    assert (report.counts["used"], report.unchecked, report.damaged, report.missing) == (6, 18, 0, 0)
+    assert (report.counts["used"], report.unchecked, report.damaged, report.missing) == (
+        6,
+        18,
+        0,
+        0,
+    )
     assert command(run_dir) == 0
-    assert any("older versions" in line and "18" in line for line in capsys.readouterr().out.split("\n"))
+    assert any(
+        "older versions" in line and "18" in line for line in capsys.readouterr().out.split("\n")
+    )
 
 
 @pytest.mark.parametrize("which", ["a.jsonl", "learner-0.jsonl"])
-def test_lines_that_were_cut_out_show_and_an_emptied_journal_is_no_clean_one(tmp_path, which, capsys):
+def test_lines_that_were_cut_out_show_and_an_emptied_journal_is_no_clean_one(
+    tmp_path, which, capsys
+):
     whole_run(tmp_path)
     assert command(tmp_path) == 0
     path = tmp_path / AUDIT / which
@@ -184,31 +257,56 @@ def test_lines_that_were_cut_out_show_and_an_emptied_journal_is_no_clean_one(tmp
     for first, end in [*itertools.pairwise(range(len(lines))), (0, 3), (2, len(lines) - 1)]:
         path.write_bytes(b"".join(lines[:first] + lines[end:]))
         capsys.readouterr()
-        assert (audit(tmp_path).missing, audit(tmp_path).faults, command(tmp_path)) == (1, [], 7), (first, end)
-        assert "Lines are missing at 1 place(s)" in (said := capsys.readouterr().out) and "cannot be judged" in said
+        assert (audit(tmp_path).missing, audit(tmp_path).faults, command(tmp_path)) == (1, [], 7), (
+            first,
+            end,
+        )
+        assert (
+            "Lines are missing at 1 place(s)" in (said := capsys.readouterr().out)
+            and "cannot be judged" in said
+        )
     path.write_bytes(b"")
     assert (audit(tmp_path).missing, command(tmp_path)) == (1, 7)
 
 
 def whole_run(folder):
-    """Two incarnations of an actor, two sessions of the learner with a resume between them, and no fault."""
+    """Two incarnations of an actor, two sessions of the learner with a resume between them, and no
+    fault.
+    """
     actor = Journal(folder / AUDIT / "a.jsonl")
     for incarnation in "12":
         who = {"actor": "a", "incarnation": incarnation}
         actor.write(**who)
         for sequence, checksum in enumerate(CONTENT[:4]):
             actor.write(**who, made=sequence, version=sequence, checksum=checksum)
-            actor.write(**who, answer=sequence, outcome="accepted", session_id="x" if incarnation == "1" else "y")
+            actor.write(
+                **who,
+                answer=sequence,
+                outcome="accepted",
+                session_id="x" if incarnation == "1" else "y",
+            )
             if incarnation == "1" and sequence >= 2:
                 actor.write(**who, answer=sequence, outcome="accepted", session_id="y")
     learner(
-        folder, life(), used(0), used(1), used(2), used(3),
-        life("y", version=2), used(2, version=5), used(3, version=6),
-        {"dropped": [["a", "2", 0]]}, used(1, 2, version=7, incarnation="2"), {"end": [["a", "2", 3]]},
-    )  # fmt: skip
+        folder,
+        life(),
+        used(0),
+        used(1),
+        used(2),
+        used(3),
+        life("y", version=2),
+        used(2, version=5),
+        used(3, version=6),
+        {"dropped": [["a", "2", 0]]},
+        used(1, 2, version=7, incarnation="2"),
+        {"end": [["a", "2", 3]]},
+    )
 
 
-garbage = st.one_of(st.binary(max_size=40), st.sampled_from([b"{}", b"null", b"[]", b'{"made": 1}', b'{"end": [[1]]}']))
+garbage = st.one_of(
+    st.binary(max_size=40),
+    st.sampled_from([b"{}", b"null", b"[]", b'{"made": 1}', b'{"end": [[1]]}']),
+)
 injuries = st.one_of(
     st.tuples(st.just("cut"), st.floats(0, 1), st.none()),
     st.tuples(st.just("flip"), st.floats(0, 1), st.integers(0, 7)),
@@ -232,7 +330,10 @@ def injure(data, injury):
 
 
 @settings(max_examples=400, deadline=None)
-@given(which=st.sampled_from(["a.jsonl", "learner-0.jsonl"]), wounds=st.lists(injuries, min_size=1, max_size=3))
+@given(
+    which=st.sampled_from(["a.jsonl", "learner-0.jsonl"]),
+    wounds=st.lists(injuries, min_size=1, max_size=3),
+)
 def test_damage_is_never_a_traceback_and_never_called_a_loss(which, wounds):
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
@@ -244,7 +345,11 @@ def test_damage_is_never_a_traceback_and_never_called_a_loss(which, wounds):
             data = injure(data, wound) if data else data
         path.write_bytes(data)
         report = audit(folder)
-        assert not report.counts["lost"] and not report.counts["duplicated"] and not report.counts["corrupted"]
+        assert (
+            not report.counts["lost"]
+            and not report.counts["duplicated"]
+            and not report.counts["corrupted"]
+        )
         # Where a journal's end was cut off between two lines, nothing shows that there were more.
         assert not report.faults or any(kind == "cut" for kind, *_ in wounds)
         if [kind for kind, *_ in wounds] == ["flip"]:

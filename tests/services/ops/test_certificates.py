@@ -9,7 +9,13 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.certificates import find, read
-from congrasp.common.transport.security import NUMBERS, Credentials, check_exposure, parse_identity, secured
+from congrasp.common.transport.security import (
+    NUMBERS,
+    Credentials,
+    check_exposure,
+    parse_identity,
+    secured,
+)
 from congrasp.services.ops.certificates import certificates, create_authority, issue, revoke
 
 
@@ -20,17 +26,30 @@ def folder(tmp_path):
 
 
 def test_a_certificate_says_run_role_number_hosts_and_end(folder):
-    made = read(issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt")
+    made = read(
+        issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt"
+    )
     assert (made.name, made.identity) == ("human.learner.0", ("human", "learner", 0))
     assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
     assert made.expires.utcoffset() == datetime.timedelta(0) and 29.99 < made.days <= 30
     assert read(issue(folder, "learner") / "tls.crt").name == "human.learner.1"
     other = issue(folder, "learner", run="a.b-c")
-    assert read(other / "tls.crt").identity == Credentials(other, "learner").identity == ("a.b-c", "learner", 2)
-    assert read(issue(folder, "actor", days=7000) / "tls.crt").expires <= read(folder / "ca.crt").expires
+    assert (
+        read(other / "tls.crt").identity
+        == Credentials(other, "learner").identity
+        == ("a.b-c", "learner", 2)
+    )
+    assert (
+        read(issue(folder, "actor", days=7000) / "tls.crt").expires
+        <= read(folder / "ca.crt").expires
+    )
     assert [one.name for one in certificates(folder)] == [
-        "ca", "a.b-c.learner.2", "human.actor.0", "human.learner.0", "human.learner.1",
-    ]  # fmt: skip
+        "ca",
+        "a.b-c.learner.2",
+        "human.actor.0",
+        "human.learner.0",
+        "human.learner.1",
+    ]
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
@@ -38,12 +57,25 @@ def test_openssl_agrees_who_may_listen(folder, tmp_path):
     create_authority(tmp_path / "other")
 
     def verify(ca, certificate, purpose):
-        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", ca, certificate]
+        command = [
+            "openssl",
+            "verify",
+            "-x509_strict",
+            "-purpose",
+            purpose,
+            "-CAfile",
+            ca,
+            certificate,
+        ]
         return subprocess.run(command, capture_output=True, check=False, timeout=20).returncode == 0
 
     learner, actor = issue(folder, "learner") / "tls.crt", issue(folder, "actor") / "tls.crt"
     ca = folder / "ca.crt"
-    assert verify(ca, learner, "sslserver") and verify(ca, learner, "sslclient") and verify(ca, actor, "sslclient")
+    assert (
+        verify(ca, learner, "sslserver")
+        and verify(ca, learner, "sslclient")
+        and verify(ca, actor, "sslclient")
+    )
     assert not verify(ca, actor, "sslserver")
     assert not verify(tmp_path / "other" / "ca.crt", actor, "sslclient")
 
@@ -108,7 +140,9 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
         find(other, "actor")
 
 
-@pytest.mark.parametrize("name", ["", "actor.0", ".actor.0", "r.boss.0", "r.actor.256", "r.actor.-1", "r.actor.x"])
+@pytest.mark.parametrize(
+    "name", ["", "actor.0", ".actor.0", "r.boss.0", "r.actor.256", "r.actor.-1", "r.actor.x"]
+)
 def test_a_common_name_that_is_none_of_ours_is_nobodys(name):
     assert parse_identity(name) is None
     assert parse_identity("r.s.actor.255") == ("r.s", "actor", 255)
@@ -120,7 +154,10 @@ def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(f
     assert revoke(folder, "actor", 3) == "human.actor.3"
     assert Credentials(learner, "learner").revoked() == {"human.actor.0", "human.actor.3"}
     assert Credentials(actor, "actor").revoked() == {"human.actor.0", "human.actor.3"}
-    assert Credentials(issue(folder, "server"), "server").revoked() == {"human.actor.0", "human.actor.3"}
+    assert Credentials(issue(folder, "server"), "server").revoked() == {
+        "human.actor.0",
+        "human.actor.3",
+    }
     with pytest.raises(CongraspError, match="is revoked"):
         issue(folder, "actor", number=0, force=True)
     assert [issue(folder, "actor").name for _ in range(3)] == ["actor.1", "actor.2", "actor.4"]
@@ -134,7 +171,11 @@ def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(f
 
 def test_with_credentials_every_endpoint_is_tls(tmp_path):
     some = Credentials(tmp_path, "actor")
-    assert secured("tcp/10.0.0.5:7447", some) == secured("tls/10.0.0.5:7447", some) == "tls/10.0.0.5:7447"
+    assert (
+        secured("tcp/10.0.0.5:7447", some)
+        == secured("tls/10.0.0.5:7447", some)
+        == "tls/10.0.0.5:7447"
+    )
     assert secured("tcp/10.0.0.5:7447", None) == "tcp/10.0.0.5:7447"
     with pytest.raises(CongraspError, match="cannot be used with certificates"):
         secured("udp/10.0.0.5:7447", some)

@@ -20,7 +20,18 @@ from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.ops.doctor import doctor as command
 from tests.rollouts import learner_hub
 
-ALWAYS = ("python", "mujoco", "mujoco-mjx", "jax", "flax", "eclipse-zenoh", "gpu", "ports", "disk", "clock")
+ALWAYS = (
+    "python",
+    "mujoco",
+    "mujoco-mjx",
+    "jax",
+    "flax",
+    "eclipse-zenoh",
+    "gpu",
+    "ports",
+    "disk",
+    "clock",
+)
 
 
 def findings(**options):
@@ -39,7 +50,9 @@ def test_this_machine_is_looked_at(capsys):
 
 def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypatch, capsys):
     real = importlib.metadata.version
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name))
+    monkeypatch.setattr(
+        importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name)
+    )
     found = findings()
     assert not found["mujoco"].fine and "4.0.0: ==3.17.0 is needed" in found["mujoco"].text
     assert "4.0.0 and 3.17.0 do not match" in found["mujoco, mujoco-mjx"].text
@@ -87,12 +100,22 @@ CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda 
         (
             "disk",
             "0.1 GiB free: a run needs about 2 GiB",
-            lambda m: m.setattr(doctor.shutil, "disk_usage", lambda path: collections.namedtuple("U", "free")(10**8)),
+            lambda m: m.setattr(
+                doctor.shutil, "disk_usage", lambda path: collections.namedtuple("U", "free")(10**8)
+            ),
         ),
         ("disk", "written at 0 MB/s: .*--run-dir", _slow),
         ("clock", "years behind; set it", lambda m: m.setattr(doctor.time, "time", lambda: 0.0)),
-        ("clock", "jumped by", lambda m: m.setattr(doctor.time, "time", itertools.count(2_000_000_000, 5).__next__)),
-        ("python", "3.10.4: 3.11, 3.12", lambda m: m.setattr(doctor.platform, "python_version", lambda: "3.10.4")),
+        (
+            "clock",
+            "jumped by",
+            lambda m: m.setattr(doctor.time, "time", itertools.count(2_000_000_000, 5).__next__),
+        ),
+        (
+            "python",
+            "3.10.4: 3.11, 3.12",
+            lambda m: m.setattr(doctor.platform, "python_version", lambda: "3.10.4"),
+        ),
         ("jax", "NVIDIA GPU is not found", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
         ("gpu", "install the NVIDIA driver", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
         ("jax", "RuntimeError: no such device", lambda m: m.setattr(jax, "devices", _broken)),
@@ -114,10 +137,14 @@ def _broken():
 def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
     answer = "NVIDIA H100, 81559, 1024, 535.1\nNVIDIA H100, 81559, 0, 580.65\n"
     monkeypatch.setattr(doctor, "_NVIDIA", os.devnull)
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer))
+    monkeypatch.setattr(
+        subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer)
+    )
     found = {finding.what: finding for finding in doctor._gpu()}
     assert not found["gpu 0"].fine and "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
-    assert found["gpu 1"].fine and found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
+    assert (
+        found["gpu 1"].fine and found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
+    )
 
 
 def test_certificates_are_looked_at(tmp_path):

@@ -1,4 +1,6 @@
-"""Signals end a process within its grace, even one whose main thread cannot listen; children do not outlive parents."""
+"""Signals end a process within its grace, even one whose main thread cannot listen; children do not
+outlive parents.
+"""
 
 import os
 import signal

@@ -28,9 +28,25 @@ STATUS = {
     "warnings": [],
     "queue": {"length": 1, "limit": 64},
     "rates": {"rollouts_per_second": 0.5, "steps_per_second": 100.0},
-    "counters": {"granted": 9, "redeemed": 8, "accepted": 8, "consumed": 7, "running": 1, "queued": 1, "capacity": 3},
+    "counters": {
+        "granted": 9,
+        "redeemed": 8,
+        "accepted": 8,
+        "consumed": 7,
+        "running": 1,
+        "queued": 1,
+        "capacity": 3,
+    },
     "roles": [
-        {"role": "actor", "id": "a", "incarnation": "1", "version": 6, "lag": 1, "rollouts": 8, "steps_per_second": 9},
+        {
+            "role": "actor",
+            "id": "a",
+            "incarnation": "1",
+            "version": 6,
+            "lag": 1,
+            "rollouts": 8,
+            "steps_per_second": 9,
+        },
         {"role": "learner", "id": "0", "incarnation": "2"},
     ],
     "unlisted": 0,
@@ -41,7 +57,11 @@ def scrape(port: int) -> dict[tuple[str, ...], float]:
     """Samples by their name and the values of their labels."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as reply:
         families = text_string_to_metric_families(reply.read().decode())
-        return {(one.name, *one.labels.values()): one.value for family in families for one in family.samples}
+        return {
+            (one.name, *one.labels.values()): one.value
+            for family in families
+            for one in family.samples
+        }
 
 
 def test_a_learner_shows_its_status_and_its_last_update():
@@ -52,8 +72,14 @@ def test_a_learner_shows_its_status_and_its_last_update():
     assert found["congrasp_learner_version",] == 7 and found["congrasp_learner_ready",] == 1
     assert found["congrasp_learner_rollouts_total", "consumed"] == 7
     assert found["congrasp_learner_tickets_total", "granted"] == 9
-    assert found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",] == 4
-    assert found["congrasp_learner_actor_lag", "a", "1"] == 1 and found["congrasp_learner_roles", "actor"] == 1
+    assert (
+        found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",]
+        == 4
+    )
+    assert (
+        found["congrasp_learner_actor_lag", "a", "1"] == 1
+        and found["congrasp_learner_roles", "actor"] == 1
+    )
     assert found["congrasp_learner_update", "episode/success"] == 0.5
     assert found["process_resident_memory_bytes",] > 0
 
@@ -89,18 +115,30 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
     with exposed(port, "127.0.0.1", metrics):
         together(answer, range(4))
         found = scrape(port)
-    assert found["congrasp_policy_queries_total", "answered"] == 400 == found["congrasp_policy_batch_bucket", "4.0"]
+    assert (
+        found["congrasp_policy_queries_total", "answered"]
+        == 400
+        == found["congrasp_policy_batch_bucket", "4.0"]
+    )
     assert found["congrasp_policy_queries_total", "overloaded"] == 400
     assert found["congrasp_policy_seconds_bucket", "0.003"] == 0
-    assert found["congrasp_policy_seconds_bucket", "0.005"] == found["congrasp_policy_seconds_count",] == 400
+    assert (
+        found["congrasp_policy_seconds_bucket", "0.005"]
+        == found["congrasp_policy_seconds_count",]
+        == 400
+    )
     assert found["congrasp_policy_version",] == 5
 
 
 @contextlib.contextmanager
 def role(*arguments):
-    """A role that runs while the block does; what it has said is in the list afterwards. It must end when told to."""
+    """A role that runs while the block does; what it has said is in the list afterwards. It must
+    end when told to.
+    """
     command = [sys.executable, "-m", "congrasp", *arguments, "--log-format", "json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         lines: list[dict] = []
         try:
             yield lines
@@ -123,19 +161,49 @@ def scraped_until(port, condition):
 @pytest.mark.timeout(240)
 def test_a_learner_and_an_actor_are_scraped(tmp_path):
     endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
-    small = ("--network.hidden", "32", "--environments", "4", "--objects.count", "1", "--objects.families", "box")
+    small = (
+        "--network.hidden",
+        "32",
+        "--environments",
+        "4",
+        "--objects.count",
+        "1",
+        "--objects.families",
+        "box",
+    )
     learner = ("learner", "--run-dir", str(tmp_path / "run"), "--listen", endpoint, *small)
-    actor = ("actor", "--connect", endpoint, "--run", "quickstart", "--id", "worker", "--physics", "native")
-    with role(*learner, "--metrics-port", str(ports[0])), role(*actor, "--metrics-port", str(ports[1])) as said:
+    actor = (
+        "actor",
+        "--connect",
+        endpoint,
+        "--run",
+        "quickstart",
+        "--id",
+        "worker",
+        "--physics",
+        "native",
+    )
+    with (
+        role(*learner, "--metrics-port", str(ports[0])),
+        role(*actor, "--metrics-port", str(ports[1])) as said,
+    ):
         wanted = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
         found = scraped_until(ports[0], lambda found: wanted.items() <= found.items())
         assert found["congrasp_learner_counters_balanced",] == 1
         # One rollout an update, for the next version and the one after it.
-        assert found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",] == 2
+        assert (
+            found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",]
+            == 2
+        )
         assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
-    assert all(line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said)
+    assert all(
+        line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said
+    )
     assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
-    assert said[0]["text"] == f"Connected to the learner at {endpoint}." and (said[0]["role"], said[0]["id"]) == (
+    assert said[0]["text"] == f"Connected to the learner at {endpoint}." and (
+        said[0]["role"],
+        said[0]["id"],
+    ) == (
         "actor",
         "worker",
     )
@@ -150,7 +218,8 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     assert line["text"].startswith("'nonsense' is not an endpoint.")
     with pytest.raises(SystemExit):
         main(["grasp", "nowhere.obj"])
-    assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")  # no log of before
+    # No log of before
+    assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")
 
 
 def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
@@ -166,7 +235,10 @@ def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
     assert log_error("It is refused.") and not log_error("It is refused.")
     logging.getLogger("library").warning("after the log")
     lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert [(line["level"], line["text"]) for line in lines] == [("warning", "closing"), ("error", "It is refused.")]
+    assert [(line["level"], line["text"]) for line in lines] == [
+        ("warning", "closing"),
+        ("error", "It is refused."),
+    ]
 
 
 def test_a_full_disk_under_a_log_costs_lines_and_not_the_process(monkeypatch):
@@ -184,5 +256,8 @@ def test_a_port_in_use_is_an_error_in_words():
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", port))
         busy.listen()
-        with pytest.raises(CongraspError, match=rf"127.0.0.1:{port}: .*--metrics-port"), exposed(port, "127.0.0.1"):
+        with (
+            pytest.raises(CongraspError, match=rf"127.0.0.1:{port}: .*--metrics-port"),
+            exposed(port, "127.0.0.1"),
+        ):
             pass

@@ -34,7 +34,10 @@ def endpoint():
         with ZenohTransport(connect=[endpoint]) as actor:
             actor.declare_alive(Keys("r").alive("actor", "worker-7", "1f"))
             sent = rollout(0.5, form, actor="worker-7", incarnation="1f", sequence=0, run_id="e")
-            assert actor.query(Keys("r").rollout("worker-7"), sent, timeout=5.0).meta["outcome"] == "accepted"
+            assert (
+                actor.query(Keys("r").rollout("worker-7"), sent, timeout=5.0).meta["outcome"]
+                == "accepted"
+            )
             yield endpoint
 
 
@@ -42,13 +45,18 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert Status(connect=endpoint, run="r", json=True)() == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["run"], found["version"], found["counters"]["accepted"]) == ("r", 0, 1)
-    assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
+    assert [(role["role"], role["id"]) for role in found["roles"]] == [
+        ("actor", "worker-7"),
+        ("learner", "0"),
+    ]
     actor = found["roles"][0]
     assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
     assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
     assert Status(connect=endpoint, run="r")() == 0
     text = capsys.readouterr().out
-    assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
+    assert (
+        "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
+    )
 
 
 def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
@@ -69,9 +77,15 @@ def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
     folder, other = tmp_path / "run", {"connect": "tcp/127.0.0.1:1"}
     for command, named in (
         *((Status, named) for named in (other, {"run": "r"})),
-        *((View, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
+        *(
+            (View, named)
+            for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})
+        ),
     ):
-        with pytest.raises(CongraspError, match=r"run is in place of --connect.*\. Give either the folder or these\."):
+        with pytest.raises(
+            CongraspError,
+            match=r"run is in place of --connect.*\. Give either the folder or these\.",
+        ):
             command(folder, **named)()
 
 
@@ -82,7 +96,10 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
     lost = copy.deepcopy(found)
     lost["counters"]["accepted"] += 1
     (words,) = warnings(lost)
-    assert words == "The counters are inconsistent: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    assert (
+        words
+        == "The counters are inconsistent: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    )
     lost["counters"]["queued"] += 1
     (words,) = warnings(lost)
     assert words == "2 rollouts are counted as queued, but the queue holds 1."
@@ -105,7 +122,9 @@ def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
 
 
 def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):
-    """600 liveliness tokens of one certificate, some with names that a terminal or a table would take for more."""
+    """600 liveliness tokens of one certificate, some with names that a terminal or a table would
+    take for more.
+    """
     found = ask_with_tokens(endpoint, 600)
     assert len(found["roles"]) == 66 and found["unlisted"] == 600 - 64
     assert any(role["id"] == "worker-7" for role in found["roles"])

@@ -1,4 +1,6 @@
-"""What one peer's logs can cost a recorder and a live viewer: names, schemas, bytes and time, and no traceback."""
+"""What one peer's logs can cost a recorder and a live viewer: names, schemas, bytes and time, and
+no traceback.
+"""
 
 import itertools
 import os
@@ -66,7 +68,9 @@ def test_a_recorder_keeps_its_size(tmp_path):
     """150 log messages of new names made the recorder of an earlier version grow by 1.8 GB."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RECORDER, str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=100, check=True)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=100, check=True
+    )
     assert int(done.stdout) < 150  # MiB, of which the messages that wait have some
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 30 << 20
 
@@ -110,7 +114,9 @@ def _odd(tmp_path):
 
 
 def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
-    """Nothing but a CongraspError of one short line, no file is opened (a pipe would wait for ever), nothing hangs."""
+    """Nothing but a CongraspError of one short line, no file is opened (a pipe would wait for
+    ever), nothing hangs.
+    """
     convert, whole = Converter(), episode()
     messages = {
         "metrics": metrics(loss=1.0),
@@ -145,7 +151,11 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
 def test_episodes_that_are_none_are_refused(change, why):
     whole = episode()
     with pytest.raises(CongraspError, match=why):
-        Converter()(KEYS.log("episode", "actor", "a"), Message({**whole.arrays, **change}, whole.meta), 10**18)
+        Converter()(
+            KEYS.log("episode", "actor", "a"),
+            Message({**whole.arrays, **change}, whole.meta),
+            10**18,
+        )
 
 
 def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
@@ -162,7 +172,8 @@ def test_a_live_view_bounds_what_waits(monkeypatch):
     monkeypatch.setattr("congrasp.services.record.live._BYTES", 1 << 20)
     convert = Converter()
     with LiveServer(0) as server:
-        entries = convert(KEYS.log("episode", "actor", "1.b"), episode(), 2**62)  # to be sent in a hundred years
+        # To be sent in a hundred years
+        entries = convert(KEYS.log("episode", "actor", "1.b"), episode(), 2**62)
         for _ in range(200):
             for entry in entries:
                 server.write(entry)

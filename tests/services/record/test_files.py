@@ -15,7 +15,13 @@ from mcap.reader import make_reader
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.record.reader import log_files, read_metrics, read_records
-from congrasp.services.record.writer import CONVENTIONS, Entry, JsonChannels, LogWriter, opaque_channel
+from congrasp.services.record.writer import (
+    CONVENTIONS,
+    Entry,
+    JsonChannels,
+    LogWriter,
+    opaque_channel,
+)
 from tests.children import python
 from tests.recordings import is_complete
 
@@ -25,7 +31,11 @@ SECOND = 10**9
 def metric_entries(count: int, start: int = 0) -> list[Entry]:
     channels = JsonChannels()
     return [
-        channels.entry("/metrics/learner/0", i * SECOND, {"update": i, "values": {"kl": i / 10, "term": {"a": -i}}})
+        channels.entry(
+            "/metrics/learner/0",
+            i * SECOND,
+            {"update": i, "values": {"kl": i / 10, "term": {"a": -i}}},
+        )
         for i in range(start, start + count)
     ]
 
@@ -47,7 +57,11 @@ doctor = functools.partial(python, "-m", "pymcap_cli.cli", "doctor", env={"COLUM
 
 
 def test_a_finished_file_is_sound_and_says_what_its_numbers_mean(tmp_path: pathlib.Path) -> None:
-    raw = Entry(opaque_channel("/rollout/a", "congrasp.Rollout"), 5, encode(Message({"x": np.arange(3)}, {})))
+    raw = Entry(
+        opaque_channel("/rollout/a", "congrasp.Rollout"),
+        5,
+        encode(Message({"x": np.arange(3)}, {})),
+    )
     (path,) = write(tmp_path, [*metric_entries(20), raw])
     assert path.suffix == ".mcap" and is_complete(path)
     checked = doctor(path)
@@ -68,7 +82,9 @@ def test_metrics_come_back_with_their_names(tmp_path: pathlib.Path) -> None:
 
 def test_after_a_resume_the_later_value_of_an_update_counts(tmp_path: pathlib.Path) -> None:
     channels = JsonChannels()
-    again = [channels.entry("/metrics/learner/0", 100 * SECOND, {"update": 2, "values": {"kl": 9.0}})]
+    again = [
+        channels.entry("/metrics/learner/0", 100 * SECOND, {"update": 2, "values": {"kl": 9.0}})
+    ]
     write(tmp_path, metric_entries(4) + again)
     steps, values = read_metrics(tmp_path)["learner/0/kl"]
     np.testing.assert_array_equal(steps, [0, 1, 2, 3])
@@ -84,7 +100,9 @@ def test_rotation_by_age_and_by_size_keeps_everything(tmp_path: pathlib.Path) ->
     entries = [Entry(blob, i, noise.bytes(1 << 20)) for i in range(6)]
     by_size = write(tmp_path / "size", entries, max_bytes=2 << 20)
     assert len(by_size) >= 2
-    assert [r.data for path in log_files(tmp_path / "size") for r in read_records(path)] == [e.data for e in entries]
+    assert [r.data for path in log_files(tmp_path / "size") for r in read_records(path)] == [
+        e.data for e in entries
+    ]
 
 
 def test_what_belongs_together_is_not_split_over_files(tmp_path: pathlib.Path) -> None:
@@ -102,13 +120,22 @@ def test_writers_in_one_folder_leave_each_others_files_alone(tmp_path: pathlib.P
         writer.write(*metric_entries(count))
     first.close()
     second.close()
-    files = [*first.files, *second.files, *write(tmp_path, metric_entries(3)), *write(tmp_path, metric_entries(4))]
-    assert [len(updates(path)) for path in files] == [1, 2, 3, 4] and sorted(tmp_path.iterdir()) == sorted(files)
+    files = [
+        *first.files,
+        *second.files,
+        *write(tmp_path, metric_entries(3)),
+        *write(tmp_path, metric_entries(4)),
+    ]
+    assert [len(updates(path)) for path in files] == [1, 2, 3, 4] and sorted(
+        tmp_path.iterdir()
+    ) == sorted(files)
 
 
 @settings(max_examples=30, deadline=None)
 @given(share=st.floats(0, 1))
-def test_a_file_cut_anywhere_gives_a_beginning(tmp_path_factory: pytest.TempPathFactory, share: float) -> None:
+def test_a_file_cut_anywhere_gives_a_beginning(
+    tmp_path_factory: pytest.TempPathFactory, share: float
+) -> None:
     path, _ = flushed_file(tmp_path_factory.mktemp("cut"))
     whole, cut = path.read_bytes(), path.with_name("cut.mcap.part")
     cut.write_bytes(whole[: round(share * len(whole))])
@@ -132,7 +159,9 @@ class FullDisk(io.FileIO):
 
 
 def test_a_full_disk_is_an_error_and_keeps_what_was_flushed(tmp_path: pathlib.Path) -> None:
-    writer = LogWriter(tmp_path, "log", open_file=lambda path: io.BufferedWriter(FullDisk(path, 20_000)))
+    writer = LogWriter(
+        tmp_path, "log", open_file=lambda path: io.BufferedWriter(FullDisk(path, 20_000))
+    )
     flushed = 0
     with pytest.raises(OSError, match="No space left"):
         for entry in metric_entries(5_000):
@@ -160,7 +189,9 @@ def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
         LogWriter(tmp_path / "file" / "logs", "log")
 
 
-def flushed_file(directory: pathlib.Path, chunks: int = 5) -> tuple[pathlib.Path, list[tuple[int, int]]]:
+def flushed_file(
+    directory: pathlib.Path, chunks: int = 5
+) -> tuple[pathlib.Path, list[tuple[int, int]]]:
     """A finished file with three messages in each chunk, and where its chunks are."""
     writer = LogWriter(directory, "log")
     for entries in (metric_entries(3, 3 * i) for i in range(chunks)):
@@ -184,12 +215,16 @@ def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_pat
     records = list(read_records(path, warn=said.append))
     read = [json.loads(record.data)["update"] for record in records]
     assert read == [i for i in range(15) if i // 3 != damaged]
-    assert {(record.topic, record.schema) for record in records} == {("/metrics/learner/0", records[0].schema)}
+    assert {(record.topic, record.schema) for record in records} == {
+        ("/metrics/learner/0", records[0].schema)
+    }
     places = f"damaged in 1 place(s), at byte {start}; at least 3 message(s) were dropped."
     assert said == [f"{path} is {places}"]
 
 
-def test_what_was_dropped_is_warned_of_by_default(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_was_dropped_is_warned_of_by_default(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path, ((start, length), *_) = flushed_file(tmp_path)
     assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 15 and not caplog.messages
     data = path.read_bytes()
@@ -200,7 +235,9 @@ def test_what_was_dropped_is_warned_of_by_default(tmp_path: pathlib.Path, caplog
 
 @settings(max_examples=150, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(tmp_path_factory, place, bit):
+def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
+    tmp_path_factory, place, bit
+):
     folder = tmp_path_factory.mktemp("flip")
     path, _ = flushed_file(folder)
     data = bytearray(path.read_bytes())
@@ -216,7 +253,13 @@ def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(tmp_pa
 
 
 @settings(max_examples=60, deadline=None)
-@given(wounds=st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=60), st.integers(0, 60)), min_size=1, max_size=4))
+@given(
+    wounds=st.lists(
+        st.tuples(st.floats(0, 1), st.binary(max_size=60), st.integers(0, 60)),
+        min_size=1,
+        max_size=4,
+    )
+)
 def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(tmp_path_factory, wounds):
     path, _ = flushed_file(tmp_path_factory.mktemp("wounds"))
     data = path.read_bytes()

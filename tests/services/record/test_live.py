@@ -51,7 +51,8 @@ class Viewer:
                     self.advertised[channel["topic"]] = channel
                 self._subscribe(message["channels"])
             elif message["op"] == "status" and "Unknown channel" in message["message"]:
-                # The server tells viewers of a new channel a moment before it takes subscriptions to it.
+                # The server tells viewers of a new channel a moment before it takes subscriptions
+                # to it.
                 self._subscribe(list(self.advertised.values()))
 
     def _subscribe(self, channels: list[dict[str, str]]) -> None:
@@ -64,7 +65,9 @@ class Viewer:
 
 
 def viewer(server: LiveServer) -> ClientConnection:
-    return connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], max_size=1 << 24)
+    return connect(
+        f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], max_size=1 << 24
+    )
 
 
 def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.Path) -> None:
@@ -81,7 +84,9 @@ def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.
             seen.listen(0.05)
             if len(seen.frames["/metrics/learner/0"]) >= 3:
                 break
-        while len(seen.frames["/episode/a0/tf"]) < 6:  # an episode of 1.5 s may be over before the viewer subscribes
+        while (
+            len(seen.frames["/episode/a0/tf"]) < 6
+        ):  # an episode of 1.5 s may be over before the viewer subscribes
             seen.frames["/episode/a0/tf"].clear()
             transport.publish(keys.log("episode", "actor", "a0"), episode(150))
             seen.listen(3.0)
@@ -142,9 +147,15 @@ def test_a_schema_that_grows_replaces_its_channel() -> None:
 def test_other_sites_in_a_browser_cannot_watch(headers: dict[str, str], admitted: bool) -> None:
     with LiveServer(0) as server:
         address = f"127.0.0.1:{server.port}"
-        lines = {"Host": address, "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
-                 "Sec-WebSocket-Key": "x3JJHMbDL1EzLkh9GBhXDw==", "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
-                 **headers}  # fmt: skip
+        lines = {
+            "Host": address,
+            "Connection": "Upgrade",
+            "Upgrade": "websocket",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "x3JJHMbDL1EzLkh9GBhXDw==",
+            "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
+            **headers,
+        }
         with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as connection:
             text = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
             connection.sendall(f"GET / HTTP/1.1\r\n{text}\r\n".encode())
@@ -153,5 +164,8 @@ def test_other_sites_in_a_browser_cannot_watch(headers: dict[str, str], admitted
 
 
 def test_a_busy_port_is_said_in_words() -> None:
-    with LiveServer(0) as server, pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"):
+    with (
+        LiveServer(0) as server,
+        pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"),
+    ):
         LiveServer(server.port)

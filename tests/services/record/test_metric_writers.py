@@ -21,19 +21,27 @@ from tests.episodes import episode
 def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
     """A run of which a learner, an actor and an episode are recorded."""
     keys, config, logs = Keys("r"), RunConfig(name="r"), folder / "logs"
-    with MemoryTransport(MemoryHub()) as transport, recorded(transport, config, folder, logs, names) as running:
+    with (
+        MemoryTransport(MemoryHub()) as transport,
+        recorded(transport, config, folder, logs, names) as running,
+    ):
         for update in updates:
             values = {"episode/success": update / 10, "kl": 0.25, "bad": float("nan")}
             transport.publish(
-                keys.log("metrics", "learner", "0"), Message({}, {"time": 0.0, "update": update, "values": values})
+                keys.log("metrics", "learner", "0"),
+                Message({}, {"time": 0.0, "update": update, "values": values}),
             )
-        transport.publish(keys.log("metrics", "actor", "a"), Message({}, {"time": 0.0, "values": {"pace": 1.0}}))
+        transport.publish(
+            keys.log("metrics", "actor", "a"), Message({}, {"time": 0.0, "values": {"pace": 1.0}})
+        )
         transport.publish(keys.log("episode", "actor", "a"), episode(3))
     assert running.error == ""
 
 
 def events(folder: pathlib.Path) -> list[list[Event]]:
-    """What is in each event file, by the framing that TensorFlow documents: length, its CRC, data, its CRC."""
+    """What is in each event file, by the framing that TensorFlow documents: length, its CRC, data,
+    its CRC.
+    """
     found = []
     for path in sorted(folder.iterdir()):
         data, at = path.read_bytes(), 0
@@ -45,23 +53,31 @@ def events(folder: pathlib.Path) -> list[list[Event]]:
     return found
 
 
-def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(tmp_path: pathlib.Path) -> None:
+def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
+    tmp_path: pathlib.Path,
+) -> None:
     publish(tmp_path, ["tensorboard"], range(5))
     assert [path.name for path in (tmp_path / "tensorboard").iterdir()] == ["learner-0"]
     (first,) = events(tmp_path / "tensorboard" / "learner-0")
     assert first[0].file_version == "brain.Event:2"
     scalars = {(e.step, v.tag): v.simple_value for e in first for v in e.summary.value}
-    assert set(scalars) == {(update, tag) for update in range(5) for tag in ("episode/success", "kl")}
+    assert set(scalars) == {
+        (update, tag) for update in range(5) for tag in ("episode/success", "kl")
+    }
     assert scalars[3, "episode/success"] == pytest.approx(0.3)
     assert (first[1].step, first[1].session_log.status) == (0, SessionLog.START)
     publish(tmp_path, ["tensorboard"], range(3, 6))
-    second = [found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3]
+    second = [
+        found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3
+    ]
     assert len(second) == 1 and second[0][1].session_log.status == SessionLog.START
     # The MCAP has the same, whatever the writer does.
     np.testing.assert_array_equal(read_metrics(tmp_path / "logs")["learner/0/kl"][0], range(6))
 
 
-def test_weights_and_biases_offline(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_and_biases_offline(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WANDB_API_KEY", "")
     publish(tmp_path, ["wandb-offline"], range(3))
     (file,) = (tmp_path / "wandb").glob("offline-run-*/run-*.wandb")

@@ -31,16 +31,25 @@ def test_a_motion_survives_its_file_and_the_file_says_what_every_array_means(tmp
         assert set(meta["arrays"]) == set(file.files) - {"meta"}
         sizes = {"T": 12, "F": 20, "L": 16, "K": 5}
         for name, meaning in meta["arrays"].items():
-            axes = [axis.strip() for axis in meaning[1 : meaning.index(")")].split(",") if axis.strip()]
+            axes = [
+                axis.strip() for axis in meaning[1 : meaning.index(")")].split(",") if axis.strip()
+            ]
             assert file[name].ndim == len(axes), name
             wanted = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
-            assert all(n in (None, size) for n, size in zip(wanted, file[name].shape, strict=True)), name
+            assert all(
+                n in (None, size) for n, size in zip(wanted, file[name].shape, strict=True)
+            ), name
 
 
 def test_rounded_quaternions_of_an_episode_are_normalised(tmp_path):
     whole = episode()
-    rounded = {name: 1.002 * np.asarray(whole.arrays[name]) for name in ("link_quaternion", "object_quaternion")}
-    save_motion(tmp_path / "a.npz", motion_of_episode(Message({**whole.arrays, **rounded}, whole.meta)))
+    rounded = {
+        name: 1.002 * np.asarray(whole.arrays[name])
+        for name in ("link_quaternion", "object_quaternion")
+    }
+    save_motion(
+        tmp_path / "a.npz", motion_of_episode(Message({**whole.arrays, **rounded}, whole.meta))
+    )
     again, motion = load_motion(tmp_path / "a.npz"), motion_of_episode(whole)
     for name in ("wrist_quaternion", "link_quaternion", "object_quaternion"):
         np.testing.assert_allclose(getattr(again, name), getattr(motion, name), atol=1e-6)
@@ -55,10 +64,19 @@ def test_a_file_of_the_first_format_is_read(tmp_path):
     arrays["trajectory_position"] = motion.goal["trajectory_position"]
     arrays["trajectory_quaternion"] = motion.goal["trajectory_quaternion"]
     meta = {"format": 1, "hand": "human", "object": "mug", "success": True, "control_dt": 0.01}
-    meta |= {"constraints": ["heading", "pose", "trajectory"], "metrics": {"held": 1.0}, "about": {"version": 3}}
+    meta |= {
+        "constraints": ["heading", "pose", "trajectory"],
+        "metrics": {"held": 1.0},
+        "about": {"version": 3},
+    }
     np.savez_compressed(path := tmp_path / "older.npz", **arrays, meta=np.array(json.dumps(meta)))
     read = load_motion(path)
-    assert (read.hand, read.object, read.success, read.metrics) == ("human", "mug", True, {"held": 1.0})
+    assert (read.hand, read.object, read.success, read.metrics) == (
+        "human",
+        "mug",
+        True,
+        {"held": 1.0},
+    )
     assert read.constraints == ("heading", "pose", "trajectory") and "pose_joints" not in read.goal
     wanted = {name: value for name, value in motion.goal.items() if name != "heading_cross"}
     np.testing.assert_equal(read.goal, wanted)
@@ -67,7 +85,9 @@ def test_a_file_of_the_first_format_is_read(tmp_path):
     np.testing.assert_equal(load_motion(again).goal, wanted)
     arrays["pose_joints"] = arrays["pose_joints"][:3]
     np.savez_compressed(path, **arrays, meta=np.array(json.dumps(meta)))
-    with pytest.raises(CongraspError, match=r"pose_q has shape \(3,\), but \(F,\) requires \(20,\)"):
+    with pytest.raises(
+        CongraspError, match=r"pose_q has shape \(3,\), but \(F,\) requires \(20,\)"
+    ):
         load_motion(path)
 
 
@@ -81,9 +101,15 @@ def test_arrays_that_are_not_known_are_left_alone(tmp_path):
 def test_the_file_alone_suffices_for_the_kinematics():
     motion = motion_of_episode(episode())
     q = motion.joint_position[-1]
-    turns, places = [], []  # of every link: x = turn x0 + place, for x0 of the wrist frame with all joints at zero
+    # Of every link: x = turn x0 + place, for x0 of the wrist frame with all joints at zero
+    turns, places = (
+        [],
+        [],
+    )
     for link, parent in enumerate(motion.link_parent):
-        turn, place = (Rotation.identity(), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
+        turn, place = (
+            (Rotation.identity(), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
+        )
         for j in np.flatnonzero(motion.joint_link == link):
             own = Rotation.from_rotvec(q[j] * motion.joint_axis[j])
             place = place + turn.apply(motion.joint_anchor[j] - own.apply(motion.joint_anchor[j]))
@@ -94,6 +120,8 @@ def test_the_file_alone_suffices_for_the_kinematics():
     for link in range(len(motion.link_names)):
         joints = np.flatnonzero(motion.joint_link == link)
         origin = motion.joint_anchor[joints[0]] if len(joints) else np.zeros(3)
-        np.testing.assert_allclose(turns[link].apply(origin) + places[link], position[link], atol=1e-6)
+        np.testing.assert_allclose(
+            turns[link].apply(origin) + places[link], position[link], atol=1e-6
+        )
         expected = Rotation.from_quat(quaternion[link], scalar_first=True)
         assert (turns[link] * expected.inv()).magnitude() < 1e-5

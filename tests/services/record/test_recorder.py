@@ -20,7 +20,13 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.reader import log_files, read_episodes, read_metrics, read_records, read_rollouts
+from congrasp.services.record.reader import (
+    log_files,
+    read_episodes,
+    read_metrics,
+    read_records,
+    read_rollouts,
+)
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
@@ -41,19 +47,26 @@ def transport() -> MemoryTransport:
     return MemoryTransport(MemoryHub())
 
 
-def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
+def test_everything_a_run_publishes_is_in_the_file(
+    transport: MemoryTransport, tmp_path: pathlib.Path
+) -> None:
     rollout = Message({"reward": np.ones((4, 2), np.float32)}, {"actor": "a0"})
     absent = {"pose_m": float("nan"), "return": 1.0}
     with Recorder(transport, "r", tmp_path) as recorder:
         for update in range(3):
             transport.publish(METRICS, metrics(update))
         transport.publish(
-            KEYS.log("metrics", "actor", "a0"), Message({}, {"time": 0.0, "values": {"pace": 5, **absent}})
+            KEYS.log("metrics", "actor", "a0"),
+            Message({}, {"time": 0.0, "values": {"pace": 5, **absent}}),
         )
         transport.publish(
-            KEYS.log("event", "actor", "a0"), Message({}, {"time": 0.0, "level": "warning", "text": "hot"})
+            KEYS.log("event", "actor", "a0"),
+            Message({}, {"time": 0.0, "level": "warning", "text": "hot"}),
         )
-        transport.publish(KEYS.log("version", "learner", "0"), Message({}, {"version": 7, "hash": "ab", "list": [1]}))
+        transport.publish(
+            KEYS.log("version", "learner", "0"),
+            Message({}, {"version": 7, "hash": "ab", "list": [1]}),
+        )
         transport.publish(KEYS.log("rollout", "actor", "a0"), rollout)
         sent = Message(episode().arrays, {**episode().meta, "metrics": absent})
         transport.publish(KEYS.log("episode", "actor", "a0"), sent)
@@ -70,7 +83,10 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
         "/events/actor/a0",
         "/version/learner/0",
         "/rollout/a0",
-        *(f"/episode/a0/{part}" for part in ("raw", "scene", "surface", "tf", "contacts", "signals")),
+        *(
+            f"/episode/a0/{part}"
+            for part in ("raw", "scene", "surface", "tf", "contacts", "signals")
+        ),
         *(f"/episode/a0/hand/{link.name}" for link in get_hand("human").links),
     }
     assert len(topics["/metrics/learner/0"]) == 3
@@ -85,7 +101,9 @@ def test_everything_a_run_publishes_is_in_the_file(transport: MemoryTransport, t
         np.testing.assert_array_equal(read.arrays[name], array)
 
 
-def test_damaged_messages_are_left_out_and_counted(transport: MemoryTransport, tmp_path: pathlib.Path) -> None:
+def test_damaged_messages_are_left_out_and_counted(
+    transport: MemoryTransport, tmp_path: pathlib.Path
+) -> None:
     said: list[str] = []
     broken = Message({**episode().arrays, "link_position": np.zeros(3)}, episode().meta)
     with Recorder(transport, "r", tmp_path, warn=said.append) as recorder:
@@ -147,8 +165,21 @@ def test_files_rotate_while_recording(transport: MemoryTransport, tmp_path: path
 
 @contextlib.contextmanager
 def recorder_process(endpoint: str, out: pathlib.Path) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "congrasp", "record", "--connect", endpoint, "--run", "r", "--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "congrasp",
+        "record",
+        "--connect",
+        endpoint,
+        "--run",
+        "r",
+        "--out",
+        str(out),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             yield process
         finally:
@@ -170,7 +201,11 @@ def publish_until(transport: ZenohTransport, done: Callable[[], bool]) -> int:
 
 
 def recorded(out: pathlib.Path) -> int:
-    return sum(len(list(read_records(path))) for path in log_files(out)) if out.exists() and any(out.iterdir()) else 0
+    return (
+        sum(len(list(read_records(path))) for path in log_files(out))
+        if out.exists() and any(out.iterdir())
+        else 0
+    )
 
 
 def steps_in(out: pathlib.Path) -> np.ndarray:
@@ -179,7 +214,10 @@ def steps_in(out: pathlib.Path) -> np.ndarray:
 
 def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ZenohTransport(listen=[endpoint]) as transport, recorder_process(endpoint, tmp_path / "out") as process:
+    with (
+        ZenohTransport(listen=[endpoint]) as transport,
+        recorder_process(endpoint, tmp_path / "out") as process,
+    ):
         publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
         transport.publish(KEYS.log("episode", "actor", "a0"), episode())
         eventually(lambda: bool(list(read_episodes(tmp_path / "out"))))
@@ -206,11 +244,23 @@ def test_a_killed_recorder_leaves_every_record_up_to_its_last_flush_and_the_run_
 
 
 CUT = {
-    *("BAD_TRAILING_MAGIC", "MISSING_FOOTER", "MISSING_DATA_END", "MISSING_CHUNK_INDEXES", "MISSING_METADATA_INDEXES"),
-    *("MISSING_STATISTICS", "NO_ATTACHMENTS", "TRUNCATED_RECORD", "TRUNCATED_FILE", "CHUNK_COMPRESSION_INEFFICIENT"),
+    *(
+        "BAD_TRAILING_MAGIC",
+        "MISSING_FOOTER",
+        "MISSING_DATA_END",
+        "MISSING_CHUNK_INDEXES",
+        "MISSING_METADATA_INDEXES",
+    ),
+    *(
+        "MISSING_STATISTICS",
+        "NO_ATTACHMENTS",
+        "TRUNCATED_RECORD",
+        "TRUNCATED_FILE",
+        "CHUNK_COMPRESSION_INEFFICIENT",
+    ),
 }
-"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, chunks of
-a busy moment are small, and nothing is wrong."""
+"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, chunks
+of a busy moment are small, and nothing is wrong."""
 
 
 def codes(path: pathlib.Path) -> set[str]:
@@ -219,7 +269,9 @@ def codes(path: pathlib.Path) -> set[str]:
 
 
 def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
-    """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how much it missed."""
+    """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how
+    much it missed.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     big, big_size = Message({"x": np.zeros(250_000, np.float32)}, {"actor": "a"}), 1_000_000
     rollouts = KEYS.log("rollout", "actor", "a")
@@ -228,14 +280,19 @@ def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
         records = (record for path in log_files(tmp_path / "out") for record in read_records(path))
         return [len(record.data) for record in records if record.topic.startswith("/rollout/")]
 
-    with ZenohTransport(listen=[endpoint]) as transport, recorder_process(endpoint, tmp_path / "out") as process:
+    with (
+        ZenohTransport(listen=[endpoint]) as transport,
+        recorder_process(endpoint, tmp_path / "out") as process,
+    ):
         publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
         process.send_signal(signal.SIGSTOP)
         for _ in range(20):
             transport.publish(rollouts, big)
         process.send_signal(signal.SIGCONT)
         small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
-        eventually(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
+        eventually(
+            lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size
+        )
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=10)
     found = re.search(r"lost (\d+)", errors.splitlines()[-1])

@@ -1,4 +1,6 @@
-"""An episode is drawn where the simulation had it; meshes keep their surface when painted; JSON channels keep names."""
+"""An episode is drawn where the simulation had it; meshes keep their surface when painted; JSON
+channels keep names.
+"""
 
 import dataclasses
 import json
@@ -69,8 +71,12 @@ def test_every_link_and_the_object_has_its_frame_at_every_step(entries: list[Ent
         for k, link in enumerate(HAND.links):
             frame = frames[f"a0/{link.name}"]
             assert frame.parent_frame_id == "a0"
-            np.testing.assert_allclose(vector(frame.translation), arrays["link_position"][i, k], atol=1e-7)
-            np.testing.assert_allclose(quaternion(frame.rotation), arrays["link_quaternion"][i, k], atol=1e-7)
+            np.testing.assert_allclose(
+                vector(frame.translation), arrays["link_position"][i, k], atol=1e-7
+            )
+            np.testing.assert_allclose(
+                quaternion(frame.rotation), arrays["link_quaternion"][i, k], atol=1e-7
+            )
 
 
 def test_capsules_lie_in_their_links_frames(entries: list[Entry]) -> None:
@@ -81,9 +87,13 @@ def test_capsules_lie_in_their_links_frames(entries: list[Entry]) -> None:
         assert entity.frame_id == f"a0/{link.name}" and entity.frame_locked
         assert len(entity.cylinders) == len(link.capsules)
         for cylinder, capsule in zip(entity.cylinders, link.capsules, strict=True):
-            along = Rotation.from_quat(quaternion(cylinder.pose.orientation), scalar_first=True).apply([0, 0, 1])
+            along = Rotation.from_quat(
+                quaternion(cylinder.pose.orientation), scalar_first=True
+            ).apply([0, 0, 1])
             ends = vector(cylinder.pose.position) + np.outer([-0.5, 0.5], along * cylinder.size.z)
-            np.testing.assert_allclose(ends, np.subtract([capsule.start, capsule.end], link_origin(link)), atol=1e-7)
+            np.testing.assert_allclose(
+                ends, np.subtract([capsule.start, capsule.end], link_origin(link)), atol=1e-7
+            )
             assert cylinder.size.x == pytest.approx(2 * capsule.radius)
 
 
@@ -91,7 +101,9 @@ def test_approach_arrow_points_at_the_heading_position(entries: list[Entry]) -> 
     (entry,) = of(entries, "scene")
     entities = {e.id: e for e in SceneUpdate.FromString(entry.data).entities}
     (arrow,) = entities["constraint/heading"].arrows
-    direction = Rotation.from_quat(quaternion(arrow.pose.orientation), scalar_first=True).apply([1, 0, 0])
+    direction = Rotation.from_quat(quaternion(arrow.pose.orientation), scalar_first=True).apply(
+        [1, 0, 0]
+    )
     tip = vector(arrow.pose.position) + (arrow.shaft_length + arrow.head_length) * direction
     arrays = episode().arrays
     np.testing.assert_allclose(tip, arrays["goal/heading_position"], atol=1e-6)
@@ -111,12 +123,16 @@ def test_approach_arrow_points_at_the_heading_position(entries: list[Entry]) -> 
 def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str]) -> None:
     (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
     ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
-    assert {name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")} == shown
+    assert {
+        name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")
+    } == shown
 
 
 def test_an_older_recording_is_drawn_as_it_is_now() -> None:
     made = episode(mask=(1, 1, 0, 1))
-    (now,), (before,) = (of(Converter()(KEY, message, START), "scene") for message in (made, older(made)))
+    (now,), (before,) = (
+        of(Converter()(KEY, message, START), "scene") for message in (made, older(made))
+    )
     assert before.data == now.data
     assert active_blocks(older(made).arrays) == active_blocks(made.arrays)
     assert active_constraints(older(made).arrays) == ("heading", "affordance", "pose", "trajectory")
@@ -124,7 +140,9 @@ def test_an_older_recording_is_drawn_as_it_is_now() -> None:
 
 def test_a_new_episode_removes_what_the_last_one_left(entries: list[Entry]) -> None:
     (entry,) = of(entries, "scene")
-    assert [d.type for d in SceneUpdate.FromString(entry.data).deletions] == [SceneEntityDeletion.ALL]
+    assert [d.type for d in SceneUpdate.FromString(entry.data).deletions] == [
+        SceneEntityDeletion.ALL
+    ]
     assert entry.channel.latched
 
 
@@ -134,19 +152,24 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     offsets = {field.name: field.offset for field in cloud.fields}
     raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
     arrays = episode().arrays
-    points = np.stack([raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1)
+    points = np.stack(
+        [raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1
+    )
     np.testing.assert_array_equal(points, arrays["surface_points"])
     red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
     np.testing.assert_array_equal(red > green, arrays["surface_avoid"])
 
 
 def above(corners: np.ndarray, point: np.ndarray) -> float:
-    """Least distance of a point to the planes of those triangles (F, 3, 3) over which it lies; trimesh's is wrong for
-    some slivers."""
+    """Least distance of a point to the planes of those triangles (F, 3, 3) over which it lies;
+    trimesh's is wrong for some slivers."""
     a, b, c = corners.swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    sides = [np.einsum("fi,fi->f", np.cross(y - x, point - x), normal) for x, y in ((a, b), (b, c), (c, a))]
+    sides = [
+        np.einsum("fi,fi->f", np.cross(y - x, point - x), normal)
+        for x, y in ((a, b), (b, c), (c, a))
+    ]
     over = np.min(sides, 0) >= -1e-9
     return float(np.abs(np.einsum("fi,fi->f", point - a, normal))[over].min())
 
@@ -168,7 +191,9 @@ def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entr
     assert 2000 < count < 2100
 
 
-def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(tmp_path: Path) -> None:
+def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
+    tmp_path: Path,
+) -> None:
     """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
     step, k = 9, [link.name for link in HAND.links].index("thumb_distal")
     writer = LogWriter(tmp_path, "log")
@@ -177,19 +202,25 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     with writer.files[0].open("rb") as file:
         found = [
             (channel.topic, message)
-            for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
-                ["/episode/a0/tf", "/episode/a0/scene"]
-            )
+            for _, channel, _, message in make_reader(
+                file, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages(["/episode/a0/tf", "/episode/a0/scene"])
         ]
     (scene,) = [message for topic, message in found if topic.endswith("scene")]
     frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
     (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
-    assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal" and frame.parent_frame_id == "a0"
+    assert (
+        frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
+        and frame.parent_frame_id == "a0"
+    )
     mesh, nail = entity.triangles
     w, axis = frame.rotation.w, vector(frame.rotation)
     local = np.array([vector(point) for point in [*mesh.points, *nail.points]])
     world = (
-        local + 2 * w * np.cross(axis, local) + 2 * np.cross(axis, np.cross(axis, local)) + vector(frame.translation)
+        local
+        + 2 * w * np.cross(axis, local)
+        + 2 * np.cross(axis, np.cross(axis, local))
+        + vector(frame.translation)
     )
     arrays, skin = episode().arrays, skin_of(HAND)
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
@@ -210,7 +241,9 @@ def test_a_recording_holds_the_hand_once_and_small(entries: list[Entry]) -> None
     one_frame = len(skin_of(HAND).points) * 3 * 9  # three doubles and their tags
     assert hand < 3 * one_frame
     assert not any(
-        e.id.startswith("hand/") for x in of(entries, "contacts") for e in SceneUpdate.FromString(x.data).entities
+        e.id.startswith("hand/")
+        for x in of(entries, "contacts")
+        for e in SceneUpdate.FromString(x.data).entities
     )
 
 
@@ -218,17 +251,23 @@ def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> Non
     updates = [SceneUpdate.FromString(entry.data) for entry in of(entries, "contacts")]
     has_table = [any(e.id == "table" for e in update.entities) for update in updates]
     assert has_table == [True] * 8 + [False] * 4
-    arrows = [len(next(e for e in update.entities if e.id == "forces").arrows) for update in updates]
+    arrows = [
+        len(next(e for e in update.entities if e.id == "forces").arrows) for update in updates
+    ]
     assert arrows == [0] * 6 + [5] * 6
     for update in updates:
-        assert all(0 < e.lifetime.ToNanoseconds() <= 2 * round(1e9 * CONTROL_DT) for e in update.entities)
+        assert all(
+            0 < e.lifetime.ToNanoseconds() <= 2 * round(1e9 * CONTROL_DT) for e in update.entities
+        )
 
 
 def test_signals_of_a_step(entries: list[Entry]) -> None:
     signals = [json.loads(entry.data) for entry in of(entries, "signals")]
     last = signals[-1]
     assert last["seconds"] == pytest.approx(11 * CONTROL_DT)
-    assert last["reward"] == pytest.approx({"contact": 0.5, "distance": -0.1, "total": 0.4}, abs=1e-6)
+    assert last["reward"] == pytest.approx(
+        {"contact": 0.5, "distance": -0.1, "total": 0.4}, abs=1e-6
+    )
     assert last["force"]["thumb_distal"] == pytest.approx(FORCE) and last["force"]["palm"] == 0
     assert last["links_in_contact"] == 5 and last["table"] is False
     assert list(last["q"]) == [joint.name for joint in HAND.joints]
@@ -249,9 +288,13 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     assert min(e.time for e in second) > max(e.time for e in first)
     other = convert("congrasp/run/log/episode/actor/b", episode(), START)
     transforms = [
-        FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data) for es in (first, other)
+        FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data)
+        for es in (first, other)
     ]
-    places = [next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x for tf in transforms]
+    places = [
+        next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x
+        for tf in transforms
+    ]
     assert places == [0.0, pytest.approx(SPACING)]
 
 
@@ -267,7 +310,9 @@ def _posed(name: str, share: float) -> tuple[np.ndarray, np.ndarray, Skin]:
     """Corners (E, 3, 3) of all parts, and of the skin, with fingers closed by a share."""
     hand = get_hand(name)
     skin = skin_of(hand)
-    position, quaternion = mujoco_link_poses(hand, hand.q_open + share * (hand.q_closed - hand.q_open))
+    position, quaternion = mujoco_link_poses(
+        hand, hand.q_open + share * (hand.q_closed - hand.q_open)
+    )
     turns = Rotation.from_quat(quaternion, scalar_first=True)
     corners = [
         (turns[k].apply(part.points) + position[k])[part.faces]
@@ -289,11 +334,17 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     hand = get_hand("human")
     skin = skin_of(hand)
     still = np.concatenate(
-        [(p.points + o)[p.faces] for own, o in zip(surface_parts(hand), skin.origins, strict=True) for p in own]
+        [
+            (p.points + o)[p.faces]
+            for own, o in zip(surface_parts(hand), skin.origins, strict=True)
+            for p in own
+        ]
     )
     assert cKDTree(still.mean(1)).query(skin.points[skin.faces].mean(1))[0].max() < 1e-4
     parts, whole, _ = _posed("human", 0.5)
-    mesh = trimesh.Trimesh(parts.reshape(-1, 3), np.arange(3 * len(parts)).reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(
+        parts.reshape(-1, 3), np.arange(3 * len(parts)).reshape(-1, 3), process=False
+    )
     points = trimesh.sample.sample_surface(mesh, 60_000, seed=0)[0]
     distance = cKDTree(points).query(whole.mean(1))[0]
     assert np.percentile(distance, 95) < 0.004
@@ -302,14 +353,18 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     }
 
 
-def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     hand = get_hand("allegro")
     balls = [trimesh.creation.icosphere(5, 0.02) for _ in hand.links]  # 20,480 triangles each
     count = len(balls[0].vertices)
     own = np.repeat(np.arange(len(balls)), count)
     skin = skin_of(hand)
     fine = skin._replace(
-        points=np.concatenate([b.vertices + o for b, o in zip(balls, skin.origins, strict=True)]).astype(np.float32),
+        points=np.concatenate(
+            [b.vertices + o for b, o in zip(balls, skin.origins, strict=True)]
+        ).astype(np.float32),
         faces=np.concatenate([b.faces + count * k for k, b in enumerate(balls)]).astype(np.int32),
         weights=np.eye(len(balls), dtype=np.float32)[own],
         material=np.full(len(own), MATERIALS.index("link")),
@@ -321,28 +376,39 @@ def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(monkeypatch: p
         np.testing.assert_allclose(np.linalg.norm(part.points, axis=-1), 0.02, atol=1e-3)
 
 
-def test_meshes_that_cannot_be_read_leave_the_capsules_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_meshes_that_cannot_be_read_leave_the_capsules_surface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def damaged(hand: object) -> Skin:
         raise CongraspError("The file is damaged.")
 
     hand = dataclasses.replace(get_hand("allegro"), name="torn")
     monkeypatch.setattr(scene, "skin_of", damaged)
-    assert all(surface_parts(hand)) and sum(len(points) for points, _ in surface_points(hand)) > 2000
+    assert (
+        all(surface_parts(hand)) and sum(len(points) for points, _ in surface_points(hand)) > 2000
+    )
 
 
 def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
     whole = episode()
-    colours = {"colour_points": np.zeros((2, 3), np.float32), "colour_values": np.zeros((2, 3), np.uint8)}
+    colours = {
+        "colour_points": np.zeros((2, 3), np.float32),
+        "colour_values": np.zeros((2, 3), np.uint8),
+    }
     check_episode(Message(whole.arrays | colours, whole.meta))
     for name in colours:
-        with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
+        with pytest.raises(
+            CongraspError, match="colour_points without colour_values, or the reverse"
+        ):
             check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
         check_episode(Message(whole.arrays | far, whole.meta))
     with pytest.raises(CongraspError, match="object of a motion"):
         motion_of_episode(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
-    motion = dataclasses.replace(motion_of_episode(whole), colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)))
+    motion = dataclasses.replace(
+        motion_of_episode(whole), colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5))
+    )
     save_motion(tmp_path / "motion.npz", motion)
     with pytest.raises(CongraspError, match="not from 0 to 255"):
         load_motion(tmp_path / "motion.npz")
@@ -353,11 +419,14 @@ def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhe
 
 @pytest.mark.parametrize("sections", [8, 512, 2048])
 def test_the_surface_stays_and_faces_are_bounded(sections):
-    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=sections)  # slivers, where there are many sections
+    # Slivers, where there are many sections
+    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=sections)
     vertices, faces = finer(mesh.vertices, mesh.faces, 0.003, 9_000)
     fine = trimesh.Trimesh(vertices, faces, process=False)
     assert len(mesh.faces) < len(faces) <= 9_000
-    assert fine.area == pytest.approx(mesh.area, rel=1e-4) and fine.volume == pytest.approx(mesh.volume, rel=1e-4)
+    assert fine.area == pytest.approx(mesh.area, rel=1e-4) and fine.volume == pytest.approx(
+        mesh.volume, rel=1e-4
+    )
     assert vertices.dtype == np.float32 and faces.dtype == np.int32
 
 
@@ -379,8 +448,12 @@ RED, BLUE = (255, 0, 0), (0, 0, 255)
 
 
 def test_a_colour_is_a_mean_of_those_nearby():
-    """At distances of 1 and 2 m, 1.5 on average: exp(-(1 / 1.5)^2) = .6412 to exp(-(2 / 1.5)^2) = .1690, so 79.1 %."""
-    colours = Colours(np.array([[0, 0, -1], [0, 0, 2]], np.float32), np.array([RED, BLUE], np.uint8))
+    """At distances of 1 and 2 m, 1.5 on average: exp(-(1 / 1.5)^2) = .6412 to exp(-(2 / 1.5)^2) =
+    .1690, so 79.1 %.
+    """
+    colours = Colours(
+        np.array([[0, 0, -1], [0, 0, 2]], np.float32), np.array([RED, BLUE], np.uint8)
+    )
     np.testing.assert_array_equal(colours_at(np.zeros((1, 3)), colours), [[202, 0, 53]])
 
 
@@ -390,7 +463,10 @@ def test_an_edge_between_two_colours_has_no_teeth():
     points = np.c_[rng.uniform(0, 0.1, (8000, 2)), np.zeros(8000)].astype(np.float32)
     colours = Colours(points, np.where(points[:, :1] < 0.05, RED, BLUE).astype(np.uint8))
     along = np.linspace(0.01, 0.09, 300)
-    red = [colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0].astype(float) for x in (0.04, 0.05)]
+    red = [
+        colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0].astype(float)
+        for x in (0.04, 0.05)
+    ]
     assert (red[0] == 255).all() and abs(red[1].mean() - 127.5) < 20
     assert red[1].std() < 60  # of the nearest points alone 127
 
@@ -404,9 +480,14 @@ def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
 
     monkeypatch.setattr(palette, "finer", counted)
     ball = trimesh.creation.icosphere(2, 0.0317)
-    colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
+    colours = Colours(
+        np.array([[0, 0, -1], [0, 0, 1]], np.float32),
+        np.array([[255, 0, 0], [0, 0, 255]], np.uint8),
+    )
     first = painted(ball.vertices, ball.faces, colours)
-    again = painted(np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours)))
+    again = painted(
+        np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours))
+    )
     assert len(cuts) == 1 and all(a is b for a, b in zip(first, again, strict=True))
     with pytest.raises(ValueError, match="read-only"):
         first[2][0] = 0
@@ -432,7 +513,9 @@ def test_a_name_may_also_be_a_group() -> None:
 
 
 def test_numbers_that_json_lacks_are_left_out() -> None:
-    entry = JsonChannels().entry("/m", 5, {"a": 1.0, "b": math.nan, "c": {"d": math.inf, "e": 2}, "f": True})
+    entry = JsonChannels().entry(
+        "/m", 5, {"a": 1.0, "b": math.nan, "c": {"d": math.inf, "e": 2}, "f": True}
+    )
     assert json.loads(entry.data) == {"a": 1.0, "c": {"e": 2}, "f": True}
     assert entry.time == 5
 
@@ -441,13 +524,18 @@ def test_schema_grows_with_new_fields_and_keeps_the_old() -> None:
     channels = JsonChannels()
     first = channels.entry("/metrics/learner/0", 0, {"update": 0, "values": {"kl": 0.1}}).channel
     again = channels.entry("/metrics/learner/0", 1, {"update": 1, "values": {"kl": 0.2}}).channel
-    grown = channels.entry("/metrics/learner/0", 2, {"values": {"success": 0.5}, "name": "x"}).channel
+    grown = channels.entry(
+        "/metrics/learner/0", 2, {"values": {"success": 0.5}, "name": "x"}
+    ).channel
     assert first is again
     assert json.loads(grown.schema) == {
         "type": "object",
         "properties": {
             "update": {"type": "number"},
-            "values": {"type": "object", "properties": {"kl": {"type": "number"}, "success": {"type": "number"}}},
+            "values": {
+                "type": "object",
+                "properties": {"kl": {"type": "number"}, "success": {"type": "number"}},
+            },
             "name": {"type": "string"},
         },
     }
@@ -457,6 +545,7 @@ def test_schema_grows_with_new_fields_and_keeps_the_old() -> None:
 def test_topics_have_schemas_of_their_own() -> None:
     channels = JsonChannels()
     names = {
-        channels.entry(topic, 0, {"a": 1}).channel.schema_name for topic in ("/metrics/actor/a", "/metrics/actor/b")
+        channels.entry(topic, 0, {"a": 1}).channel.schema_name
+        for topic in ("/metrics/actor/a", "/metrics/actor/b")
     }
     assert len(names) == 2

@@ -1,4 +1,6 @@
-"""Every figure of the paper stands beside a comparable one, or the reason why none does; and its LaTeX."""
+"""Every figure of the paper stands beside a comparable one, or the reason why none does; and its
+LaTeX.
+"""
 
 import json
 import pathlib
@@ -11,7 +13,14 @@ from hypothesis import strategies as st
 from congrasp.services.evaluate.paper import TABLES, paper_lines, paper_row
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.table import escape
-from congrasp.services.reproduce.comparison import SUCCESS, compare, not_comparable, summary, tables, unmatched
+from congrasp.services.reproduce.comparison import (
+    SUCCESS,
+    compare,
+    not_comparable,
+    summary,
+    tables,
+    unmatched,
+)
 from congrasp.services.reproduce.plan import Part, RequiredPolicy, Result, parts, policies
 from tests.rows import row
 
@@ -25,25 +34,39 @@ def result(source, *rows, hand="human", method="ours", table="single", data=None
 
 def find(cells, table, constraint, quantity=SUCCESS, hand="human", method="ours", group=""):
     keys = (table, constraint, quantity, hand, method, group)
-    return [c for c in cells if (c.table, c.constraint, c.quantity, c.hand, c.method, c.group) == keys]
+    return [
+        c for c in cells if (c.table, c.constraint, c.quantity, c.hand, c.method, c.group) == keys
+    ]
 
 
 def test_a_figure_stands_beside_the_papers_of_the_same_hand_method_and_source():
     heading = row(
-        "heading", 0.99, 0.97, 0.997, errors={"heading_rad": 0.1, "heading_m": 0.03}, margins={"heading_m": 0.002}
+        "heading",
+        0.99,
+        0.97,
+        0.997,
+        errors={"heading_rad": 0.1, "heading_m": 0.03},
+        margins={"heading_m": 0.002},
     )
     cells = compare([result("hands", heading)], {}, HANDS)
     (cell,) = find(cells, "hands", "heading")
     assert (cell.ours, cell.low, cell.high, cell.paper) == (0.99, 0.97, 0.997, 0.96)
     assert cell.difference == pytest.approx(0.03) and cell.verdict == "better"
     (metres,) = find(cells, "hands", "heading", "heading_m")
-    assert (metres.low, metres.high) == pytest.approx((0.028, 0.032)) and metres.difference == pytest.approx(0.01)
+    assert (metres.low, metres.high) == pytest.approx(
+        (0.028, 0.032)
+    ) and metres.difference == pytest.approx(0.01)
     assert metres.verdict == "worse"  # a larger error
     (radians,) = find(cells, "hands", "heading", "heading_rad")
-    assert radians.difference == pytest.approx(-0.043) and (radians.low, radians.verdict) == (None, "")
+    assert radians.difference == pytest.approx(-0.043) and (radians.low, radians.verdict) == (
+        None,
+        "",
+    )
     # The paper's 96.9 % is of captured constraints: ours is only the nearest.
     (captured,) = find(cells, "single", "heading")
-    assert captured.ours is None and captured.nearest == 0.99 and "GRAB and OakInk" in captured.reason
+    assert (
+        captured.ours is None and captured.nearest == 0.99 and "GRAB and OakInk" in captured.reason
+    )
     (other,) = find(cells, "hands", "heading", hand="sharpa")
     assert other.ours is None and other.reason == "not evaluated"
 
@@ -56,12 +79,17 @@ def test_every_figure_of_the_paper_has_a_cell():
     assert len(cells) == sum(1 + len(line.figures.errors) for line in lines)
     assert all(cell.ours is None and cell.reason for cell in cells)
     for line in lines:
-        assert paper_row(line.source, line.hand, line.method, line.constraint, line.group) == line.figures
+        assert (
+            paper_row(line.source, line.hand, line.method, line.constraint, line.group)
+            == line.figures
+        )
 
 
 def test_captured_rows_of_several_data_sets_each_have_a_cell():
-    grab, oak = (result("captured", row("pose", rate, 0.0, 1.0), table="captured", data=name)
-                 for rate, name in ((0.8, "grab"), (0.9, "oakink")))  # fmt: skip
+    grab, oak = (
+        result("captured", row("pose", rate, 0.0, 1.0), table="captured", data=name)
+        for rate, name in ((0.8, "grab"), (0.9, "oakink"))
+    )
     found = find(compare([grab, oak], {}, HANDS), "ablation", "pose")
     assert [(cell.data, cell.ours) for cell in found] == [("grab", 0.8), ("oakink", 0.9)]
 
@@ -73,8 +101,10 @@ def test_reasons_say_what_is_missing():
     assert graspxl.reason == "no policy of the method 'graspxl': its training failed"
     (allegro,) = find(cells, "hands", "pose", hand="allegro")
     assert allegro.reason == "the hand 'allegro' was not requested"
-    assert any("GraspXL" not in why and "graspxl" in what and "small objects" in what
-               for what, why, _ in not_comparable(cells).rows)  # fmt: skip
+    assert any(
+        "GraspXL" not in why and "graspxl" in what and "small objects" in what
+        for what, why, _ in not_comparable(cells).rows
+    )
 
 
 def test_rows_without_an_episode_that_succeeds_have_no_error_to_compare():
@@ -84,7 +114,10 @@ def test_rows_without_an_episode_that_succeeds_have_no_error_to_compare():
 
 
 def test_groups_by_size_are_compared_and_others_are_our_own():
-    rows = [row("heading", 0.9, 0.8, 0.95, group=group) for group in ("", "small (up to 8 cm)", "family mug")]
+    rows = [
+        row("heading", 0.9, 0.8, 0.95, group=group)
+        for group in ("", "small (up to 8 cm)", "family mug")
+    ]
     results = [result("objects", *rows, table="objects")]
     (small,) = find(compare(results, {}, HANDS), "objects", "heading", group="small")
     assert small.paper == 0.929 and small.ours == 0.9
@@ -92,32 +125,59 @@ def test_groups_by_size_are_compared_and_others_are_our_own():
 
 
 def test_the_summary_counts_rates_and_intervals():
-    rows = [row("heading", 0.99, 0.97, 0.997), row("pose", 0.9, 0.85, 0.95), row("trajectory", 0.96, 0.93, 0.98)]
+    rows = [
+        row("heading", 0.99, 0.97, 0.997),
+        row("pose", 0.9, 0.85, 0.95),
+        row("trajectory", 0.96, 0.93, 0.98),
+    ]
     text = summary(compare([result("hands", *rows)], {}, HANDS))
-    assert text.startswith("3 of the paper's 47 success rates") and "at or above the paper's in 2;" in text
+    assert (
+        text.startswith("3 of the paper's 47 success rates")
+        and "at or above the paper's in 2;" in text
+    )
     assert "interval is above it in 1, and below it in 1." in text
 
 
 def test_parts_are_the_papers_tables():
     needed = policies(("human", "allegro"), ("pd", "no-dynamic-center"))
-    assert [policy.name for policy in needed] == ["human-ours", "allegro-ours", "human-pd", "human-no-dynamic-center"]
+    assert [policy.name for policy in needed] == [
+        "human-ours",
+        "allegro-ours",
+        "human-pd",
+        "human-no-dynamic-center",
+    ]
     names = [part.name for part in parts(needed, [pathlib.Path("data/grab")], noise=True)]
     assert names == [
-        *("human-ours-single", "allegro-ours-single", "human-pd-single", "human-no-dynamic-center-single"),
-        *("human-ours-composed", "human-ours-noise", "human-ours-objects", "human-no-dynamic-center-objects"),
+        *(
+            "human-ours-single",
+            "allegro-ours-single",
+            "human-pd-single",
+            "human-no-dynamic-center-single",
+        ),
+        *(
+            "human-ours-composed",
+            "human-ours-noise",
+            "human-ours-objects",
+            "human-no-dynamic-center-objects",
+        ),
         *("human-ours-grab", "human-pd-grab", "human-no-dynamic-center-grab"),
     ]
 
 
 def test_rows_come_back_from_json_as_they_were():
-    one = row("pose", 0.5, 0.4, 0.6, errors={"pose_rad": 0.1, "pose_m": None}, margins={"pose_rad": 0.01})
+    one = row(
+        "pose", 0.5, 0.4, 0.6, errors={"pose_rad": 0.1, "pose_m": None}, margins={"pose_rad": 0.01}
+    )
     assert Row.from_json(json.loads(json.dumps(one.to_json()))) == one
     with pytest.raises((LookupError, TypeError)):
         Row.from_json({"constraint": "pose"})
 
 
 def test_latex_is_balanced_and_holds_every_figure():
-    rows = [row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01}) for name in ("heading", "pose")]
+    rows = [
+        row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01})
+        for name in ("heading", "pose")
+    ]
     shown = tables(compare([result("hands", *rows)], {}, HANDS))
     text = "\n".join(table.latex("50 % of 3_objects & more.") for table in shown)
     opened, closed = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
@@ -137,6 +197,13 @@ def test_latex_is_balanced_and_holds_every_figure():
 @given(st.text("&%$#_{}~^\\<>±ab \n"))
 def test_escaped_text_has_no_special_character_left(text):
     found = escape(text)
-    for command in (r"\textbackslash{}", r"\textasciitilde{}", r"\textasciicircum{}", r"$\pm$", "$<$", "$>$"):
+    for command in (
+        r"\textbackslash{}",
+        r"\textasciitilde{}",
+        r"\textasciicircum{}",
+        r"$\pm$",
+        "$<$",
+        "$>$",
+    ):
         found = found.replace(command, "")
     assert not re.search(r"[&%$#_{}~^]", re.sub(r"\\[&%$#_{}]", "", found))

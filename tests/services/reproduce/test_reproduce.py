@@ -1,4 +1,6 @@
-"""The command from end to end on a few episodes, what a second start repeats, and what it refuses."""
+"""The command from end to end on a few episodes, what a second start repeats, and what it
+refuses.
+"""
 
 import html
 import json
@@ -23,17 +25,33 @@ OURS = RequiredPolicy("human", "ours")
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """In the full system's place, with a network that compiles quickly; it knows no references, which take long."""
+    """In the full system's place, with a network that compiles quickly; it knows no references,
+    which take long.
+    """
     task = TaskConfig(constraints=("heading", "affordance"))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    bundles.save(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(16,), encoder=4))), path)
+    bundles.save(
+        untrained(RunConfig(task=task, network=NetworkConfig(hidden=(16,), encoder=4))), path
+    )
     return path
 
 
 @pytest.mark.timeout(600)
 @pytest.mark.slow
-def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, tmp_path, capsys, monkeypatch):
-    command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy), "--out", str(tmp_path)]
+def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
+    policy, tmp_path, capsys, monkeypatch
+):
+    command = [
+        "--quick",
+        "--hands",
+        "human",
+        "--methods",
+        "graspxl",
+        "--policy",
+        str(policy),
+        "--out",
+        str(tmp_path),
+    ]
     command += ["--episodes", "2", "--pool", "2", "--physics", "native"]
     failed = "human-ours-composed: The method 'ours' has no row in these tables."
 
@@ -48,7 +66,10 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
     assert failure.startswith(failed) and failed in printed
     rates = [cell for cell in first["cells"] if cell["quantity"] == "success"]
     compared = [cell for cell in rates if cell["ours"] is not None]
-    assert f"{len(compared)} of the paper's 47 success rates" in printed and "reproduction.html" in printed
+    assert (
+        f"{len(compared)} of the paper's 47 success rates" in printed
+        and "reproduction.html" in printed
+    )
     assert {cell["table"] for cell in compared} == {"hands", "objects"} and len(compared) >= 5
     for cell in compared:
         assert 0.0 <= cell["low"] <= cell["ours"] <= cell["high"] <= 1.0
@@ -78,7 +99,9 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
         reproduced()
 
 
-def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, tmp_path, monkeypatch):
+def test_policies_come_from_the_user_from_trainings_or_from_the_package(
+    policy, tmp_path, monkeypatch
+):
     """A method whose training fails is named with the reason, and the others are evaluated."""
     asked = []
 
@@ -96,15 +119,34 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     monkeypatch.setattr(run, "train_all", train_all)
     monkeypatch.setattr(run, "evaluate_part", evaluate_part)
     request = run.Request(
-        out=tmp_path, hands=("human", "allegro"), methods=("pd", "graspxl"), given={OURS: read_entrant(policy)},
-        captured=(), quick=False, options=(), patience=1.0, command="congrasp reproduce",
-        episodes=3, pool=3, many=6, physics="native", seed=0,
-    )  # fmt: skip
+        out=tmp_path,
+        hands=("human", "allegro"),
+        methods=("pd", "graspxl"),
+        given={OURS: read_entrant(policy)},
+        captured=(),
+        quick=False,
+        options=(),
+        patience=1.0,
+        command="congrasp reproduce",
+        episodes=3,
+        pool=3,
+        many=6,
+        physics="native",
+        seed=0,
+    )
     account = run.reproduce(request, lambda text, total: lambda done: None)
     what = {one.name: text for one, text in account.policies}
     assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
-    assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
-    assert what["human-ours"].startswith("policy.safetensors, version 0") and what["human-pd"] == "needs none"
+    assert asked[2:6] == [
+        "human-ours-single",
+        "human-pd-single",
+        "human-ours-composed",
+        "human-ours-noise",
+    ]
+    assert (
+        what["human-ours"].startswith("policy.safetensors, version 0")
+        and what["human-pd"] == "needs none"
+    )
     assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"
     assert what["human-dgrasp"] == "none: not requested"
     assert account.failures == ["it failed", "it failed"]
@@ -115,13 +157,21 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     ("arguments", "words"),
     [
         (["--hands", "human", "--methods", "levitate"], "no method 'levitate'"),
-        (["--quick", "--hands", "allegro", "--policy", "{policy}"], "is of the hand 'human' and the method 'ours'"),
-        (["--hands", "human", "--methods", "pd"], "human-ours must be trained first, and this machine has no GPU"),
+        (
+            ["--quick", "--hands", "allegro", "--policy", "{policy}"],
+            "is of the hand 'human' and the method 'ours'",
+        ),
+        (
+            ["--hands", "human", "--methods", "pd"],
+            "human-ours must be trained first, and this machine has no GPU",
+        ),
         (["--quick", "--hands", "paw"], "no hand 'paw'"),
         (["--patience", "0"], "--patience is 0"),
     ],
 )
-def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypatch, arguments, words):
+def test_bad_input_is_refused_before_anything_begins(
+    policy, tmp_path, monkeypatch, arguments, words
+):
     monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(CongraspError, match=words):
@@ -129,11 +179,20 @@ def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
-def test_captured_sets_are_looked_for_where_the_import_puts_them(policy, tmp_path, capsys, monkeypatch):
+def test_captured_sets_are_looked_for_where_the_import_puts_them(
+    policy, tmp_path, capsys, monkeypatch
+):
     (tmp_path / "grab" / "objects").mkdir(parents=True)
-    monkeypatch.setattr(run, "evaluate_tables", lambda own, *arguments, **options: Found(own, [], [], [], ""))
+    monkeypatch.setattr(
+        run, "evaluate_tables", lambda own, *arguments, **options: Found(own, [], [], [], "")
+    )
     monkeypatch.setattr(run, "exam_pool", lambda exam, count: [])
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy)]
-    assert load("reproduce")([*command, "--captured", str(tmp_path / "grab"), "--out", str(tmp_path / "out")])() == 1
+    assert (
+        load("reproduce")(
+            [*command, "--captured", str(tmp_path / "grab"), "--out", str(tmp_path / "out")]
+        )()
+        == 1
+    )
     assert "human-ours-grab: " in (printed := capsys.readouterr().out)
     assert "has no folder 'constraints'" in printed and "congrasp constraints import" in printed

@@ -36,7 +36,9 @@ def gate():
 def running(batcher, gate):
     """Submits an item, 0, that runs alone in its caller's thread and is held at the gate."""
     answer = Future()
-    threading.Thread(target=lambda: answer.set_result(batcher.submit(0, 10.0).result(10)), daemon=True).start()
+    threading.Thread(
+        target=lambda: answer.set_result(batcher.submit(0, 10.0).result(10)), daemon=True
+    ).start()
     assert gate.entered.acquire(timeout=10)
     return answer
 
@@ -66,7 +68,10 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
     batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0, peer="greedy") for i in (1, 2, 3)]
-    for refuse in (lambda: batcher.submit(4, 10.0, peer="greedy"), lambda: batcher.check_room("greedy")):
+    for refuse in (
+        lambda: batcher.submit(4, 10.0, peer="greedy"),
+        lambda: batcher.check_room("greedy"),
+    ):
         with pytest.raises(OverloadedError, match="Overloaded: 3 of your queries are queued"):
             refuse()
     batcher.check_room("modest")
@@ -93,14 +98,18 @@ class Letters(Gate):
         return [CongraspError("bad") if "!" in item else item.upper() for item in items]
 
     def batcher(self):
-        parts = Parts(4, lambda item, first, end: item[first:end], lambda item, results: "".join(results))
+        parts = Parts(
+            4, lambda item, first, end: item[first:end], lambda item, results: "".join(results)
+        )
         return Batcher(self, size=8, window=0.0, depth=10, weigh=len, parts=parts)
 
     def run(self, *items):
         """Submits (peer, item) while the first is held back; their futures."""
         batcher, first = self.batcher(), Future()
         (peer, item), *rest = items
-        threading.Thread(target=lambda: first.set_result(batcher.submit(item, 10.0, peer)), daemon=True).start()
+        threading.Thread(
+            target=lambda: first.set_result(batcher.submit(item, 10.0, peer)), daemon=True
+        ).start()
         assert self.entered.acquire(timeout=10)
         futures = [batcher.submit(item, 10.0, peer) for peer, item in rest]
         self.go.set()
@@ -110,8 +119,14 @@ class Letters(Gate):
 @pytest.mark.parametrize(
     ("items", "batches"),
     [
-        ("a:k b:abcdefg a:l b:hi a:mno", [["k"], ["ab", "l", "m"], ["cd", "no"], ["efg", "h"], ["i"]]),
-        ("a:k b:abcdefg c:tuvwxyz a:l", [["k"], ["a", "t", "l"], ["bc", "uv"], ["de", "wx"], ["fg", "yz"]]),
+        (
+            "a:k b:abcdefg a:l b:hi a:mno",
+            [["k"], ["ab", "l", "m"], ["cd", "no"], ["efg", "h"], ["i"]],
+        ),
+        (
+            "a:k b:abcdefg c:tuvwxyz a:l",
+            [["k"], ["a", "t", "l"], ["bc", "uv"], ["de", "wx"], ["fg", "yz"]],
+        ),
     ],
 )
 def test_peers_share_a_batch_however_long_their_items_are(several, items, batches):

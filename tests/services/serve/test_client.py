@@ -53,7 +53,9 @@ class CannedServer:
 
     def _act(self, key: str, request: Message) -> Message:
         layout = self.function.layout
-        self.fields.append({name: x[0] for name, x in layout.unpack(layout.parse(request).vectors).items()})
+        self.fields.append(
+            {name: x[0] for name, x in layout.unpack(layout.parse(request).vectors).items()}
+        )
         n = np.float32(len(self.fields))
         targets = np.concatenate([np.zeros(26), np.full(20, n), np.full(6, -n)]).astype(np.float32)
         return Inference(targets[None], [["words"]]).reply({"version": 3, "total_ms": 0.5})
@@ -132,7 +134,9 @@ def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
         client.act(STATE)
         server.function = PolicyFunction(get_hand("allegro"), TaskConfig(hand="allegro"))
         for ask in (lambda: client.act(STATE), client.metadata):
-            with pytest.raises(RefusedError, match="The policy is for the hand 'allegro', not 'human'"):
+            with pytest.raises(
+                RefusedError, match="The policy is for the hand 'allegro', not 'human'"
+            ):
                 ask()
     server.close()
 

@@ -37,7 +37,9 @@ def answer(value: object, wrist: object = None) -> Answer:
 
 
 class ScriptedPolicy:
-    """Gives `outcome` (an answer, an exception or a function of the state), and keeps what it was asked."""
+    """Gives `outcome` (an answer, an exception or a function of the state), and keeps what it was
+    asked.
+    """
 
     def __init__(self, outcome):
         self.outcome, self.states, self.requests = outcome, [], []
@@ -58,7 +60,15 @@ class ScriptedPolicy:
 
 def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):
     """A guard of a slow loop, so that the policy's thread has time to answer, in an episode."""
-    guard = Guard(policy, limits, OPEN, period=0.5, wait=0.4, clock=clock, **{"stale": 0.6, "hold": 2.0, **options})
+    guard = Guard(
+        policy,
+        limits,
+        OPEN,
+        period=0.5,
+        wait=0.4,
+        clock=clock,
+        **{"stale": 0.6, "hold": 2.0, **options},
+    )
     guard.reset(request)
     return guard
 
@@ -70,7 +80,8 @@ def test_answers_are_followed_from_the_targets_that_were_commanded():
         clock.now += 0.01
         second = guard.step(STATE)
     assert first.mode == second.mode == "follow" and second.answer is policy.outcome
-    np.testing.assert_allclose(first.q_target, [0.5, 0.4])  # 1 N.m over 2 N.m/rad ahead of the joint; its limit
+    # 1 N.m over 2 N.m/rad ahead of the joint; its limit
+    np.testing.assert_allclose(first.q_target, [0.5, 0.4])
     np.testing.assert_allclose(first.q_torque, [1.0, 0.8])
     np.testing.assert_array_equal(policy.states[0]["q_target"], np.zeros(FINGERS))
     np.testing.assert_array_equal(policy.states[1]["q_target"], first.q_target)
@@ -79,9 +90,16 @@ def test_answers_are_followed_from_the_targets_that_were_commanded():
 
 
 def test_velocities_that_are_not_measured_are_estimated_from_positions():
-    """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m being its gain."""
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
-    limits = dataclasses.replace(LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0))
+    """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m
+    being its gain.
+    """
+    clock, policy = (
+        Clock(100.0),
+        ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0]))),
+    )
+    limits = dataclasses.replace(
+        LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0)
+    )
     with guarded(policy, clock, limits) as guard:
         turned = np.array([3.1, 3.2 - 2 * np.pi, 3.2 - 2 * np.pi, 3.3 - 2 * np.pi])
         way = np.array([0.0, 0.2, 0.2, 0.4])
@@ -96,11 +114,14 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
             clock.now += 0.5
     np.testing.assert_allclose(reached[0], 0.5)  # at rest: 1 N over 2 N/m
     np.testing.assert_allclose(reached[1:], [0.2 + 0.02 + 0.5, 0.2 + 0.02 + 0.5, 0.4 + 0.01 + 0.5])
-    # The third measurement says nothing new; the last is 0.2 m in a second. Angles beyond a half turn are near.
+    # The third measurement says nothing new; the last is 0.2 m in a second. Angles beyond a half
+    # turn are near.
     seen = [state["u_velocity"] for state in policy.states]
     np.testing.assert_allclose([x[0] for x in seen], [0.0, 0.4, 0.4, 0.2])
     np.testing.assert_allclose([x[5] for x in seen], [0.0, 0.2, 0.2, 0.1])
-    np.testing.assert_allclose([state["q_velocity"] for state in policy.states], [[0.0] * 2, *[[0.1] * 2] * 3])
+    np.testing.assert_allclose(
+        [state["q_velocity"] for state in policy.states], [[0.0] * 2, *[[0.1] * 2] * 3]
+    )
 
 
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
@@ -114,7 +135,14 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
             clock.now += 0.5
             command = guard.step(STATE)
             modes.append(command.mode)
-        assert modes == ["follow", "hold", "hold", "hold", fallback]  # 0.5 s is fresh still; 2 s have gone at the last
+        # 0.5 s is fresh still; 2 s have gone at the last
+        assert modes == [
+            "follow",
+            "hold",
+            "hold",
+            "hold",
+            fallback,
+        ]
         assert guard.trouble == "Nobody is there." and guard.counters.lost == 5
         np.testing.assert_allclose(command.q_target, OPEN if fallback == "open" else [0.2, 0.1])
         policy.outcome = answer(np.array([-0.5, 0.0]))
@@ -150,7 +178,9 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
         clock.now += 0.5
         opened = guard.step(now)
         assert opened.mode == "open"
-        np.testing.assert_allclose(opened.q_target, OPEN if "q" not in changed else command.q_target)
+        np.testing.assert_allclose(
+            opened.q_target, OPEN if "q" not in changed else command.q_target
+        )
         guard.reset(REQUEST)
         assert guard.step(STATE).mode == "hold"
 
@@ -171,7 +201,9 @@ def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
 
 
 def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
-    """Its hand opens after a silence, unless the table's absence says that something may be held."""
+    """Its hand opens after a silence, unless the table's absence says that something may be
+    held.
+    """
     state = {name: STATE[name] for name in ("q", "u")}
     for table, mode in ((True, "open"), (False, "freeze")):
         clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
@@ -181,7 +213,15 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
             policy.outcome = TransportError("Nobody is there.")
             clock.now += 2.5
             assert guard.step({**state, "table": table}).mode == mode
-        assert policy.states[0].keys() == {"q", "u", "q_velocity", "u_velocity", "table", "q_target", "u_target"}
+        assert policy.states[0].keys() == {
+            "q",
+            "u",
+            "q_velocity",
+            "u_velocity",
+            "table",
+            "q_target",
+            "u_target",
+        }
 
 
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
@@ -203,7 +243,11 @@ def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measur
 
 def test_limits_and_open_pose_are_those_of_the_policy_s_metadata():
     policy = ScriptedPolicy(answer(np.array([0.9, 0.9])))
-    policy.metadata = lambda: {"hand": "two", "limits": LIMITS.as_lists(), "open_pose": OPEN.tolist()}
+    policy.metadata = lambda: {
+        "hand": "two",
+        "limits": LIMITS.as_lists(),
+        "open_pose": OPEN.tolist(),
+    }
     with Guard(policy, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock(100.0)) as guard:
         guard.reset(REQUEST)
         np.testing.assert_allclose(guard.step(STATE).q_target, [0.5, 0.4])
@@ -217,7 +261,9 @@ def test_limits_and_open_pose_are_those_of_the_policy_s_metadata():
 def test_the_palm_stays_above_the_table():
     """The base is 0.1 m above the table's top, turned by half about x: its z axis points down."""
     wrist = np.array([0.0, 0.0, 0.1]), np.array([0.0, 1.0, 0.0, 0.0])
-    limits = dataclasses.replace(LIMITS, palm=np.array([[0.0, 0.0, 0.03, 0.02]]), speed=np.full(8, 100.0))
+    limits = dataclasses.replace(
+        LIMITS, palm=np.array([[0.0, 0.0, 0.03, 0.02]]), speed=np.full(8, 100.0)
+    )
     down = answer(np.zeros(2), np.array([0.1, 0.0, 0.15, 0.0, 0.0, 0.0]))
     request = dataclasses.replace(REQUEST, wrist=wrist)
     with guarded(ScriptedPolicy(down), Clock(100.0), limits, request) as guard:
@@ -227,7 +273,9 @@ def test_the_palm_stays_above_the_table():
         for wrong in ((np.zeros(3), np.zeros(4)), (np.full(3, np.nan), wrist[1])):
             with pytest.raises(CongraspError, match="wrist's"):
                 guard.reset(dataclasses.replace(REQUEST, wrist=wrong))
-    with guarded(ScriptedPolicy(down), Clock(100.0), limits, request, table=(0.0, 0.0, 1.0, -1.0)) as guard:
+    with guarded(
+        ScriptedPolicy(down), Clock(100.0), limits, request, table=(0.0, 0.0, 1.0, -1.0)
+    ) as guard:
         np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
@@ -286,13 +334,22 @@ def test_after_an_answer_that_came_late_the_next_is_waited_for():
 
 
 def test_a_policy_that_hangs_does_not_hold_the_loop_up():
-    release, policy = threading.Event(), ScriptedPolicy(lambda state: (release.wait(20.0), answer(np.ones(2)))[1])
-    guard = Guard(policy, LIMITS, OPEN, period=0.01, wait=0.005, stale=0.02, hold=0.05, fallback="freeze")
+    release, policy = (
+        threading.Event(),
+        ScriptedPolicy(lambda state: (release.wait(20.0), answer(np.ones(2)))[1]),
+    )
+    guard = Guard(
+        policy, LIMITS, OPEN, period=0.01, wait=0.005, stale=0.02, hold=0.05, fallback="freeze"
+    )
     guard.reset(REQUEST)
     modes = []
     while not modes or modes[-1] != "freeze":
         modes.append(guard.step(STATE).mode)
-    assert len(policy.states) == 1 and guard.counters.late == len(modes) and set(modes[:-1]) == {"hold"}
+    assert (
+        len(policy.states) == 1
+        and guard.counters.late == len(modes)
+        and set(modes[:-1]) == {"hold"}
+    )
     guard.reset(REQUEST)
     release.set()  # what comes back now is of the episode before
     guard.step(STATE)
@@ -328,7 +385,11 @@ def test_the_policy_is_told_what_is_not_measured():
 def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
     with guarded(ScriptedPolicy(outcome), Clock(100.0)) as guard:
         command = guard.step(STATE)
-    assert command.mode == "hold" and getattr(guard.counters, counter) == 1 and guard.counters.answers == 0
+    assert (
+        command.mode == "hold"
+        and getattr(guard.counters, counter) == 1
+        and guard.counters.answers == 0
+    )
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
@@ -338,8 +399,13 @@ ARRAYS = st.one_of(
     st.lists(NUMBERS, min_size=6, max_size=6).map(np.array),
     st.sampled_from([None, "x", np.zeros((2, 2)), np.zeros(0)]),
 )
-OUTCOMES = st.one_of(st.builds(answer, ARRAYS, ARRAYS), st.sampled_from([TransportError("away"), KeyError("q"), None]))
-STATES = st.dictionaries(st.sampled_from(["q", "u", "q_velocity", "u_velocity", "object_position"]), ARRAYS)
+OUTCOMES = st.one_of(
+    st.builds(answer, ARRAYS, ARRAYS),
+    st.sampled_from([TransportError("away"), KeyError("q"), None]),
+)
+STATES = st.dictionaries(
+    st.sampled_from(["q", "u", "q_velocity", "u_velocity", "object_position"]), ARRAYS
+)
 TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
 
 
@@ -355,7 +421,11 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
         for outcome, state, passed, begins in steps:
             policy.outcome = outcome
             if begins:
-                guard.reset(GraspRequest(q=np.full(FINGERS, 9.0), wrist=(np.zeros(3), np.array([1.0, 0, 0, 0]))))
+                guard.reset(
+                    GraspRequest(
+                        q=np.full(FINGERS, 9.0), wrist=(np.zeros(3), np.array([1.0, 0, 0, 0]))
+                    )
+                )
                 last[FINGERS:] = 0.0
             clock.now += passed
             command = guard.step(state)
@@ -369,7 +439,13 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
 
 
 def test_what_makes_no_guard_is_refused():
-    for wrong in ({"wait": 0.01}, {"stale": 0.0}, {"hold": 0.01}, {"fallback": "wave"}, {"stale": float("nan")}):
+    for wrong in (
+        {"wait": 0.01},
+        {"stale": 0.0},
+        {"hold": 0.01},
+        {"fallback": "wave"},
+        {"stale": float("nan")},
+    ):
         with pytest.raises(CongraspError):
             Guard(ScriptedPolicy(None), LIMITS, OPEN, **wrong)
     with pytest.raises(CongraspError, match="open pose"):

@@ -32,7 +32,11 @@ LIMITS = JointLimits(
     palm=np.array([[0.0, 0.0, -0.05, 0.02], [0.1, 0.0, 0.0, 0.03]]),
 )
 SLIDES, HINGES = slice(-6, -3), slice(-3, None)
-FLOOR = Floor(np.array([0.0, 0.6, 0.8, 0.1]), (np.array([0.1, 0.2, 0.2]), np.array([0.8, 0.0, 0.6, 0.0])), LIMITS.palm)
+FLOOR = Floor(
+    np.array([0.0, 0.6, 0.8, 0.1]),
+    (np.array([0.1, 0.2, 0.2]), np.array([0.8, 0.0, 0.6, 0.0])),
+    LIMITS.palm,
+)
 """Of which the palm begins above: (0.6, 0.8).(0.2, 0.2) - 0.1 = 0.18 m at the wrist."""
 ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
 NEAR = st.floats(-2.0, 2.0)
@@ -53,7 +57,9 @@ VALUES = st.one_of(
         ]
     ),
 )
-STEPS = st.lists(st.tuples(VALUES, VALUES, VALUES, st.one_of(st.floats(0.0, 1.0), ANY)), min_size=1, max_size=20)
+STEPS = st.lists(
+    st.tuples(VALUES, VALUES, VALUES, st.one_of(st.floats(0.0, 1.0), ANY)), min_size=1, max_size=20
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -103,34 +109,53 @@ def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits(
     assert limit(0.01, 0.0, 0.0, 0.0).target == pytest.approx(0.01)  # the first period
     fast = limit(0.5, 0.4, 0.0, 0.01)
     assert fast.target == pytest.approx(0.07) and fast.by == ("speed",)  # 6 rad/s for 10 ms
-    strong = limit(0.12, -0.1, 0.0, 0.02)  # the servo reaches 0.6 N.m / 3 N.m/rad = 0.2 rad ahead of the joint
+    # The servo reaches 0.6 N.m / 3 N.m/rad = 0.2 rad ahead of the joint
+    strong = limit(0.12, -0.1, 0.0, 0.02)
     assert strong.target == pytest.approx(0.1) and strong.by == ("torque",)
     assert strong.torque == pytest.approx(0.6)
     moving = limit(0.12, 0.1, -3.0, 0.03)  # 3 * 0.02 + 0.1 * 3 = 0.36 N.m
-    assert moving.target == pytest.approx(0.12) and moving.by == () and moving.torque == pytest.approx(0.36)
+    assert (
+        moving.target == pytest.approx(0.12)
+        and moving.by == ()
+        and moving.torque == pytest.approx(0.36)
+    )
     held = limit(math.nan, 0.1, 0.0, 0.04)
     assert held.target == pytest.approx(0.12) and held.by == ("not_finite",)
     unmeasured = limit(0.15, math.nan, 0.0, 0.05)
     assert unmeasured.target == pytest.approx(0.12) and unmeasured.by == ("not_finite", "torque")
-    assert unmeasured.torque == pytest.approx(0.06)  # 3 N.m/rad from 0.1 rad, where the joint was last
+    # 3 N.m/rad from 0.1 rad, where the joint was last
+    assert unmeasured.torque == pytest.approx(0.06)
 
 
 def test_wrist_targets_have_limits_of_speed_acceleration_and_force_by_their_norm():
-    free = {"kp": np.ones(7), "kv": np.zeros(7), "lower": np.full(7, -9.0), "upper": np.full(7, 9.0)}
-    limits = JointLimits(speed=np.full(7, 2.0), torque=np.full(7, 5.0), acceleration=np.full(7, 20.0), **free)
+    free = {
+        "kp": np.ones(7),
+        "kv": np.zeros(7),
+        "lower": np.full(7, -9.0),
+        "upper": np.full(7, 9.0),
+    }
+    limits = JointLimits(
+        speed=np.full(7, 2.0), torque=np.full(7, 5.0), acceleration=np.full(7, 20.0), **free
+    )
     limiter = Limiter(limits, np.zeros(7), period=0.1)
-    goal = np.array([0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0])  # 1 m from where it is: 2 m/s after one step of 20 m/s^2
+    # 1 m from where it is: 2 m/s after one step of 20 m/s^2
+    goal = np.array([0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0])
     places = [np.zeros(7)]
     for step in range(20):
         places.append(limiter.limit(goal, places[-1], np.zeros(7), 0.1 * step).target)
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / 0.1
-    np.testing.assert_allclose(np.array(places)[:, 2] * 3, np.array(places)[:, 1] * 4, atol=1e-9)  # straight
-    assert speeds.max() == pytest.approx(2.0) and (np.abs(np.diff(speeds, prepend=0.0)) <= 2.0 + 1e-9).all()
-    np.testing.assert_allclose(
-        speeds[:6], [2.0, 2.0, 2.0, 2.0, 2.0, 0.0], atol=1e-9
-    )  # and stops there at once: 2 / 0.1
+    # Straight
+    np.testing.assert_allclose(np.array(places)[:, 2] * 3, np.array(places)[:, 1] * 4, atol=1e-9)
+    assert (
+        speeds.max() == pytest.approx(2.0)
+        and (np.abs(np.diff(speeds, prepend=0.0)) <= 2.0 + 1e-9).all()
+    )
+    # And stops there at once: 2 / 0.1
+    np.testing.assert_allclose(speeds[:6], [2.0, 2.0, 2.0, 2.0, 2.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(places[-1], goal, atol=1e-9)
-    far = Limiter(limits, np.zeros(7), period=0.1).limit(100.0 * goal, np.zeros(7), np.zeros(7), 0.0)
+    far = Limiter(limits, np.zeros(7), period=0.1).limit(
+        100.0 * goal, np.zeros(7), np.zeros(7), 0.0
+    )
     assert np.linalg.norm(far.torque) <= 5.0 and far.by == ("torque", "speed")
     slow = dataclasses.replace(limits, acceleration=np.full(7, 2.0))
     limiter, places = Limiter(slow, np.zeros(7), period=0.1), [np.zeros(7)]
@@ -138,12 +163,16 @@ def test_wrist_targets_have_limits_of_speed_acceleration_and_force_by_their_norm
         places.append(limiter.limit(goal, places[-1], np.zeros(7), 0.1 * step).target)
     speeds = np.diff(np.array(places) @ goal) / 0.1
     np.testing.assert_allclose(speeds[:4], [0.2, 0.4, 0.6, 0.8], atol=1e-9)
-    assert (np.abs(np.diff(speeds)) <= 0.2 + 1e-9).all() and (np.array(places) @ goal <= 1.0 + 1e-9).all()
+    assert (np.abs(np.diff(speeds)) <= 0.2 + 1e-9).all() and (
+        np.array(places) @ goal <= 1.0 + 1e-9
+    ).all()
     np.testing.assert_allclose(places[-1], goal, atol=1e-6)
 
 
 def test_a_palm_is_as_high_as_its_lowest_sphere():
-    """The base is 0.3 m up and turned by 90 degrees about x, so that its y axis points up: x, y, z are x, -z, y."""
+    """The base is 0.3 m up and turned by 90 degrees about x, so that its y axis points up: x, y, z
+    are x, -z, y.
+    """
     half = np.sqrt(0.5)
     floor = Floor(
         np.array([0.0, 0.0, 1.0, 0.05]),
@@ -153,7 +182,8 @@ def test_a_palm_is_as_high_as_its_lowest_sphere():
     np.testing.assert_allclose(floor.normal, [0.0, 1.0, 0.0], atol=1e-12)
     assert floor.clearance(np.zeros(6)) == pytest.approx(0.3 - 0.05 - 0.1 - 0.02)
     assert floor.clearance(np.array([0.5, -0.1, 0.7, 0.0, 0.0, 0.0])) == pytest.approx(0.03)
-    turned = floor.clearance(np.array([0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0]))  # y to z, z to -y: down
+    # Y to z, z to -y: down
+    turned = floor.clearance(np.array([0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0]))
     assert turned == pytest.approx(0.3 - 0.05 - 0.2 - 0.01)
 
 
@@ -165,7 +195,8 @@ def test_limits_of_a_hand_are_those_of_its_model():
     np.testing.assert_allclose(narrow.lower[:16], (hand.lower + hand.upper) / 2, atol=1e-6)
     assert limits.torque[0] == 0.7
     mass = sum(link.mass for link in hand.links) + 0.65
-    assert limits.torque[16] == pytest.approx(15.0 * mass) and 23.0 < limits.torque[16] < 25.0  # a = 15 m/s^2
+    # A = 15 m/s^2
+    assert limits.torque[16] == pytest.approx(15.0 * mass) and 23.0 < limits.torque[16] < 25.0
     assert limits.kp[-1] == hand.wrist.hinge_kp and len(limits.speed) == 22
     older = JointLimits.of_hand(hand, ControlConfig(wrist_acceleration=0.0))
     assert older.torque[16] == hand.wrist.slide_limit
@@ -183,15 +214,32 @@ def test_a_limit_of_the_grip_is_one_of_the_torque_by_the_way_to_the_fingertip():
         joint = link.joints[0]
         lever = np.linalg.norm(np.subtract(last.tip, joint.anchor))
         expected = min(5.0 * lever, joint.torque_limit)
-        assert limits.torque[hand.joints.index(joint)] == pytest.approx(expected) and 0.02 < lever < 0.2
+        assert (
+            limits.torque[hand.joints.index(joint)] == pytest.approx(expected)
+            and 0.02 < lever < 0.2
+        )
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"speed": [np.nan]}, {"torque": [-1.0]}, {"upper": [-2.0]}, {"kp": [0.0]}, {"kv": [0.0, 0.0]}, {"palm": [0.0]}],
+    [
+        {"speed": [np.nan]},
+        {"torque": [-1.0]},
+        {"upper": [-2.0]},
+        {"kp": [0.0]},
+        {"kv": [0.0, 0.0]},
+        {"palm": [0.0]},
+    ],
 )
 def test_limits_that_are_none_are_refused(wrong):
-    fields = {"lower": [-1.0], "upper": [1.0], "speed": [1.0], "torque": [1.0], "kp": [1.0], "kv": [0.0]}
+    fields = {
+        "lower": [-1.0],
+        "upper": [1.0],
+        "speed": [1.0],
+        "torque": [1.0],
+        "kp": [1.0],
+        "kv": [0.0],
+    }
     with pytest.raises(CongraspError, match="limits"):
         JointLimits(**{name: np.repeat(value, 7) for name, value in {**fields, **wrong}.items()})
     with pytest.raises(ValueError, match="read-only"):

@@ -1,4 +1,6 @@
-"""The two implementations of `Policy`, a bundle in this process and a server's client, asked the same."""
+"""The two implementations of `Policy`, a bundle in this process and a server's client, asked the
+same.
+"""
 
 import dataclasses
 
@@ -6,7 +8,12 @@ import numpy as np
 import pytest
 
 from congrasp.common.config import NetworkConfig, RunConfig
-from congrasp.common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
+from congrasp.common.errors import (
+    CongraspError,
+    ContradictionError,
+    RefusedError,
+    UnknownConstraintError,
+)
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.request import GraspRequest
@@ -51,10 +58,14 @@ def policies(tmp_path_factory) -> tuple[Policy, Policy]:
 
 
 def goals(request: GraspRequest) -> dict[str, dict[str, np.ndarray]]:
-    """Goal arrays of every constraint around the heading of a request; the trajectory ends at the graspable region."""
+    """Goal arrays of every constraint around the heading of a request; the trajectory ends at the
+    graspable region.
+    """
     heading = request.constraints["heading"]
     graspable = request.surface[request.surface[:, 2].argmin()]
-    path = graspable + np.linspace(0.2, 0.0, task.TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
+    path = graspable + np.linspace(0.2, 0.0, task.TASK.trajectory_points)[:, None] * np.array(
+        [0.0, 0.0, 1.0]
+    )
     turns = np.tile(IDENTITY, (task.TASK.trajectory_points, 1))
     return {
         "heading": dict(heading),
@@ -81,11 +92,20 @@ def same(one, other):
 
 @pytest.mark.parametrize("names", COMBINATIONS)
 def test_both_answers_are_equal(policies, episode, names):
-    states = [{**episode.state, "q": episode.state["q"] + 0.01 * i, "table": np.bool_(i < 3)} for i in range(5)]
+    states = [
+        {**episode.state, "q": episode.state["q"] + 0.01 * i, "table": np.bool_(i < 3)}
+        for i in range(5)
+    ]
     answers = []
     for policy in policies:
         policy.reset(asked(episode.request, names))
-        answers.append([*(policy.act(state) for state in states), *policy.act_each(states), policy.act(states[0])])
+        answers.append(
+            [
+                *(policy.act(state) for state in states),
+                *policy.act_each(states),
+                policy.act(states[0]),
+            ]
+        )
         policy.reset(asked(episode.request, names))
         answers[-1] += [*policy.act_each(states), policy.act(states[0])]
     for one, other in zip(*answers, strict=True):
@@ -138,7 +158,9 @@ def test_bad_states_leave_the_episode(policies, episode, change, words):
     for policy in policies:
         policy.reset(asked(episode.request, "heading"))
         policy.act(episode.state)
-        state = {name: value for name, value in {**episode.state, **change}.items() if value is not None}
+        state = {
+            name: value for name, value in {**episode.state, **change}.items() if value is not None
+        }
         with pytest.raises(RefusedError, match=words) as caught:
             policy.act(state)
         messages.append(str(caught.value))
@@ -159,18 +181,29 @@ def test_angles_in_degrees_are_refused_wherever_they_are(policies, episode, wher
     if where == "pose_q":
         request.constraints["pose"]["q"] = degrees
     for policy in policies:
-        with pytest.raises(RefusedError, match=rf"The field '{where}' has an angle of 12\.5\. Give it in radians"):
-            policy.reset(dataclasses.replace(request, q=degrees if where == "q_initial" else request.q))
+        with pytest.raises(
+            RefusedError, match=rf"The field '{where}' has an angle of 12\.5\. Give it in radians"
+        ):
+            policy.reset(
+                dataclasses.replace(request, q=degrees if where == "q_initial" else request.q)
+            )
             policy.act({**state, where: degrees[: state[where].size]} if where in state else state)
 
 
 def test_both_refuse_a_contradiction(policies, episode):
     highest = episode.request.surface[episode.request.surface[:, 2].argmax()]
     request = asked(episode.request, "trajectory affordance")
-    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (task.TASK.trajectory_points, 1))}
+    path = {
+        **goals(episode.request)["trajectory"],
+        "position": np.tile(highest, (task.TASK.trajectory_points, 1)),
+    }
     for policy in policies:
-        policy.reset(dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path}))
-        with pytest.raises(ContradictionError, match="trajectory ends nearer to the avoid region than to the grasp"):
+        policy.reset(
+            dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path})
+        )
+        with pytest.raises(
+            ContradictionError, match="trajectory ends nearer to the avoid region than to the grasp"
+        ):
             policy.act(episode.state)
 
 
@@ -198,8 +231,8 @@ STUDENT = RunConfig(
 
 
 def test_history_of_a_student(episode):
-    """The vector that is inferred from holds the control steps before this one, newest first, and at the begin its
-    first reading; velocities and forces that a client sends change nothing."""
+    """The vector that is inferred from holds the control steps before this one, newest first, and
+    at the begin its first reading; velocities and forces that a client sends change nothing."""
     policy = LocalPolicy(untrained(STUDENT))
     layout, sent = policy._function.layout, []
     parse = layout.parse
@@ -209,9 +242,18 @@ def test_history_of_a_student(episode):
         return parse(query)
 
     layout.parse = spy
-    policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))
+    policy.reset(
+        dataclasses.replace(
+            episode.request, constraints={"heading": episode.request.constraints["heading"]}
+        )
+    )
     states = [
-        {**episode.state, "q": episode.state["q"] + 0.01 * i, "object_position": np.full(3, 0.1 * i)} for i in range(6)
+        {
+            **episode.state,
+            "q": episode.state["q"] + 0.01 * i,
+            "object_position": np.full(3, 0.1 * i),
+        }
+        for i in range(6)
     ]
     answers = [policy.act(state) for state in states]
     q = np.float32([state["q"] for state in states])
@@ -219,34 +261,53 @@ def test_history_of_a_student(episode):
     np.testing.assert_array_equal(sent[1]["past_q"][0], q[[0, 0, 0]])
     np.testing.assert_array_equal(sent[2]["past_q"][0], q[[1, 0, 0]])
     np.testing.assert_array_equal(sent[5]["past_q"][0], q[[4, 3, 2]])
-    np.testing.assert_allclose(sent[5]["past_object_position"][0], [[0.4] * 3, [0.3] * 3, [0.2] * 3], rtol=1e-6)
+    np.testing.assert_allclose(
+        sent[5]["past_object_position"][0], [[0.4] * 3, [0.3] * 3, [0.2] * 3], rtol=1e-6
+    )
     targets = np.float32([answers[i].q_target for i in (3, 2, 1)])
     np.testing.assert_array_equal(sent[5]["past_q_target"][0], targets)
     np.testing.assert_array_equal(sent[5]["q_target"][0], answers[4].q_target)
-    same(policy.act_each([states[0]])[0], policy.act_each([{**states[0], "object_velocity": np.ones(3)}])[0])
+    same(
+        policy.act_each([states[0]])[0],
+        policy.act_each([{**states[0], "object_velocity": np.ones(3)}])[0],
+    )
     expected = policy.act_each([states[3]])[0]
     policy._packer._meta["layout"] = "of another server"
     same(policy.act_each([states[3]])[0], expected)
     moved = {**states[0], "u": states[0]["u"] + np.array([0.01, 0, 0, 0, 0, 0])}
-    assert not np.array_equal(policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target)
+    assert not np.array_equal(
+        policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target
+    )
 
 
 def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
     camera = dataclasses.replace(STUDENT.task, observation="camera")
     policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=camera)))
-    own, cloud = episode.request, np.asarray(episode.request.surface) + episode.request.object_pose[0]
+    own, cloud = (
+        episode.request,
+        np.asarray(episode.request.surface) + episode.request.object_pose[0],
+    )
     heading = own.constraints["heading"]
     heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}
     request = dataclasses.replace(
-        own, constraints={"heading": heading}, surface=None, object_pose=None, avoid=None, cloud=cloud[:100]
+        own,
+        constraints={"heading": heading},
+        surface=None,
+        object_pose=None,
+        avoid=None,
+        cloud=cloud[:100],
     )
     state = {name: episode.state[name] for name in ("q", "u", "table") if name in episode.state}
     policy.reset(request)
     for _ in range(3):
         answer = policy.act(state)
-    assert answer.q_target.shape == state["q"].shape and policy.metadata()["observation"] == "camera"
-    again = policy.act_each([state, {**state, "cloud": cloud[:100]}, {**state, "cloud": cloud[:60] + 0.01}])
+    assert (
+        answer.q_target.shape == state["q"].shape and policy.metadata()["observation"] == "camera"
+    )
+    again = policy.act_each(
+        [state, {**state, "cloud": cloud[:100]}, {**state, "cloud": cloud[:60] + 0.01}]
+    )
     np.testing.assert_array_equal(again[0].action, again[1].action)
     assert not np.array_equal(again[2].action, again[0].action)
     with pytest.raises(RefusedError, match="unknown field 'object_position'"):
@@ -267,23 +328,35 @@ class Recorder(EpisodePolicy):
 
     def _query(self, query):
         layout = self.function.layout
-        self.sent.append({name: x[0] for name, x in layout.unpack(layout.parse(query).vectors).items()})
+        self.sent.append(
+            {name: x[0] for name, x in layout.unpack(layout.parse(query).vectors).items()}
+        )
         zeros = np.zeros((1, len(layout.hand.motors) + len(layout.hand.joints) + 12), np.float32)
         return Inference(zeros, [[]]).reply({"version": 1, "total_ms": 0.0})
 
 
-@pytest.mark.parametrize(("settle", "expected"), [(0.04, [0.0, 6.0, 4.0, 4.0, 4.0]), (0.0, [0.0] * 5)])
+@pytest.mark.parametrize(
+    ("settle", "expected"), [(0.04, [0.0, 6.0, 4.0, 4.0, 4.0]), (0.0, [0.0] * 5)]
+)
 def test_a_student_averages_the_resting_object(episode, settle, expected):
-    """Readings 0, 12, 0, 90 and 0 mm from the first one: the fourth has moved; one that is refused does not count."""
+    """Readings 0, 12, 0, 90 and 0 mm from the first one: the fourth has moved; one that is refused
+    does not count.
+    """
     policy = Recorder(dataclasses.replace(STUDENT.task, sensing=SensingConfig(settle=settle)))
-    policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))
+    policy.reset(
+        dataclasses.replace(
+            episode.request, constraints={"heading": episode.request.constraints["heading"]}
+        )
+    )
     start = episode.state["object_position"]
     policy.act(episode.state)
     for x in (0.012, 0.0, 0.09, 0.0):
         with pytest.raises(RefusedError, match="unknown field 'colour'"):
             policy.act({**episode.state, "colour": np.zeros(3)})
         policy.act({**episode.state, "object_position": start + np.array([x, 0.0, 0.0])})
-    found = [1e3 * (sent["object_position_initial"] - start) for sent in policy.sent if "past_q" in sent]
+    found = [
+        1e3 * (sent["object_position_initial"] - start) for sent in policy.sent if "past_q" in sent
+    ]
     np.testing.assert_allclose([x for x, _, _ in found], expected, atol=1e-4)
 
 

@@ -32,12 +32,28 @@ vector = st.tuples(coordinate, coordinate, coordinate).map(lambda v: np.array(v,
 def arrays(**changes):
     """The arrays of a query whose values tell where they belong."""
     rng = np.random.default_rng(0)
-    state = ("q", "u", "q_target", "u_target", "q_initial", "object_position", "object_position_initial")
-    given_arrays = {name: rng.normal(size=LAYOUT.shapes[name]).astype(np.float32) for name in (*state, "base_position")}
-    given_arrays |= dict.fromkeys(("object_quaternion", "object_quaternion_initial", "base_quaternion"), IDENTITY)
+    state = (
+        "q",
+        "u",
+        "q_target",
+        "u_target",
+        "q_initial",
+        "object_position",
+        "object_position_initial",
+    )
+    given_arrays = {
+        name: rng.normal(size=LAYOUT.shapes[name]).astype(np.float32)
+        for name in (*state, "base_position")
+    }
+    given_arrays |= dict.fromkeys(
+        ("object_quaternion", "object_quaternion_initial", "base_quaternion"), IDENTITY
+    )
     given_arrays |= {"time": np.float32(7), "table": np.bool_(True)}
     given_arrays |= {"surface_points": rng.normal(size=(8, 3)), "surface_avoid": np.arange(8) < 3}
-    given_arrays |= {"heading_position": rng.normal(size=3), "heading_direction": np.array([0.0, 0.0, -1.0])}
+    given_arrays |= {
+        "heading_position": rng.normal(size=3),
+        "heading_direction": np.array([0.0, 0.0, -1.0]),
+    }
     return {name: value for name, value in {**given_arrays, **changes}.items() if value is not None}
 
 
@@ -79,10 +95,13 @@ def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(directio
 
 
 @pytest.mark.parametrize(
-    ("turn", "along"), [([np.cos(0.3), 0, 0, np.sin(0.3)], 0.0), ([1, 0, 0, 0], 0.0), ([1, 0, 0, 0], 1.0)]
+    ("turn", "along"),
+    [([np.cos(0.3), 0, 0, np.sin(0.3)], 0.0), ([1, 0, 0, 0], 0.0), ([1, 0, 0, 0], 1.0)],
 )
 def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
-    """It is the hand's own at the start, in the object's frame; along the heading it says nothing."""
+    """It is the hand's own at the start, in the object's frame; along the heading it says
+    nothing.
+    """
     own = grasp_frame(get_hand("human")).cross
     wrist, thing = Rotation.from_euler("x", 0.4), Rotation.from_quat(turn, scalar_first=True)
     held = thing.inv().apply(wrist.apply(own))
@@ -110,7 +129,11 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
     ("constraints", "changes", "words"),
     [
         (["flight"], {}, "no constraint 'flight'"),
-        (["affordance"], {}, "no constraint that guides the wrist. Add one of: heading, pose, trajectory"),
+        (
+            ["affordance"],
+            {},
+            "no constraint that guides the wrist. Add one of: heading, pose, trajectory",
+        ),
         (["heading", "affordance"], {"surface_avoid": np.zeros(8, bool)}, "both sides"),
         (["heading", "affordance"], {"surface_avoid": None}, "lacks the field 'surface_avoid'"),
         (["heading"], {"q": None}, "lacks the field 'q'"),
@@ -120,8 +143,16 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
         (["heading"], {"u": np.full(6, np.inf)}, "'u' is not finite"),
         (["heading"], {"surface_points": np.zeros((0, 3))}, "surface_points"),
         (["heading"], {"surface_avoid": np.zeros(5, bool)}, r"must be \(8,\)"),
-        (["heading"], {"base_quaternion": np.zeros(4)}, "'base_quaternion' has length 0.000, not 1"),
-        (["trajectory"], {"trajectory_position": np.zeros((3, 3))}, "lacks the field 'trajectory_quaternion'"),
+        (
+            ["heading"],
+            {"base_quaternion": np.zeros(4)},
+            "'base_quaternion' has length 0.000, not 1",
+        ),
+        (
+            ["trajectory"],
+            {"trajectory_position": np.zeros((3, 3))},
+            "lacks the field 'trajectory_quaternion'",
+        ),
     ],
 )
 def test_bad_queries_name_the_field_and_the_rule(constraints, changes, words):
@@ -130,14 +161,30 @@ def test_bad_queries_name_the_field_and_the_rule(constraints, changes, words):
 
 
 def test_odd_constraints_are_refused_in_one_short_line():
-    for names in (None, 7, "heading", [["heading"]], [None], ["x" * 500_000], {"heading": 1}, ["heading", 3]):
+    for names in (
+        None,
+        7,
+        "heading",
+        [["heading"]],
+        [None],
+        ["x" * 500_000],
+        {"heading": 1},
+        ["heading", 3],
+    ):
         with pytest.raises(CongraspError, match="list of names") as caught:
-            LAYOUT.parse(Message(packed(LAYOUT, arrays()).arrays, {"layout": LAYOUT.digest, "constraints": names}))
+            LAYOUT.parse(
+                Message(
+                    packed(LAYOUT, arrays()).arrays, {"layout": LAYOUT.digest, "constraints": names}
+                )
+            )
         assert len(str(caught.value)) < 120
 
 
 def test_a_query_of_another_layout_is_refused():
-    vector, meta = packed(LAYOUT, arrays()).arrays["packed"], {"constraints": ["heading"], "layout": LAYOUT.digest}
+    vector, meta = (
+        packed(LAYOUT, arrays()).arrays["packed"],
+        {"constraints": ["heading"], "layout": LAYOUT.digest},
+    )
     assert len(LAYOUT.parse(Message({"packed": np.tile(vector, (64, 1))}, meta)).vectors) == 64
     for count in (0, 65):
         with pytest.raises(CongraspError, match=f"The query has {count} states"):
@@ -166,32 +213,47 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
     )
     queries = good, bad, good, third
     fields, checks = COMPLETE(np.concatenate([query.vectors for query in queries]))
-    errors = [LAYOUT.find_error(query, row[None]) for query, row in zip(queries, np.asarray(checks), strict=True)]
+    errors = [
+        LAYOUT.find_error(query, row[None])
+        for query, row in zip(queries, np.asarray(checks), strict=True)
+    ]
     assert [error is not None for error in errors] == [False, True, False, True]
     assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
     _, alone = parse()
     for name, value in fields.items():
-        np.testing.assert_allclose(np.asarray(value)[[0, 2]], alone[name][None].repeat(2, 0), atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            np.asarray(value)[[0, 2]], alone[name][None].repeat(2, 0), atol=1e-6, err_msg=name
+        )
         assert np.isfinite(value).all()
 
 
-CLOSER = TaskConfig(constraints=("heading",), surface_points=8, trajectory_points=3, surface_normals=True)
+CLOSER = TaskConfig(
+    constraints=("heading",), surface_points=8, trajectory_points=3, surface_normals=True
+)
 UP = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (8, 1))
 
 
 @functools.cache
 def completing(task):
     layout = Layout(HAND, task)
-    return layout, jax.jit(lambda vectors: (layout.complete(vectors)[1], layout.surface(layout.complete(vectors)[0])))
+    return layout, jax.jit(
+        lambda vectors: (layout.complete(vectors)[1], layout.surface(layout.complete(vectors)[0]))
+    )
 
 
 def normals_of(task=CLOSER, **changes):
     """The normals with which a policy computes features for a query."""
     layout, complete = completing(task)
     points = "cloud" if task.observation == "camera" else "surface_points"
-    given_arrays = {name: value for name, value in arrays(**changes).items() if name in {*layout.shapes, *changes}}
+    given_arrays = {
+        name: value
+        for name, value in arrays(**changes).items()
+        if name in {*layout.shapes, *changes}
+    }
     if points == "cloud":
-        given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {points: changes[points]}
+        given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {
+            points: changes[points]
+        }
     query = layout.parse(packed(layout, given_arrays))
     layout.estimate_normals(query.vectors)
     checks, surface = complete(query.vectors)
@@ -214,8 +276,15 @@ def test_given_normals_are_used_and_missing_ones_are_estimated():
 
 def test_normals_are_estimated_once_for_a_surface(monkeypatch):
     calls = []
-    monkeypatch.setattr(requests, "estimated_normals", lambda points: calls.append(points) or estimated_normals(points))
-    layout, own = Layout(HAND, CLOSER), np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
+    monkeypatch.setattr(
+        requests,
+        "estimated_normals",
+        lambda points: calls.append(points) or estimated_normals(points),
+    )
+    layout, own = (
+        Layout(HAND, CLOSER),
+        np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32),
+    )
     vectors = np.zeros((5, layout.size), np.float32)
     for row, surface in enumerate((0, 1, 0, 0, 1)):
         vectors[row, layout.offsets["surface_points"] :][:24] = own[surface].reshape(-1)
@@ -224,12 +293,17 @@ def test_normals_are_estimated_once_for_a_surface(monkeypatch):
     layout.estimate_normals(vectors)
     assert len(calls) == 2
     found, expected = layout.unpack(vectors)["surface_normals"], np.asarray(estimated_normals(own))
-    np.testing.assert_allclose(found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5)
+    np.testing.assert_allclose(
+        found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("normals", "error"),
-    [(2.0 * UP, "'surface_normals' has length 2.000, not 1"), (UP[:5], r"shape \(5, 3\); it must be \(8, 3\)")],
+    [
+        (2.0 * UP, "'surface_normals' has length 2.000, not 1"),
+        (UP[:5], r"shape \(5, 3\); it must be \(8, 3\)"),
+    ],
 )
 def test_normals_that_are_none_are_named(normals, error):
     with pytest.raises(CongraspError, match=error):

@@ -1,4 +1,6 @@
-"""The examples' loops keep a simulated robot to its limits while their policy server is killed and comes back."""
+"""The examples' loops keep a simulated robot to its limits while their policy server is killed and
+comes back.
+"""
 
 import contextlib
 import time
@@ -28,7 +30,9 @@ def robot(loop):
 
 
 def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
-    """Over Zenoh, in a process of its own; nothing was lifted, so that the hand opens when the server has gone."""
+    """Over Zenoh, in a process of its own; nothing was lifted, so that the hand opens when the
+    server has gone.
+    """
     with contextlib.closing(Rig(tmp_path, robot, TASK)) as rig:
         with steady_server(HAND.name) as port:
             rig.begin(f"tcp/127.0.0.1:{port}", "--hold", "1.5")
@@ -40,7 +44,9 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
     assert robot.beyond <= 0.0 and robot.strongest <= 1.0 + 1e-6
 
 
-def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(loop, robot, tmp_path):
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(
+    loop, robot, tmp_path
+):
     bundles.save(policy(), tmp_path / "policy.safetensors")
     limits = congrasp.JointLimits.of_hand(HAND)
     robot.reset()
@@ -48,8 +54,14 @@ def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_s
     try:
         client = congrasp.PolicyClient(server.url, hand=HAND.name, timeout=0.2, wait=SECONDS)
         client.metadata()
-        with congrasp.Guard(client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
-            grasps, ticker, counters = loop.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
+        with congrasp.Guard(
+            client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open"
+        ) as guard:
+            grasps, ticker, counters = (
+                loop.Grasps(robot, guard, TASK),
+                congrasp.Ticker(100.0),
+                guard.counters,
+            )
 
             def step_until(done):
                 deadline = time.monotonic() + SECONDS

@@ -1,4 +1,6 @@
-"""The example's node: its CDR over Zenoh is an independent implementation's, and with rclpy it is the same node."""
+"""The example's node: its CDR over Zenoh is an independent implementation's, and with rclpy it is
+the same node.
+"""
 
 import array
 import contextlib
@@ -27,7 +29,10 @@ from tests import examples
 from tests.bare_zenoh import bare_session
 from tests.waits import eventually
 
-OUTPUTS = {"joint_command": "sensor_msgs/msg/JointState", "wrist_command": "geometry_msgs/msg/PoseStamped"}
+OUTPUTS = {
+    "joint_command": "sensor_msgs/msg/JointState",
+    "wrist_command": "geometry_msgs/msg/PoseStamped",
+}
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HAND = get_hand("allegro")
 NAMES = [joint.name for joint in HAND.joints]
@@ -51,7 +56,11 @@ class SteadyPolicy:
 
     def act(self, state):
         self.state = state
-        if not all(np.isfinite(state[name]).all() for name in ("q", "u", "object_position", "cloud") if name in state):
+        if not all(
+            np.isfinite(state[name]).all()
+            for name in ("q", "u", "object_position", "cloud")
+            if name in state
+        ):
             raise congrasp.RefusedError("not finite")
         return Answer(*self.wanted, np.zeros(22), 1, (), 0.0, 0.0)
 
@@ -97,19 +106,26 @@ def robot_says(obj):
 
 
 def check(policy, obj, commanded):
-    """What the policy was told, and the commands (joints, wrist), against numbers worked out here."""
+    """What the policy was told, and the commands (joints, wrist), against numbers worked out
+    here.
+    """
     np.testing.assert_allclose(policy.request.q, HAND.q_open, atol=1e-6)
     np.testing.assert_allclose(policy.request.object_pose[0], [0.0, 0.1, 0.05], atol=1e-6)
-    np.testing.assert_allclose(policy.request.object_pose[1], [np.cos(0.25), 0, 0, np.sin(0.25)], atol=1e-6)
+    np.testing.assert_allclose(
+        policy.request.object_pose[1], [np.cos(0.25), 0, 0, np.sin(0.25)], atol=1e-6
+    )
     np.testing.assert_allclose(policy.state["q"], HAND.q_open, atol=1e-6)
     np.testing.assert_allclose(policy.state["u"], np.zeros(6), atol=1e-6)
     joints, wrist = commanded
     q_wanted, u_wanted = policy.wanted
     assert list(joints.name) == NAMES and len(joints.velocity) == 0
     np.testing.assert_allclose(joints.position, q_wanted, atol=1e-6)
-    np.testing.assert_allclose(joints.effort, 3.0 * 0.05 * np.ones(16), atol=1e-5)  # kp of Allegro, 0.05 rad ahead
+    # Kp of Allegro, 0.05 rad ahead
+    np.testing.assert_allclose(joints.effort, 3.0 * 0.05 * np.ones(16), atol=1e-5)
     place, turn = wrist.pose.position, wrist.pose.orientation
-    np.testing.assert_allclose([place.x, place.y, place.z], BASE + BASE_TURN.as_matrix() @ u_wanted[:3], atol=1e-6)
+    np.testing.assert_allclose(
+        [place.x, place.y, place.z], BASE + BASE_TURN.as_matrix() @ u_wanted[:3], atol=1e-6
+    )
     cos, sin = np.cos([0.02, 0.01]), np.sin([0.02, 0.01])
     about_x = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
     about_z = np.array([[cos[1], -sin[1], 0], [sin[1], cos[1], 0], [0, 0, 1]])
@@ -124,7 +140,8 @@ HOLD = 60.0
 
 @contextlib.contextmanager
 def running(example, bus, arguments, age, lift, target):
-    """A node with a steady policy, whose `now` is the guard's clock: 0.05 s pass whenever the node looks at its topics.
+    """A node with a steady policy, whose `now` is the guard's clock: 0.05 s pass whenever the node
+    looks at its topics.
 
     `target` makes what the node grasps of its sensors.
     """
@@ -148,7 +165,8 @@ def running(example, bus, arguments, age, lift, target):
 def node_of(example, bus, lift=0.0, age=5.0, **given):
     """A node with a tracker, and the object that it grasps."""
     obj = procedural.generate(7)
-    arguments = example.Arguments("capsule:7", robot_age=5.0, **given)  # on a machine with other work
+    # On a machine with other work
+    arguments = example.Arguments("capsule:7", robot_age=5.0, **given)
     request = congrasp.GraspRequest(surface=obj.points)
     make = lambda sensors: example.Tracked(sensors, request, obj.origin)  # noqa: E731
     with running(example, bus, arguments, age, lift, make) as (node, policy):
@@ -156,7 +174,9 @@ def node_of(example, bus, lift=0.0, age=5.0, **given):
 
 
 class Wire:
-    """A bus in this process: messages that are there at every step, and the last ones that were sent."""
+    """A bus in this process: messages that are there at every step, and the last ones that were
+    sent.
+    """
 
     def __init__(self):
         self.said, self.sent = [], {}
@@ -177,7 +197,9 @@ class Wire:
 def arrived(node, policy):
     """Whether the targets, which the limits slow down, rest where the policy wants them."""
     limiter = node._guard._limiter
-    return np.allclose(limiter.target, np.concatenate(policy.wanted)) and np.allclose(limiter._speed, 0.0)
+    return np.allclose(limiter.target, np.concatenate(policy.wanted)) and np.allclose(
+        limiter._speed, 0.0
+    )
 
 
 def schema(kind):
@@ -185,7 +207,9 @@ def schema(kind):
 
 
 def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
-    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags; long ones share memory."""
+    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags; long
+    ones share memory.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     write = {k: serialize_dynamic(*schema(k))[schema(k)[0]] for k in set(example.INPUTS.values())}
     read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(OUTPUTS.values())}
@@ -212,7 +236,9 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
         eventually(refused)
         eventually(lambda: turn() and arrived(node, policy))
         turn()
-        newest = {t: eventually(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()}
+        newest = {
+            t: eventually(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()
+        }
         check(policy, obj, [read[OUTPUTS[t]](payload) for t, payload in newest.items()])
         silent.append("object_pose")
         eventually(lambda: (turn(), node._guard.trouble)[1])  # a measurement of this age is refused
@@ -221,7 +247,9 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
 
 
 def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
-    """Against a stand-in for rclpy that takes what rclpy takes: messages by class, arrays as lists."""
+    """Against a stand-in for rclpy that takes what rclpy takes: messages by class, arrays as
+    lists.
+    """
     said, sent, callbacks = [], {}, {}
 
     class Node:
@@ -239,10 +267,14 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
             callbacks.clear()
 
     def message(kind):
-        names = [field for field in STORE.types[kind].__dataclass_fields__ if field != "__msgtype__"]
+        names = [
+            field for field in STORE.types[kind].__dataclass_fields__ if field != "__msgtype__"
+        ]
 
         def make(self, **fields):
-            assert set(fields) <= set(names) and not any(isinstance(x, np.ndarray) for x in fields.values())
+            assert set(fields) <= set(names) and not any(
+                isinstance(x, np.ndarray) for x in fields.values()
+            )
             self.__dict__.update(fields)
 
         return type(kind.rpartition("/")[2], (), {"__init__": make})
@@ -252,12 +284,27 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
             topic, message = said.pop(0)
             callbacks[topic](message)
 
-    policies = {"ReliabilityPolicy": Fields(BEST_EFFORT=1), "DurabilityPolicy": Fields(TRANSIENT_LOCAL=1)}
+    policies = {
+        "ReliabilityPolicy": Fields(BEST_EFFORT=1),
+        "DurabilityPolicy": Fields(TRANSIENT_LOCAL=1),
+    }
     qos = Fields(QoSProfile=Fields, **policies)
-    rclpy = Fields(init=lambda: None, create_node=lambda name: Node(), spin_once=spin_once, try_shutdown=lambda: None)
+    rclpy = Fields(
+        init=lambda: None,
+        create_node=lambda name: Node(),
+        spin_once=spin_once,
+        try_shutdown=lambda: None,
+    )
     monkeypatch.setitem(sys.modules, "rclpy", rclpy)
     monkeypatch.setitem(sys.modules, "rclpy.qos", qos)
-    for package in ("sensor_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces", "tf2_msgs", "rosgraph_msgs"):
+    for package in (
+        "sensor_msgs",
+        "geometry_msgs",
+        "std_msgs",
+        "builtin_interfaces",
+        "tf2_msgs",
+        "rosgraph_msgs",
+    ):
         kinds = [kind for kind in STORE.types if kind.startswith(f"{package}/msg/")]
         monkeypatch.setitem(sys.modules, package, types.ModuleType(package))
         module = Fields(**{kind.rpartition("/")[2]: message(kind) for kind in kinds})
@@ -280,7 +327,9 @@ def test_stamps_are_of_a_simulator_s_clock_where_one_is_published(example, capsy
 
     def joints(seconds):
         header = Fields(stamp=stamp(seconds), frame_id="")
-        return "joint_states", Fields(header=header, name=NAMES, position=HAND.q_open.tolist(), velocity=[])
+        return "joint_states", Fields(
+            header=header, name=NAMES, position=HAND.q_open.tolist(), velocity=[]
+        )
 
     def clock(seconds):
         return "clock", Fields(clock=stamp(seconds))
@@ -295,7 +344,11 @@ def test_stamps_are_of_a_simulator_s_clock_where_one_is_published(example, capsy
         assert not measured(joints(time.time() - 100))
         assert measured(joints(12)) and measured(joints(13))
         assert capsys.readouterr().err.count("joint_states: its stamps are a simulator's") == 1
-        assert measured(joints(14), clock(15)) and not measured(joints(14), clock(50)) and measured(joints(49))
+        assert (
+            measured(joints(14), clock(15))
+            and not measured(joints(14), clock(50))
+            and measured(joints(49))
+        )
         bus.said = robot_says(obj)
         node.step()
         assert bus.sent["joint_command"].header.stamp.sec == 50
@@ -317,7 +370,9 @@ def test_a_bus_that_is_absent_is_one_line(example, monkeypatch, options, words):
 
 
 def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
-    """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object in a lost frame."""
+    """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object
+    in a lost frame.
+    """
     bus = Wire()
     with node_of(example, bus) as (node, _, obj):
         (_, joints), _, _, (_, thing) = robot_says(obj)
@@ -328,10 +383,16 @@ def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
         line = example.report(None, node._guard, node._sensors)
         assert ", motor_1, " in line
         assert line.startswith(f"Waiting for the joints {NAMES[0]} in joint_states (there: ")
-        assert "; see --joint-map); wrist_pose; object_pose: a pose, and tf from its frame 'camera'" in line
+        assert (
+            "; see --joint-map); wrist_pose; object_pose: a pose, and tf from its frame 'camera'"
+            in line
+        )
     with node_of(example, bus, joint_map=(f"{NAMES[0]}=motor_1",)) as (node, _, obj):
         node.step()
-        assert node._sensors.missing().startswith("wrist_pose; ") and node._sensors.names[0] == "motor_1"
+        assert (
+            node._sensors.missing().startswith("wrist_pose; ")
+            and node._sensors.names[0] == "motor_1"
+        )
         old = dict(robot_says(obj))["wrist_pose"]
         old.header = header(age=9.0)
         bus.said = [("wrist_pose", old)]
@@ -341,24 +402,38 @@ def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
 
 
 def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example):
-    """The base stands at (1, 0, 0), turned by 90 degrees about z; the camera hangs 2 m above it and looks along its z;
-    it is really 1 cm farther along its own x axis. The palm is 10 cm along the flange's z axis.
+    """The base stands at (1, 0, 0), turned by 90 degrees about z; the camera hangs 2 m above it and
+    looks along its z; it is really 1 cm farther along its own x axis. The palm is 10 cm along the
+    flange's z axis.
 
-    An object at (0.3, 0.2, 0) of the camera is at (0.31, 0.2, 2) of the base, so at (1 - 0.2, 0.31, 2) of the world.
+    An object at (0.3, 0.2, 0) of the camera is at (0.31, 0.2, 2) of the base, so at (1 - 0.2, 0.31,
+    2) of the world.
     """
     bus, level = Wire(), Rotation.identity()
     quarter = Rotation.from_euler("z", 90, degrees=True)
-    with node_of(example, bus, mount="0 0 0.1 0 0 0", hand_eye="0.01 0 0 0 0 0") as (node, policy, obj):
+    with node_of(example, bus, mount="0 0 0.1 0 0 0", hand_eye="0.01 0 0 0 0 0") as (
+        node,
+        policy,
+        obj,
+    ):
         fixed = Fields(transforms=[frame("base", "world", [1.0, 0.0, 0.0], quarter, age=99.0)])
         moving = Fields(transforms=[frame("camera", "base", [0.0, 0.0, 2.0], level)])
         thing = posed(np.array([0.3, 0.2, 0.0]) + obj.origin, level, frame="camera")
         flange = posed([0.5, 0.0, 0.3], level, frame="base")
         joints = robot_says(obj)[0]
-        bus.said = [("tf_static", fixed), ("tf", moving), joints, ("object_pose", thing), ("wrist_pose", flange)]
+        bus.said = [
+            ("tf_static", fixed),
+            ("tf", moving),
+            joints,
+            ("object_pose", thing),
+            ("wrist_pose", flange),
+        ]
         assert node.step().mode == "follow"
         np.testing.assert_allclose(policy.request.object_pose[0], [0.8, 0.31, 2.0], atol=1e-9)
         np.testing.assert_allclose(policy.request.wrist[0], [1.0, 0.5, 0.4], atol=1e-9)
-        np.testing.assert_allclose(policy.request.wrist[1], quarter.as_quat(scalar_first=True), atol=1e-9)
+        np.testing.assert_allclose(
+            policy.request.wrist[1], quarter.as_quat(scalar_first=True), atol=1e-9
+        )
         u = node._guard._limiter.target[-6:]
         turned = quarter * Rotation.from_euler("XYZ", u[3:])
         place = bus.sent["wrist_command"].pose.position
@@ -370,7 +445,9 @@ def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example)
 
 
 def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
-    """3 steps of approach; then 10 cm at 2 cm a step, with a smooth beginning and end: 3 s^2 - 2 s^3."""
+    """3 steps of approach; then 10 cm at 2 cm a step, with a smooth beginning and end: 3 s^2 - 2
+    s^3.
+    """
     bus = Wire()
     with node_of(example, bus, lift=0.1) as (node, policy, obj):
         heights, tables = [], []
@@ -378,12 +455,17 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
         def risen():
             bus.said = robot_says(obj)
             if bus.sent:
-                bus.said[2] = "wrist_pose", Fields(header=header(), pose=bus.sent["wrist_command"].pose)
+                bus.said[2] = (
+                    "wrist_pose",
+                    Fields(header=header(), pose=bus.sent["wrist_command"].pose),
+                )
             node.step()
             heights.append(bus.sent["wrist_command"].pose.position.z)
             tables.append(policy.state is None or bool(policy.state["table"]))
             seen = 0.0 if policy.state is None else policy.state["object_position"][2]
-            return seen == pytest.approx(-0.05) and heights[-1] - heights[0] == pytest.approx(0.1, abs=0.005)
+            return seen == pytest.approx(-0.05) and heights[-1] - heights[0] == pytest.approx(
+                0.1, abs=0.005
+            )
 
         eventually(risen)
         rise = [0.1 * s**2 * (3 - 2 * s) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
@@ -403,8 +485,12 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
 
 
 @pytest.mark.parametrize(("radius", "height"), [(0.06, 0.04), (0.015, 0.0)])
-def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_middle(example, radius, height):
-    """Of a ball, from above: 6 cm - 2 cm over the middle; the middle of a ball of 1.5 cm is nearer to its surface."""
+def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_middle(
+    example, radius, height
+):
+    """Of a ball, from above: 6 cm - 2 cm over the middle; the middle of a ball of 1.5 cm is nearer
+    to its surface.
+    """
     middle = np.array([0.1, 0.0, 0.5])
     points = np.random.default_rng(0).normal(size=(4000, 3))
     points = middle + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -413,12 +499,16 @@ def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_mid
 
 
 def test_the_policy_s_clock_reaches_the_removal_when_the_object_may_leave_the_table(example):
-    plan = example.Plan("world", approach_steps=200, trained_steps=100, lift=0.1, step=0.001, dry_run=False)
+    plan = example.Plan(
+        "world", approach_steps=200, trained_steps=100, lift=0.1, step=0.001, dry_run=False
+    )
     assert [plan.time(followed) for followed in (0, 100, 200, 230)] == [0.0, 50.0, 100.0, 130.0]
 
 
 def test_a_step_waits_for_the_measurement_of_its_time(example):
-    """Not for one that came more than half a period early, and for none more than half a period late."""
+    """Not for one that came more than half a period early, and for none more than half a period
+    late.
+    """
     bus, began = Wire(), time.monotonic()
     with node_of(example, bus) as (node, _, obj):
         node._last = began
@@ -445,35 +535,61 @@ PALM, PALM_TURN = np.array([0.5, 0.1, 0.32]), Rotation.from_euler("x", 180, degr
 
 def camera_node(example, bus, lift=0.0, age=5.0, **given):
     """A node of a policy with a camera, in a box around (0.5, 0.1)."""
-    arguments = example.Arguments(cloud_topic=TOPIC, robot_age=5.0, box="0.5 0.1 0.2 0.3 0.3 0.4", **given)
+    arguments = example.Arguments(
+        cloud_topic=TOPIC, robot_age=5.0, box="0.5 0.1 0.2 0.3 0.3 0.4", **given
+    )
     make = functools.partial(example.target_of, arguments, hand=HAND, described=DESCRIBED)
     return running(example, bus, arguments, age, lift, make)
 
 
 def cloud_of(points, rows=1, **stamp):
-    """A PointCloud2 of points (N, 3) in the world, as a camera has it: rows with gaps, of points with other fields."""
-    kind = np.dtype({"names": ["rgb", "x", "y", "z"], "formats": ["<u4", "<f4", "<f4", "<f4"], "offsets": [0, 4, 8, 16],
-                     "itemsize": 24})  # fmt: skip
+    """A PointCloud2 of points (N, 3) in the world, as a camera has it: rows with gaps, of points
+    with other fields.
+    """
+    kind = np.dtype(
+        {
+            "names": ["rgb", "x", "y", "z"],
+            "formats": ["<u4", "<f4", "<f4", "<f4"],
+            "offsets": [0, 4, 8, 16],
+            "itemsize": 24,
+        }
+    )
     local = CAMERA_TURN.inv().apply(points - CAMERA)
     packed = np.zeros(len(points), kind)
     packed["x"], packed["y"], packed["z"] = local.T
     lines = [row.tobytes() + b"\xff" * 5 for row in packed.reshape(rows, -1)]
-    fields = [Fields(name=name, offset=at, datatype=7, count=1) for name, at in (("x", 4), ("y", 8), ("z", 16))]
+    fields = [
+        Fields(name=name, offset=at, datatype=7, count=1)
+        for name, at in (("x", 4), ("y", 8), ("z", 16))
+    ]
     return Fields(
-        header=header("camera", **stamp), height=rows, width=len(points) // rows, fields=fields, is_bigendian=False,
-        point_step=24, row_step=24 * (len(points) // rows) + 5, data=array.array("B", b"".join(lines)), is_dense=False,
-    )  # fmt: skip
+        header=header("camera", **stamp),
+        height=rows,
+        width=len(points) // rows,
+        fields=fields,
+        is_bigendian=False,
+        point_step=24,
+        row_step=24 * (len(points) // rows) + 5,
+        data=array.array("B", b"".join(lines)),
+        is_dense=False,
+    )
 
 
 def block(shift=(0.0, 0.0, 0.0)):
     """(300, 3) points of an object on the table."""
-    return np.random.default_rng(1).uniform([0.47, 0.07, 0.006], [0.53, 0.13, 0.1], (300, 3)) + shift
+    return (
+        np.random.default_rng(1).uniform([0.47, 0.07, 0.006], [0.53, 0.13, 0.1], (300, 3)) + shift
+    )
 
 
 def surroundings():
-    """(100, 3) points that are none of the object: table, wall, no measurement, and the hand itself."""
+    """(100, 3) points that are none of the object: table, wall, no measurement, and the hand
+    itself.
+    """
     rng = np.random.default_rng(2)
-    table = np.concatenate([rng.uniform(0.4, 0.6, (30, 2)) - [0, 0.4], rng.normal(0, 0.001, (30, 1))], 1)
+    table = np.concatenate(
+        [rng.uniform(0.4, 0.6, (30, 2)) - [0, 0.4], rng.normal(0, 0.001, (30, 1))], 1
+    )
     wall = rng.uniform([0.7, -1, 0], [0.9, 1, 1], (30, 3))
     hand = PALM + PALM_TURN.apply(mujoco_link_poses(HAND, HAND.q_open)[0])
     return np.concatenate([table, wall, np.full((24, 3), np.nan), hand[:16]])
@@ -482,12 +598,21 @@ def surroundings():
 def camera_says(cloud, wrist=(PALM, PALM_TURN)):
     """Messages of a robot whose camera stands still."""
     fixed = Fields(transforms=[frame("camera", "world", CAMERA, CAMERA_TURN)])
-    joints = Fields(header=header(""), name=NAMES, position=HAND.q_open.tolist(), velocity=[], effort=[])
-    return [("tf_static", fixed), ("joint_states", joints), ("wrist_pose", posed(*wrist)), (TOPIC, cloud)]
+    joints = Fields(
+        header=header(""), name=NAMES, position=HAND.q_open.tolist(), velocity=[], effort=[]
+    )
+    return [
+        ("tf_static", fixed),
+        ("joint_states", joints),
+        ("wrist_pose", posed(*wrist)),
+        (TOPIC, cloud),
+    ]
 
 
 def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
-    """In the order of the cloud, 64 of 300; the same from a cloud in rows, and where the camera is off as stated."""
+    """In the order of the cloud, 64 of 300; the same from a cloud in rows, and where the camera is
+    off as stated.
+    """
     bus, points = Wire(), block()
     expected = points[np.arange(64) * 300 // 64]
     around = surroundings()
@@ -498,7 +623,9 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
         np.testing.assert_allclose(policy.state["cloud"], expected, atol=1e-6)
         assert policy.request.surface is None and policy.request.object_pose is None
-        np.testing.assert_allclose([policy.request.camera, policy.state["camera_position"]], [CAMERA] * 2)
+        np.testing.assert_allclose(
+            [policy.request.camera, policy.state["camera_position"]], [CAMERA] * 2
+        )
         heading = policy.request.constraints["heading"]
         middle = expected.mean(0)
         top = expected[np.linalg.norm((expected - middle)[:, :2], axis=1) < 0.01, 2].max()
@@ -510,7 +637,10 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
         np.testing.assert_allclose(policy.request.camera, CAMERA + off)
-    with camera_node(example, bus) as (node, policy):  # a cloud in the world's frame does not say where the camera is
+    with camera_node(example, bus) as (
+        node,
+        policy,
+    ):  # a cloud in the world's frame does not say where the camera is
         bus.said = camera_says(cloud_of(CAMERA + CAMERA_TURN.apply(points)))
         bus.said[-1][1].header.frame_id = "world"
         eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
@@ -537,7 +667,9 @@ def test_a_hidden_object_stays_where_it_was_and_a_silent_camera_stops_the_hand(e
     with camera_node(example, bus, age=0.5) as (node, policy):
         bus.said = camera_says(cloud_of(surroundings()))
         assert node.step() is None
-        assert f"{TOPIC}: 0 of 76 points in --box" in example.report(None, node._guard, node._sensors)
+        assert f"{TOPIC}: 0 of 76 points in --box" in example.report(
+            None, node._guard, node._sensors
+        )
         bus.said = camera_says(cloud_of(block(), age=9.0))
         assert node.step() is None and f"{TOPIC} (the last one is 9." in node._sensors.missing()
 
@@ -565,7 +697,9 @@ def test_the_cloud_rises_with_the_hand(example):
         def risen():
             nonlocal wrist
             height = -float(node._plan.rise(node._followed)[2])
-            bus.said = camera_says(cloud_of(np.concatenate([block((0, 0, -height)), surroundings()[:30]])), wrist)
+            bus.said = camera_says(
+                cloud_of(np.concatenate([block((0, 0, -height)), surroundings()[:30]])), wrist
+            )
             command = node.step()
             if bus.sent:
                 place = bus.sent["wrist_command"].pose.position
@@ -582,7 +716,11 @@ def test_a_camera_needs_a_topic_and_a_tracker_an_object(example):
     for arguments, observation, words in (
         (example.Arguments(), "camera", "a point cloud. Set --cloud-topic and name no object"),
         (example.Arguments("mug:7", cloud_topic=TOPIC), "camera", "name no object"),
-        (example.Arguments("mug:7", cloud_topic=TOPIC), "full", "Name an object and leave out --cloud-topic"),
+        (
+            example.Arguments("mug:7", cloud_topic=TOPIC),
+            "full",
+            "Name an object and leave out --cloud-topic",
+        ),
         (example.Arguments(), "tracked", "Name an object"),
         (example.Arguments(cloud_topic=TOPIC, box="1 2 3"), "camera", "--box is '1 2 3'"),
     ):
@@ -594,7 +732,9 @@ def test_a_camera_needs_a_topic_and_a_tracker_an_object(example):
 def test_constraints_of_a_cloud_are_in_the_world_frame(example, tmp_path):
     """An affordance painted on its upper half stays there in newer clouds."""
     trimesh.PointCloud(block()[block()[:, 2] > 0.05]).export(tmp_path / "upper.ply")
-    constraint = example.Constraints(heading="0 1 -1", at="0.5 0.1 0.08", affordance=str(tmp_path / "upper.ply"))
+    constraint = example.Constraints(
+        heading="0 1 -1", at="0.5 0.1 0.08", affordance=str(tmp_path / "upper.ply")
+    )
     bus = Wire()
     with camera_node(example, bus, constraint=constraint) as (node, policy):
 
@@ -606,9 +746,15 @@ def test_constraints_of_a_cloud_are_in_the_world_frame(example, tmp_path):
         bus.said = camera_says(cloud_of(block()))
         node.step()
         eventually(seen)
-        np.testing.assert_allclose(policy.request.constraints["heading"]["position"], [0.5, 0.1, 0.08])
+        np.testing.assert_allclose(
+            policy.request.constraints["heading"]["position"], [0.5, 0.1, 0.08]
+        )
         for points, avoid in (
             (policy.request.cloud, policy.request.avoid),
             (policy.state["cloud"], policy.state["surface_avoid"]),
         ):
-            assert avoid[points[:, 2] < 0.03].all() and not avoid[points[:, 2] > 0.07].any() and len(avoid) == 64
+            assert (
+                avoid[points[:, 2] < 0.03].all()
+                and not avoid[points[:, 2] > 0.07].any()
+                and len(avoid) == 64
+            )

@@ -45,7 +45,9 @@ def served(tmp_path_factory, metrics, example):
     bundles.save(task.policy(), path)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
-        server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
+        server = PolicyServer(
+            transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch
+        )
         metrics.health = server.health
         yield path, endpoint, example
         server.close()
@@ -58,10 +60,17 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
         first, second = (client.act(episode.state) for _ in range(2))
         health = client.health()
         assert health["ready"] and health["hand"] == "human"
-        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health["states_per_second"] > 100
-    assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
+        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health[
+            "states_per_second"
+        ] > 100
+    assert (
+        first.q_target.shape == (20,)
+        and first.u_target.shape == (6,)
+        and first.action.shape == (26,)
+    )
     assert first.version == 0 and first.active == ("The heading guides the wrist.",)
-    # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
+    # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the
+    # limits.
     expected = first.q_target + 0.1 * second.action[:20]
     np.testing.assert_allclose(second.q_target[3:7], expected[3:7], atol=1e-4)
 
@@ -79,13 +88,19 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
             client.act(episode.state)
         after = scrape(port)
     grown = {name: value - before[name] for name, value in after.items()}
-    assert grown["congrasp_policy_queries_total", "answered"] == 3 == grown["congrasp_policy_seconds_count",]
+    assert (
+        grown["congrasp_policy_queries_total", "answered"]
+        == 3
+        == grown["congrasp_policy_seconds_count",]
+    )
     assert grown["congrasp_policy_queries_total", "refused"] == 1
     assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
     assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
 
 
-def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
+def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
+    served, monkeypatch
+):
     path, endpoint, episode = served
     monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
     policy = task.policy()
@@ -121,7 +136,9 @@ def test_a_latency_test_sends_no_more_than_its_rate(served):
 
 
 @pytest.mark.parametrize("beside_others", [False, True])
-def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served, beside_others, monkeypatch):
+def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(
+    served, beside_others, monkeypatch
+):
     """Beside other clients the eleven are inferred in three parts."""
     _, endpoint, episode = served
     monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
@@ -142,7 +159,9 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
     for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
         assert (one.version, one.active) == (other.version, other.active)
         for name in ("action", "q_target", "u_target"):
-            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name
+            )
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
 
 
@@ -153,17 +172,24 @@ def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
     server = types.SimpleNamespace(_infer=lambda queries, queued: [whole])
     query = Query(np.zeros((4, 5), np.float32), ())
     assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is whole
-    inference, held, queued, inferred = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+    inference, held, queued, inferred = PolicyServer._join(
+        server, query, [part(new, 1.0), part(new, 2.0)]
+    )
     np.testing.assert_array_equal(inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
     assert (inference.active, held, queued, inferred) == ([["x"]] * 4, new, 0.25, 1.0)
 
 
 def test_bad_lists_of_states_are_refused(served):
     _, endpoint, episode = served
-    good, bad = episode.state, {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
+    good, bad = (
+        episode.state,
+        {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])},
+    )
     with PolicyClient(endpoint) as client:
         client.reset(episode.request)
-        with pytest.raises(RefusedError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"):
+        with pytest.raises(
+            RefusedError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"
+        ):
             client.act_each([good, good, bad])
         with pytest.raises(CongraspError, match="65 states"):
             client.act_each([good] * 65)
@@ -189,7 +215,9 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         return client.act(episode.state).version
 
     with contextlib.ExitStack() as stack:
-        clients = [stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)]
+        clients = [
+            stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)
+        ]
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
         stack.callback(go.set)
         asked = [pool.submit(ask, clients[0])]

@@ -1,4 +1,6 @@
-"""A headless browser for the tests of the page; the trace of a failed test is kept in test-results/."""
+"""A headless browser for the tests of the page; the trace of a failed test is kept in
+test-results/.
+"""
 
 import contextlib
 import os
@@ -32,12 +34,16 @@ def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -
     """A page whose console must stay empty: errors and warnings there fail the test."""
     context = browser.new_context(viewport=SIZE, accept_downloads=True)
     context.set_default_timeout(60_000)
-    # Without a picture of every frame, which costs more than drawing them: a failure keeps the last one.
+    # Without a picture of every frame, which costs more than drawing them: a failure keeps the last
+    # one.
     context.tracing.start(screenshots=bool(os.environ.get("KEEP_TRACES")), snapshots=True)
     opened = context.new_page()
     messages: list[str] = []
     opened.on(
-        "console", lambda message: messages.append(message.text) if message.type in ("error", "warning") else None
+        "console",
+        lambda message: (
+            messages.append(message.text) if message.type in ("error", "warning") else None
+        ),
     )
     opened.on("pageerror", lambda error: messages.append(str(error)))
     opened.messages = messages

@@ -1,4 +1,6 @@
-"""The policy of the studio: its newest weights, and the choice between the drawn grasp and its variations."""
+"""The policy of the studio: its newest weights, and the choice between the drawn grasp and its
+variations.
+"""
 
 import dataclasses
 import threading
@@ -51,7 +53,11 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None
     newer = dataclasses.replace(POLICY, version=POLICY.version + 5)
     source.next = lambda: newer
     policy.refresh()
-    assert policy.newest() == {"source": "the run 'r'", "version": POLICY.version + 5, "trouble": ""}
+    assert policy.newest() == {
+        "source": "the run 'r'",
+        "version": POLICY.version + 5,
+        "trouble": "",
+    }
     other = dataclasses.replace(newer, spec=dataclasses.replace(newer.spec, hand="allegro"))
     source.next = lambda: other
     policy.refresh()

@@ -17,18 +17,29 @@ from congrasp.services.studio.page import drawing, for_page, lanes
 from tests.episodes import episode, older
 
 STEPS, REMOVAL = 30, 18
-TOLERANCES = {(name, error.unit): error.tolerance for name in ("heading", "trajectory")
-              for error in get_constraint(name).errors}  # fmt: skip
+TOLERANCES = {
+    (name, error.unit): error.tolerance
+    for name in ("heading", "trajectory")
+    for error in get_constraint(name).errors
+}
 
 
 def with_error(made: Message, **values: float | np.ndarray) -> Message:
     """The episode with other errors in all steps."""
-    own = {f"error/{name}": np.broadcast_to(np.float32(value), STEPS) for name, value in values.items()}
+    own = {
+        f"error/{name}": np.broadcast_to(np.float32(value), STEPS) for name, value in values.items()
+    }
     return Message({**made.arrays, **own}, made.meta)
 
 
 def test_every_active_constraint_has_a_lane_and_no_other() -> None:
-    assert set(lanes(episode(STEPS, removal=REMOVAL))) == {"contact", "heading", "affordance", "pose", "trajectory"}
+    assert set(lanes(episode(STEPS, removal=REMOVAL))) == {
+        "contact",
+        "heading",
+        "affordance",
+        "pose",
+        "trajectory",
+    }
     assert set(lanes(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)))) == {"contact", "heading"}
 
 
@@ -36,9 +47,13 @@ def test_the_fake_grasp_meets_its_constraints() -> None:
     found = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
     heading = found["heading"]
     np.testing.assert_allclose(heading.errors["rad"], 0.0, atol=1e-3)
-    assert heading.met[-1] and heading.counts.tolist() == [False] * REMOVAL + [True] * (STEPS - REMOVAL)
+    assert heading.met[-1] and heading.counts.tolist() == [False] * REMOVAL + [True] * (
+        STEPS - REMOVAL
+    )
     pose = found["pose"]
-    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6) and pose.errors["m"][-1] == pytest.approx(0, abs=1e-6)
+    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6) and pose.errors["m"][
+        -1
+    ] == pytest.approx(0, abs=1e-6)
     assert not pose.met[0] and pose.met[-1]
     trajectory = found["trajectory"]
     assert trajectory.counts.tolist() == [True] * REMOVAL + [False] * (STEPS - REMOVAL)
@@ -49,7 +64,9 @@ def test_the_fake_grasp_meets_its_constraints() -> None:
 def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
     made = episode(STEPS, removal=REMOVAL)
     stays = {**made.arrays, "table": np.ones(STEPS, bool)}
-    lifted = lanes(Message(stays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}))
+    lifted = lanes(
+        Message(stays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}})
+    )
     assert lifted["contact"].counts.tolist() == [False] * 20 + [True] * (STEPS - 20)
     assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
 
@@ -60,7 +77,10 @@ def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> N
     made, most = episode(STEPS, removal=REMOVAL), TOLERANCES[name, unit]
     lane = lanes(with_error(made, **{f"{name}_{unit}": most + 0.001}))[name]
     np.testing.assert_allclose(lane.errors[unit], most + 0.001, atol=1e-6)
-    assert not lane.met.any() and lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
+    assert (
+        not lane.met.any()
+        and lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
+    )
 
 
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
@@ -81,15 +101,24 @@ def test_only_the_fingers_of_a_pose_count_under_a_wrist_path() -> None:
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
     lane = lanes(Message({**made.arrays, "active/fingers": np.bool_(True)}, made.meta))["fingers"]
-    assert not lane.met.any() and lane.legend == "share of touching links of other fingers: 0 % at most"
+    assert (
+        not lane.met.any()
+        and lane.legend == "share of touching links of other fingers: 0 % at most"
+    )
 
 
 def test_the_page_gets_one_message_with_everything_it_plays() -> None:
     message = decode(encode(for_page(episode(STEPS, removal=REMOVAL))))
     assert message.arrays["lane/heading/met"].shape == (STEPS,)
     assert "at most" in message.meta["lanes"]["heading"]
-    assert {"link_position", "object_quaternion", "reward/contact", "arrow/heading/tip"} <= message.arrays.keys()
-    # The fake grasp ends in its reference pose: the ghost is where the hand is, in the object's frame.
+    assert {
+        "link_position",
+        "object_quaternion",
+        "reward/contact",
+        "arrow/heading/tip",
+    } <= message.arrays.keys()
+    # The fake grasp ends in its reference pose: the ghost is where the hand is, in the object's
+    # frame.
     last = message.arrays["link_position"][-1] - message.arrays["object_position"][-1]
     np.testing.assert_allclose(message.arrays["ghost/pose/position"], last, atol=1e-5)
 
@@ -119,7 +148,9 @@ def image(view: dict[str, object], frame: int = 5) -> np.ndarray:
 def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the object's pixels: the affordance paints it red and green."""
     red, green, blue = seen[..., 0], seen[..., 1], seen[..., 2]
-    return np.nonzero(((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue)))
+    return np.nonzero(
+        ((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue))
+    )
 
 
 def test_a_picture_has_the_camera_of_the_page() -> None:
@@ -127,14 +158,25 @@ def test_a_picture_has_the_camera_of_the_page() -> None:
     rows, columns = painted(seen)
     assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
     # From twice as far the object is half as large along each side.
-    assert len(painted(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(len(rows) / 4, rel=0.25)
+    assert len(painted(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(
+        len(rows) / 4, rel=0.25
+    )
 
 
 def test_a_video_has_a_frame_for_every_40_ms() -> None:
     shares: list[float] = []
     made = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
     assert made.name == "cylinder-0-3.mp4" and shares[-1] == 1.0 and shares == sorted(shares)
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", "-", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-i",
+        "-",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     frames = subprocess.run(command, input=made.data, capture_output=True, check=True).stdout
     assert len(frames) == len(shares) * 854 * 480 * 3 and len(shares) == 2  # steps 0 and 4
 
@@ -168,9 +210,17 @@ FLAGS = np.ones(4, bool)
             {"affordance": 0, "trajectory": 5},
             "The wrist trajectory decided: without it 5 of 8",
         ),
-        (("affordance", "pose"), {"affordance": 2, "pose": 1}, "The affordance decided: without it 2 of 8"),
+        (
+            ("affordance", "pose"),
+            {"affordance": 2, "pose": 1},
+            "The affordance decided: without it 2 of 8",
+        ),
         (("pose",), {"pose": 0}, "does not help. It guides. Try another reference pose."),
-        (("affordance", "trajectory"), {"affordance": 0, "trajectory": 0}, "It guides. Try another wrist trajectory."),
+        (
+            ("affordance", "trajectory"),
+            {"affordance": 0, "trajectory": 0},
+            "It guides. Try another wrist trajectory.",
+        ),
         (("affordance",), {"affordance": 0}, "It guides. Try another heading."),
     ],
 )
@@ -178,7 +228,9 @@ def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without,
     made = episode(12, removal=8, success=False)
     metrics = {**made.meta["metrics"], "held": 0.0, "diverged": 0.0, "moved_at_removal": 0.2}
     failed = type(made)(made.arrays, {**made.meta, "metrics": metrics})
-    request = GraspRequest({"heading": {}, **{name: {} for name in asked}}, FLAGS if "affordance" in asked else None)
+    request = GraspRequest(
+        {"heading": {}, **{name: {} for name in asked}}, FLAGS if "affordance" in asked else None
+    )
     tried: dict[str, GraspRequest] = {}
 
     def held(weaker: GraspRequest, name: str) -> int:
@@ -186,7 +238,9 @@ def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without,
         return without[name]
 
     note = why_nothing_held(failed, request, ["It guides."], held, attempts=8, drop_height=0.1)
-    assert note.startswith("None of 8 attempts held. The one shown: pushed away before the table was removed.")
+    assert note.startswith(
+        "None of 8 attempts held. The one shown: pushed away before the table was removed."
+    )
     assert says in note and tried.keys() == set(asked)
     for name, weaker in tried.items():
         assert set(weaker.constraints) == {"heading", *asked} - {name}

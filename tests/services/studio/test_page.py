@@ -70,7 +70,11 @@ def opened(page: Any, site: Site) -> Any:
 
 
 def red(image: np.ndarray) -> np.ndarray:
-    return (image[..., 0] > 90) & (image[..., 0] > 2.2 * image[..., 1]) & (image[..., 0] > 2.2 * image[..., 2])
+    return (
+        (image[..., 0] > 90)
+        & (image[..., 0] > 2.2 * image[..., 1])
+        & (image[..., 0] > 2.2 * image[..., 2])
+    )
 
 
 def grasp(page: Any, site: Site) -> str:
@@ -80,7 +84,9 @@ def grasp(page: Any, site: Site) -> str:
     """
     before = {motion["id"] for motion in site.session.state()["motions"]}
     page.click("#grasp")
-    (made,) = eventually(lambda: {motion["id"] for motion in site.session.state()["motions"]} - before)
+    (made,) = eventually(
+        lambda: {motion["id"] for motion in site.session.state()["motions"]} - before
+    )
     page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
     page.wait_for_selector("#player:not([hidden])")
     return str(made)
@@ -96,11 +102,15 @@ def handle(page: Any, name: str) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     seen = picture(opened)
-    small = np.asarray(Image.fromarray(seen.astype(np.uint8)).resize((96, 72), Image.Resampling.BOX)).astype(int)
+    small = np.asarray(
+        Image.fromarray(seen.astype(np.uint8)).resize((96, 72), Image.Resampling.BOX)
+    ).astype(int)
     wanted = np.asarray(Image.open(REFERENCE).convert("RGB")).astype(int)
     # Buttons lie over the picture's upper and lower edge; fonts differ between machines.
     difference = np.abs(small - wanted).max(-1)[12:-6]
-    assert (difference > 40).mean() < 0.02, "the picture is another than tests/services/studio/first_picture.png"
+    assert (difference > 40).mean() < 0.02, (
+        "the picture is another than tests/services/studio/first_picture.png"
+    )
     assert orange(seen).mean() > 0.01
     grey = np.ptp(seen, axis=-1) < 14
     shadow = grey & (abs(seen.mean(-1) - 0.8 * 219) < 8)  # on the table, which is 219 bright
@@ -151,7 +161,9 @@ def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site
     eventually(lambda: site.studio["roll_deg"] == 45.0 and opened.input_value("#roll") == "45")
     opened.focus("#roll")
     opened.keyboard.press("ArrowRight")
-    eventually(lambda: site.studio["roll_deg"] > 45.0 and opened.input_value("#roll-number") != "45")
+    eventually(
+        lambda: site.studio["roll_deg"] > 45.0 and opened.input_value("#roll-number") != "45"
+    )
     opened.click("#undo")
     eventually(lambda: opened.input_value("#roll-number") == "45")
 
@@ -162,7 +174,11 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     opened.click("[data-tool=path]")
     drag(opened, [(x + 220, y - 40), (x + 140, y - 70), (x + 60, y - 60), (x + 10, y)])
     opened.wait_for_selector("[data-mask=trajectory][data-on=true]")
-    (path,) = (np.array(marker["points"]) for marker in site.studio["markers"] if marker["kind"] == "polyline")
+    (path,) = (
+        np.array(marker["points"])
+        for marker in site.studio["markers"]
+        if marker["kind"] == "polyline"
+    )
     assert len(path) == fake.FakePolicy().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
     assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
@@ -184,7 +200,10 @@ def test_constraints_without_a_drawing_tool_are_set_by_flags(page: Any) -> None:
     assert page.is_visible("[data-ask=affordance]") and not page.is_visible("[data-ask=pose]")
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
-    assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == ["thumb", "index"]
+    assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == [
+        "thumb",
+        "index",
+    ]
     page.check("#constraints label:has-text('middle') input")
     eventually(lambda: fingers() == ["thumb", "index", "middle"])
     assert page.is_checked("[data-ask=fingers]")
@@ -204,27 +223,37 @@ def test_constraints_without_a_drawing_tool_are_set_by_flags(page: Any) -> None:
     session.close()
 
 
-def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_is_played_scrubbed_read_and_saved(
+    opened: Any, site: Site, tmp_path: pathlib.Path
+) -> None:
     assert opened.input_value("#hand") == "of the run"
     still, tail = picture(opened), handle(opened, "tail")
     opened.fill("[data-phase=lift]", "0.15")
     opened.press("[data-phase=lift]", "Enter")
     eventually(lambda: site.session.state()["phases"]["lift"] == 0.15)
     grasp(opened, site)
-    assert [item.get_attribute("data-lane") for item in opened.locator("#lanes [data-lane]").all()] == [
-        "contact", "heading",
-    ]  # fmt: skip
+    assert [
+        item.get_attribute("data-lane") for item in opened.locator("#lanes [data-lane]").all()
+    ] == [
+        "contact",
+        "heading",
+    ]
     opened.select_option("#speed", "1")
     opened.wait_for_selector("#play:has-text('Play')")  # it has come to its end
     opened.locator("#scrub").fill("0")
     first = picture(opened)
-    # A click at the end of the lanes: the hand has closed, the table is removed, and the heading is met.
+    # A click at the end of the lanes: the hand has closed, the table is removed, and the heading is
+    # met.
     box = opened.locator("#timeline").bounding_box()
     opened.mouse.click(box["x"] + 0.97 * box["width"], box["y"] + 10)
     opened.wait_for_selector("[data-lane=heading][data-met=true]")
     assert opened.inner_text("#time") != "0.00 s" and "7.5 N" in opened.inner_text("#lanes")
-    assert "Contact force, N" in opened.inner_text("#values") and "Reward per step" in opened.inner_text("#values")
-    assert "w_c: for all links in contact" in opened.get_attribute("#values tr:has-text('Contact') >> nth=-1", "title")
+    assert "Contact force, N" in opened.inner_text(
+        "#values"
+    ) and "Reward per step" in opened.inner_text("#values")
+    assert "w_c: for all links in contact" in opened.get_attribute(
+        "#values tr:has-text('Contact') >> nth=-1", "title"
+    )
     last = picture(opened)
     for one, other in ((still, first), (first, last)):
         rows = min(len(one), len(other))
@@ -242,8 +271,13 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert Image.open(tmp_path / "motion.png").size == (1280, 720)
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
-    assert site.grasping.asked[-1][0].name == "mug_1" and site.grasping.asked[-1][2] == (0.0, 0.15, 2.0)
-    assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
+    assert site.grasping.asked[-1][0].name == "mug_1" and site.grasping.asked[-1][2] == (
+        0.0,
+        0.15,
+        2.0,
+    )
+    # The constraints are seen from where they were
+    assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)
 
 
 @pytest.mark.slow
@@ -258,13 +292,17 @@ def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) ->
     opened.wait_for_selector("#play:has-text('Play')")
     both = picture(opened)
     left, right = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
-    assert red(left).mean() > 0.001 and red(right).mean() < 0.0002  # the affordance was of the second alone
+    # The affordance was of the second alone
+    assert red(left).mean() > 0.001 and red(right).mean() < 0.0002
     assert orange(right).mean() > 0.005
     assert opened.inner_text("#values tr").split() == ["motion", second, "motion", first]
     opened.select_option("#layout", "over")
     over = picture(opened)
     middle = over[:, over.shape[1] // 4 : 3 * over.shape[1] // 4]
-    assert red(middle).sum() > 0.8 * red(over).sum() > 0 and red(over[:, : over.shape[1] // 4]).sum() == 0
+    assert (
+        red(middle).sum() > 0.8 * red(over).sum() > 0
+        and red(over[:, : over.shape[1] // 4]).sum() == 0
+    )
     opened.click(f"[data-motion='{first}'] .delete")
     opened.wait_for_selector(f"[data-motion='{first}']", state="detached")
     opened.wait_for_selector("#player", state="hidden")
@@ -288,7 +326,9 @@ def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> N
 
 
 @pytest.mark.slow
-def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
+def test_a_mesh_is_opened_and_a_wrong_file_is_explained(
+    opened: Any, site: Site, tmp_path: pathlib.Path
+) -> None:
     for name in ("mug.stl", "mug.docx"):
         (tmp_path / name).write_bytes(b"something")
     opened.set_input_files("#file", tmp_path / "mug.docx")
@@ -300,7 +340,9 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site,
     assert orange(picture(opened)).mean() > 0.005
     (tmp_path / "unknown.stl").write_bytes(b"something")
     opened.set_input_files("#file", tmp_path / "unknown.stl")
-    opened.wait_for_selector("#unit-question:has-text('In which unit are the numbers of unknown.stl?')")
+    opened.wait_for_selector(
+        "#unit-question:has-text('In which unit are the numbers of unknown.stl?')"
+    )
     assert "inches: 2.29 x 2.29 x 7.62 cm" in opened.inner_text("#unit")
     opened.select_option("#unit", "in")
     eventually(lambda: max(site.studio["object"]["size_cm"]) < 8)
@@ -308,14 +350,21 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site,
     opened.click("[data-rest='1']")
     opened.wait_for_selector("[data-rest='1'][aria-pressed=true]")
     assert site.studio["rest"]["index"] == 1
-    eventually(lambda: opened.evaluate("document.querySelector('[data-rest=\"1\"] img').naturalWidth") == 150)
+    eventually(
+        lambda: (
+            opened.evaluate("document.querySelector('[data-rest=\"1\"] img').naturalWidth") == 150
+        )
+    )
 
 
 @pytest.mark.slow
-def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(opened: Any, site: Site) -> None:
+def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(
+    opened: Any, site: Site
+) -> None:
     opened.click("#show-training")
     opened.wait_for_selector("tr[data-actor=a099]", state="attached")
-    assert not opened.is_visible("#policy")  # the studio's policy may be older than the run's, which a tile shows
+    # The studio's policy may be older than the run's, which a tile shows
+    assert not opened.is_visible("#policy")
     assert opened.locator("tr[data-actor]").count() == 100
     assert opened.inner_text("[data-tile='largest lag'] b") == "2 versions"
     assert "Throughput" in opened.inner_text("figure[data-curve=steps_per_second]")
@@ -327,13 +376,17 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.click("tr[data-actor=a042]")
     opened.wait_for_selector("#result:has-text('thing-42')")
     # A newer episode of the actor that is watched takes its place by itself.
-    site.window.take(Keys("fake").log("episode", "actor", "a042"), fake.actor_episode(77), time.time())
+    site.window.take(
+        Keys("fake").log("episode", "actor", "a042"), fake.actor_episode(77), time.time()
+    )
     opened.wait_for_selector("#result:has-text('thing-77')")
     curve = opened.locator("figure[data-curve='episode/success'] canvas")
     box = curve.bounding_box()
     curve.click(position={"x": box["width"] * DIP / 59, "y": 30})
     opened.wait_for_selector("#found [data-episode]")
-    assert "2 episodes within" in opened.inner_text("#found") and f"update {DIP}" in opened.inner_text("#found")
+    assert "2 episodes within" in opened.inner_text(
+        "#found"
+    ) and f"update {DIP}" in opened.inner_text("#found")
     opened.click("#found [data-episode]")
     opened.wait_for_selector("#result:has-text('thing-2')")
     opened.click("#show-studio")
@@ -344,5 +397,10 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     site.window.take_status(None, time.time())
     opened.click("#show-training")
     opened.wait_for_selector("[data-tile=state] b:has-text('finished')")
-    eventually(lambda: opened.locator("#curves figure").count() == len(site.window.view()["names"]) == 6)
-    assert opened.inner_text("#run-trouble") == "" and opened.inner_text("[data-tile=update] b") == "59"
+    eventually(
+        lambda: opened.locator("#curves figure").count() == len(site.window.view()["names"]) == 6
+    )
+    assert (
+        opened.inner_text("#run-trouble") == ""
+        and opened.inner_text("[data-tile=update] b") == "59"
+    )

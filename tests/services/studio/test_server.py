@@ -41,7 +41,12 @@ class Page:
     def ask(self, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
         kind = {"Content-Type": "application/json"} if method == "POST" else {}
-        connection.request(method, path, body or None, {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}})
+        connection.request(
+            method,
+            path,
+            body or None,
+            {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}},
+        )
         answer = connection.getresponse()
         found = answer.status, answer.read()
         connection.close()
@@ -61,7 +66,9 @@ class Page:
 
     def upload(self, name: str, content: bytes = b"solid") -> dict[str, Any]:
         kind = "application/octet-stream"
-        return json.loads(self.ask("POST", f"/api/upload?name={name}", content, Content_Type=kind)[1])
+        return json.loads(
+            self.ask("POST", f"/api/upload?name={name}", content, Content_Type=kind)[1]
+        )
 
     def wait(self) -> dict[str, Any]:
         """The job once it has ended, without an error."""
@@ -90,19 +97,30 @@ def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: 
     assert page.ask("GET", "/static/picture.js")[0] == 200
     assert page.ask("GET", "/prefix/static/vendor/three.module.min.js")[0] == 200
     hostile = ("HTTP://[", f"/static/{'a' * 300}.css", "/static/%00.css")
-    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none", *hostile):
+    for path in (
+        "/static/../server.py",
+        "/static/%2e%2e/server.py",
+        "/etc/passwd",
+        "/static/",
+        "/api/none",
+        *hostile,
+    ):
         assert page.ask("GET", path)[0] == 404, path
 
 
 def test_a_result_that_is_not_json_is_answered() -> None:
-    server = PageServer(lambda browser: Routes({"/api/nan": lambda query: {"x": float("nan")}}, {}), "127.0.0.1", 0)
+    server = PageServer(
+        lambda browser: Routes({"/api/nan": lambda query: {"x": float("nan")}}, {}), "127.0.0.1", 0
+    )
     code, found = Page(server.port).ask("GET", "/api/nan")
     server.close()
     assert code == 500 and "ValueError" in json.loads(found)["error"]
 
 
 def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cookie identifies it, edits and undo are separate, and beyond the limit the least recent idle one ends."""
+    """A cookie identifies it, edits and undo are separate, and beyond the limit the least recent
+    idle one ends.
+    """
     monkeypatch.setattr(server_module, "MOST", 2)
     made: list[Session] = []
 
@@ -125,14 +143,20 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
 
     try:
         cookies = [open_page().partition(";")[0] for _ in range(3)]
-        assert len(set(cookies)) == 3 and all(c.startswith(f"congrasp-{server.port}=") for c in cookies)
-        assert open_page(Cookie=cookies[0]) == "" and "HttpOnly; SameSite=Strict" in open_page(Cookie="congrasp=x")
+        assert len(set(cookies)) == 3 and all(
+            c.startswith(f"congrasp-{server.port}=") for c in cookies
+        )
+        assert open_page(Cookie=cookies[0]) == "" and "HttpOnly; SameSite=Strict" in open_page(
+            Cookie="congrasp=x"
+        )
         body = json.dumps({"action": "fill", "avoid": True}).encode()
         assert page.ask("POST", "/api/do", body, Cookie=cookies[0])[0] == 200
         assert [undoable(cookie) for cookie in cookies[:2]] == [True, False] and len(made) == 2
         assert undoable(cookies[0])  # used more recently than the second
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
-            refused = json.loads(page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1])
+            refused = json.loads(
+                page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1]
+            )
             assert "2 browsers use this studio. Try again" in refused["error"] and len(made) == 2
         monkeypatch.setattr(server_module, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
@@ -143,13 +167,20 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_hundred_simultaneous_connections_are_accepted() -> None:
-    with _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server, contextlib.ExitStack() as stack:
+    with (
+        _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server,
+        contextlib.ExitStack() as stack,
+    ):
         for _ in range(100):  # none is accepted yet
             stack.enter_context(socket.create_connection(server.server_address[:2], 10.0))
 
 
 def test_other_sites_are_rejected(page: Page) -> None:
-    own = {"Host": f"localhost:{page.port}", "Origin": f"http://localhost:{page.port}", "Sec_Fetch_Site": "same-origin"}
+    own = {
+        "Host": f"localhost:{page.port}",
+        "Origin": f"http://localhost:{page.port}",
+        "Sec_Fetch_Site": "same-origin",
+    }
     assert page.ask("GET", "/api/state", **own)[0] == 200
     for other in (
         "Host=evil.example:80",
@@ -164,7 +195,10 @@ def test_other_sites_are_rejected(page: Page) -> None:
 def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
     """`ssh -L 9000:localhost:7480` keeps the browser's Host; a proxy of a notebook ends TLS."""
     server = PageServer(
-        lambda browser: Routes({"/api/state": lambda query: {}}, {}), "127.0.0.1", 0, ["hub.example.org"]
+        lambda browser: Routes({"/api/state": lambda query: {}}, {}),
+        "127.0.0.1",
+        0,
+        ["hub.example.org"],
     )
     page = Page(server.port)
 
@@ -172,20 +206,36 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         return page.ask("GET", "/api/state", **headers)[0]
 
     try:
-        assert code(Host="localhost:9000", Origin="http://localhost:9000", Sec_Fetch_Site="same-origin") == 200
+        assert (
+            code(
+                Host="localhost:9000", Origin="http://localhost:9000", Sec_Fetch_Site="same-origin"
+            )
+            == 200
+        )
         assert code(Host="hub.example.org", Origin="https://hub.example.org") == 200
         # nginx puts the address behind it as Host and leaves the browser's Origin.
         own = f"127.0.0.1:{server.port}"
         assert code(Host=own, Origin="https://hub.example.org") == 200
         refused = page.ask("GET", "/", Host=own, Origin="https://other.example")
-        assert refused[0] == 403 and "--allow-host 'other.example'" in json.loads(refused[1])["error"]
+        assert (
+            refused[0] == 403 and "--allow-host 'other.example'" in json.loads(refused[1])["error"]
+        )
         assert code(Host=own, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
         assert code(Host="localhost:9000", Origin="http://localhost:9001") == 403
         assert code(Host="hub.example.org", Origin="https://evil.example") == 403
         refused = page.ask("GET", "/", Host="other.example.org")
-        assert refused[0] == 403 and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
-        assert page.ask("GET", "/user/me/proxy/7480/api/state")[0] == page.ask("GET", "/user/me/")[0] == 200
-        for file in filter(pathlib.Path.is_file, STATIC.rglob("*")):  # a proxy offers the page below a prefix
+        assert (
+            refused[0] == 403
+            and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
+        )
+        assert (
+            page.ask("GET", "/user/me/proxy/7480/api/state")[0]
+            == page.ask("GET", "/user/me/")[0]
+            == 200
+        )
+        for file in filter(
+            pathlib.Path.is_file, STATIC.rglob("*")
+        ):  # a proxy offers the page below a prefix
             assert not re.search(r"[\"'`]/(api|static)/", file.read_text())
     finally:
         server.close()
@@ -201,7 +251,10 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         (b'{"action": "set_rest_pose", "rest": 0.5}', "no resting pose '0.5'"),
         (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
         (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
-        (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
+        (
+            b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}',
+            "'paint' takes other values",
+        ),
         (b'{"action": "set_heading", "surface": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
         (b'{"action": "explode"}', "no action 'explode'"),
         (b'{"action": "set_roll", "turns": 2}', "other values"),
@@ -230,8 +283,14 @@ def test_a_body_without_length_or_beyond_the_limit_is_refused_unread(page: Page)
         ("X-Nothing: else", 404),
     ],
 )
-def test_a_refused_request_is_answered_before_its_body_arrives(page: Page, header: str, code: int) -> None:
-    right = f"Host: 127.0.0.1:{page.port}", "Content-Type: application/json", f"Content-Length: {128 << 20}"
+def test_a_refused_request_is_answered_before_its_body_arrives(
+    page: Page, header: str, code: int
+) -> None:
+    right = (
+        f"Host: 127.0.0.1:{page.port}",
+        "Content-Type: application/json",
+        f"Content-Length: {128 << 20}",
+    )
     lines = [line for line in right if line.partition(":")[0] not in header] + [header]
     with socket.create_connection(("127.0.0.1", page.port), timeout=10) as connection:
         connection.sendall("\r\n".join(["POST /api/none HTTP/1.1", *lines, "", ""]).encode())
@@ -275,7 +334,14 @@ def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
         for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
             assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
         assert page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=nan")[0] == 400
-        assert len(json.loads(page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=1")[1])["episodes"]) == 1
+        assert (
+            len(
+                json.loads(page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=1")[1])[
+                    "episodes"
+                ]
+            )
+            == 1
+        )
     finally:
         server.close()
         session.close()
@@ -290,7 +356,9 @@ def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> 
     page.do("grasp")
     assert page.wait() and grasping.asked[-1][0].mass == 0.5 and mass() == 500
     page.do("weigh", material="steel")
-    assert mass() not in (500, own) and "The mass is 9e+09 g" in page.do("weigh", mass_g=9e9)["error"]
+    assert (
+        mass() not in (500, own) and "The mass is 9e+09 g" in page.do("weigh", mass_g=9e9)["error"]
+    )
     page.do("weigh")
     assert mass() == own
 
@@ -305,7 +373,9 @@ def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePo
     assert page.state["phases"] == {"approach": 1.5, "lift": 0.2, "hold": 1.0}
 
 
-def test_a_grasp_from_request_to_files(page: Page, grasping: fake.FakePolicy, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_from_request_to_files(
+    page: Page, grasping: fake.FakePolicy, tmp_path: pathlib.Path
+) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
     page.wait()
@@ -316,7 +386,9 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: fake.FakePolicy, tm
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
     assert played.arrays["lane/affordance/met"].shape == (fake.STEPS,)
     for kind in ("npz", "mcap"):
-        (tmp_path / f"m.{kind}").write_bytes(page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1])
+        (tmp_path / f"m.{kind}").write_bytes(
+            page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1]
+        )
     motion = load_motion(tmp_path / "m.npz")
     np.testing.assert_array_equal(motion.link_position, played.arrays["link_position"])
     (episode,) = read_episodes(tmp_path / "m.mcap")
@@ -324,11 +396,14 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: fake.FakePolicy, tm
     assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
 
 
-def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: fake.FakePolicy) -> None:
+def test_a_fault_inside_is_shown_and_the_studio_continues(
+    page: Page, grasping: fake.FakePolicy
+) -> None:
     grasping.fails = "the hand fell off"
     page.do("grasp")
     with pytest.raises(
-        AssertionError, match=r"fault of congrasp.*the hand fell off|the hand fell off.*fault of congrasp"
+        AssertionError,
+        match=r"fault of congrasp.*the hand fell off|the hand fell off.*fault of congrasp",
     ):
         page.wait()
     grasping.fails = ""
@@ -366,7 +441,8 @@ def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page)
         names.append(found["chosen"])
         sizes.append(max(found["studio"]["object"]["size_cm"]))
     assert sizes[1] / sizes[0] == pytest.approx(2.54, rel=0.05)
-    assert names[0] == names[1] and found["objects"].count(names[0]) == 1  # it took the place of the first
+    # It took the place of the first
+    assert names[0] == names[1] and found["objects"].count(names[0]) == 1
     page.do("object", name="mug")
     assert page.wait() and page.state["upload"] is None
 
@@ -399,7 +475,9 @@ def test_an_upload_during_a_job_is_refused(page, grasping, monkeypatch):
 
 
 def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    monkeypatch.setattr(
+        page_module, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)]
+    )
     page.do("grasp")
     number = int(page.wait()["made"])
     camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}
@@ -435,7 +513,10 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(page, capsys)
         PageServer(lambda browser: Routes({}, {}), "127.0.0.1", page.port)
     for arguments, says in (
         (["--host", "0.0.0.0"], "would be reachable from other machines"),
-        (["--policy", __file__, "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
+        (
+            ["--policy", __file__, "--connect", "tcp/127.0.0.1:1"],
+            "Give one of --policy and --connect",
+        ),
         (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--objects", "/nowhere"], "/nowhere"),
         (["--recordings", "/nowhere"], "/nowhere"),

@@ -39,10 +39,15 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
 def test_drawing_tools_follow_from_goal_arrays(studio: Studio) -> None:
     tools = {row["name"]: row["tool"] for row in describe(studio)["constraints"]}
     assert {name: tool for name, tool in tools.items() if tool} == {
-        "heading": "arrow", "affordance": "paint", "pose": "hand", "trajectory": "path",
-    }  # fmt: skip
+        "heading": "arrow",
+        "affordance": "paint",
+        "pose": "hand",
+        "trajectory": "path",
+    }
     lacking = Studio(HAND, dataclasses.replace(TASK, constraints=("heading",)), MUG)
-    with pytest.raises(CongraspError, match=r"no constraint of the tool 'path'\. It supports heading"):
+    with pytest.raises(
+        CongraspError, match=r"no constraint of the tool 'path'\. It supports heading"
+    ):
         lacking.draw([[0.0, 0.0, 0.3], [0.0, 0.0, 0.1]])
 
 
@@ -111,7 +116,9 @@ def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studi
 
 
 @pytest.mark.parametrize("direction", [[0.0, 0.0, -1.0], [0.3, -0.5, -0.4], [1.0, 0.0, 0.0]])
-def test_the_roll_is_the_angle_of_the_cross_finger_axis_from_level(studio: Studio, direction: list[float]) -> None:
+def test_the_roll_is_the_angle_of_the_cross_finger_axis_from_level(
+    studio: Studio, direction: list[float]
+) -> None:
     turn = matrix(MUG.rest_poses[0][3:])
     studio.set_heading([0.0, 0.0, 0.0], turn.T @ direction)
     studio.set_roll(0.0)
@@ -126,7 +133,9 @@ def test_the_roll_is_the_angle_of_the_cross_finger_axis_from_level(studio: Studi
         )
 
 
-def test_a_drawn_path_keeps_its_beginning_and_ends_at_the_wrist_of_the_grasp(studio: Studio) -> None:
+def test_a_drawn_path_keeps_its_beginning_and_ends_at_the_wrist_of_the_grasp(
+    studio: Studio,
+) -> None:
     up = matrix(MUG.rest_poses[0][3:])[2]
     drawn = [studio.arrow.position + up * h for h in (0.35, 0.25, 0.2)]
     studio.draw(drawn)
@@ -192,7 +201,11 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
 def test_another_object_resets_the_request(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
-    assert studio.asked == set() and "pose" not in studio.fields and describe(studio)["object"]["name"] == "other"
+    assert (
+        studio.asked == set()
+        and "pose" not in studio.fields
+        and describe(studio)["object"]["name"] == "other"
+    )
 
 
 def same(one: Studio, edit: object) -> bool:
@@ -232,7 +245,9 @@ def test_edits_are_undone_and_redone_until_a_new_one(studio: Studio) -> None:
     for state in states[-2::-1]:
         history.undo()
         assert same(studio, state)
-    assert history.view() == {"undo": "", "redo": ACTIONS["set_rest_pose"]} and studio.asked == set()
+    assert (
+        history.view() == {"undo": "", "redo": ACTIONS["set_rest_pose"]} and studio.asked == set()
+    )
     history.undo()  # there is nothing more
     for state in states[1:]:
         history.redo()

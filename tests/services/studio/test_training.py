@@ -37,7 +37,12 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
     view = window.view()
     assert len(view["actors"]) == 100
     row = view["actors"][4]
-    assert (row["id"], row["lag"], row["steps_per_second"], row["success"]) == ("a004", 1, 1004.0, 0.0)
+    assert (row["id"], row["lag"], row["steps_per_second"], row["success"]) == (
+        "a004",
+        1,
+        1004.0,
+        0.0,
+    )
     assert row["object"] == "thing-4" and row["alive"]
     assert window.episode("a004").meta["object"] == "thing-4"
     assert view["constraints"]["pose"] == 0.5 and view["counters"]["granted"] == 3
@@ -48,7 +53,11 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
 def test_success_is_shown_for_every_constraint_of_the_learners_metrics() -> None:
     window, key = fake.window(actors=0), KEYS.log("metrics", "learner", "0")
     assert list(window.view()["constraints"]) == ["heading", "pose"]
-    window.take(key, Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}), time.time())
+    window.take(
+        key,
+        Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}),
+        time.time(),
+    )
     assert window.view()["constraints"]["fingers"] == 0.25
 
 
@@ -105,14 +114,39 @@ def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> No
 def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
     hub = MemoryHub()
     learner, mine = MemoryTransport(hub), MemoryTransport(hub)
-    learner.serve(KEYS.status, lambda key, request: Message({}, fake.status(2) | {"queue": {"length": 0, "limit": 4}}
-                  | {"counters": dict.fromkeys(("granted", "running", "redeemed", "returned", "expired", "accepted",
-                                              "consumed", "dropped", "queued"), 0)}))  # fmt: skip
+    learner.serve(
+        KEYS.status,
+        lambda key, request: Message(
+            {},
+            fake.status(2)
+            | {"queue": {"length": 0, "limit": 4}}
+            | {
+                "counters": dict.fromkeys(
+                    (
+                        "granted",
+                        "running",
+                        "redeemed",
+                        "returned",
+                        "expired",
+                        "accepted",
+                        "consumed",
+                        "dropped",
+                        "queued",
+                    ),
+                    0,
+                )
+            },
+        ),
+    )
     window = TrainingWindow("fake")
     follower = Follower(mine, window, every=0.05)
     stop = threading.Event()
     try:
-        while not (window.view()["curves"] and window.view()["version"] == 12 and len(window.view()["actors"]) == 2):
+        while not (
+            window.view()["curves"]
+            and window.view()["version"] == 12
+            and len(window.view()["actors"]) == 2
+        ):
             learner.publish(KEYS.log("metrics", "learner", "0"), fake.metrics(1))
             stop.wait(0.05)
         assert window.view()["phase"] == "training"
@@ -123,7 +157,9 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
         follower.close()
 
 
-def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_path: pathlib.Path) -> None:
+def test_episodes_around_a_time_come_from_finished_and_from_growing_files(
+    tmp_path: pathlib.Path,
+) -> None:
     when = BEGIN + 10 * DIP
     fake.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
     recordings = Recordings(tmp_path)
@@ -144,7 +180,9 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_pa
         recordings.episode("nothing")
 
 
-def test_only_the_damaged_part_of_a_finished_file_is_lost(tmp_path: pathlib.Path, caplog: Any) -> None:
+def test_only_the_damaged_part_of_a_finished_file_is_lost(
+    tmp_path: pathlib.Path, caplog: Any
+) -> None:
     fake.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
     file = next(tmp_path.glob("*.mcap"))
     intact = file.read_bytes()
@@ -156,13 +194,18 @@ def test_only_the_damaged_part_of_a_finished_file_is_lost(tmp_path: pathlib.Path
 
     everyone = [f"a{n:03d}" for n in range(6)]
     (summary_start,) = struct.unpack_from("<Q", intact, len(intact) - len(MCAP0_MAGIC) - 20)
-    assert all(found(place) == everyone for place in range(summary_start, len(intact) - len(MCAP0_MAGIC), 2411))
+    assert all(
+        found(place) == everyone
+        for place in range(summary_start, len(intact) - len(MCAP0_MAGIC), 2411)
+    )
     caplog.clear()
     assert found(intact.index(b"zstd") + 400) == everyone[3:]
     assert f"{file} is damaged in 1 place" in caplog.text
 
 
-def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_episodes_the_nearest_are_taken(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(training_module, "MOST", 3)
     fake.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
     _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
@@ -174,9 +217,17 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     with Recorder(transport, "fake", tmp_path) as recorder:
         for update in range(40):
             transport.publish(KEYS.log("metrics", "learner", "0"), fake.metrics(update))
-        reported = {"time": BEGIN, "version": 39, "values": {"rollouts": 12.0, "steps_per_second": 800.0, "x": 1.0}}
+        reported = {
+            "time": BEGIN,
+            "version": 39,
+            "values": {"rollouts": 12.0, "steps_per_second": 800.0, "x": 1.0},
+        }
         transport.publish(KEYS.log("metrics", "actor", "a003"), Message({}, reported))
-        told = {"time": BEGIN + 400, "level": "info", "text": "The run is complete after 40 updates."}
+        told = {
+            "time": BEGIN + 400,
+            "level": "info",
+            "text": "The run is complete after 40 updates.",
+        }
         transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
         eventually(lambda: recorder.messages >= 42)
     fake.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
@@ -188,16 +239,29 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     assert curve.values[DIP] == 0.1 and curve.times[DIP] == BEGIN + 10 * DIP
     # A run that is over is shown whole: its last state, and no learner is missed.
     view = window.view()
-    assert view["phase"] == "recorded" and view["last"]["update"] == 39 and view["last"]["success"] == 0.78
-    assert list(view["curves"]) == list(dict.fromkeys((*FIRST, *view["names"]))) and len(view["curves"]) == 6
+    assert (
+        view["phase"] == "recorded"
+        and view["last"]["update"] == 39
+        and view["last"]["success"] == 0.78
+    )
+    assert (
+        list(view["curves"]) == list(dict.fromkeys((*FIRST, *view["names"])))
+        and len(view["curves"]) == 6
+    )
     assert [event["text"] for event in view["events"]] == ["The run is complete after 40 updates."]
     row = view["actors"][0]
     assert (row["version"], row["rollouts"], row["steps_per_second"]) == (39, 12.0, 800.0)
 
 
-def test_a_window_has_the_name_of_the_run_or_of_the_recordings_folder(tmp_path: pathlib.Path) -> None:
+def test_a_window_has_the_name_of_the_run_or_of_the_recordings_folder(
+    tmp_path: pathlib.Path,
+) -> None:
     fake.record(tmp_path / "mine" / "logs", [(BEGIN, 3)])
-    for run, folder, name in (("", tmp_path / "mine" / "logs", "mine"), ("r", tmp_path / "mine", "r"), ("", None, "")):
+    for run, folder, name in (
+        ("", tmp_path / "mine" / "logs", "mine"),
+        ("r", tmp_path / "mine", "r"),
+        ("", None, ""),
+    ):
         assert opened_window(run, folder).run == name
 
 
@@ -211,7 +275,13 @@ def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
 
 def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> None:
     found = labels_of(
-        ["term/force_excess", "episode/heading_rad", "staleness_mean", "update_seconds", "episode/success"]
+        [
+            "term/force_excess",
+            "episode/heading_rad",
+            "staleness_mean",
+            "update_seconds",
+            "episode/success",
+        ]
     )
     units = {name: label["unit"] for name, label in found.items()}
     assert units == {

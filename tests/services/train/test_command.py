@@ -18,7 +18,8 @@ from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import Launch
 
 LAUNCH = Launch(actors=1)
-CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)  # 40 steps an update
+# 40 steps an update
+CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)
 
 
 @pytest.fixture
@@ -39,7 +40,12 @@ def clock(monkeypatch):
 
 def status(update, **values):
     # Fewer steps than updates of this size: earlier updates may have had fewer ranks.
-    figures = {"transitions": 30.0 * update, "steps_per_second": 1234.4, "staleness_mean": 0.5, **values}
+    figures = {
+        "transitions": 30.0 * update,
+        "steps_per_second": 1234.4,
+        "staleness_mean": 0.5,
+        **values,
+    }
     return {"values": figures, "update": update, "version": update, "actors": 2}
 
 
@@ -52,7 +58,16 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
         clock.seconds += 30
         progress.show(status(1))
         clock.seconds += 20
-        progress.show(status(3, **{"episode/success": 0.256, "episode/links_at_removal": 2.5, "episode/return": -7.25}))
+        progress.show(
+            status(
+                3,
+                **{
+                    "episode/success": 0.256,
+                    "episode/links_at_removal": 2.5,
+                    "episode/return": -7.25,
+                },
+            )
+        )
     first, *start, early, late = (line.strip() for line in said())
     assert "First update" in start[0] and any(line.endswith(": a stage") for line in start[1:])
     assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
@@ -75,12 +90,24 @@ def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
         for _ in range(22):
             clock.seconds += 1.0
             progress.show({"actors": 1})
-    assert [line.split()[-4] for line in said()] == ["1", "11", "21", "22"]  # the last one at the end
+    # The last one at the end
+    assert [line.split()[-4] for line in said()] == [
+        "1",
+        "11",
+        "21",
+        "22",
+    ]
 
 
 def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
     output = io.StringIO()
-    narrow = Console(file=output, width=80, force_terminal=True, highlight=False, soft_wrap=command.console.soft_wrap)
+    narrow = Console(
+        file=output,
+        width=80,
+        force_terminal=True,
+        highlight=False,
+        soft_wrap=command.console.soft_wrap,
+    )
     monkeypatch.setattr(command, "console", narrow)
     with _Progress(CONFIG) as progress:
         progress.show(status(1))
@@ -98,7 +125,9 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
     assert commands and set(commands) <= set(COMMANDS)
 
 
-@pytest.mark.parametrize(("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")])
+@pytest.mark.parametrize(
+    ("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")]
+)
 def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, free, words):
     def die(*args, **options):
         raise CongraspError("The learner failed: its log is empty")  # its log is on the same disk
@@ -130,12 +159,15 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "train", stop)
-    config = RunConfig(objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native")
+    config = RunConfig(
+        objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native"
+    )
     with pytest.raises(KeyboardInterrupt):
         command.run_training(config, tmp_path, LAUNCH, resume=False, evaluation=0)
     full = get_preset("human").objects.count
     assert (
-        f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of 32 units" in said()[1]
+        f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of "
+        f"32 units" in said()[1]
     )
 
 

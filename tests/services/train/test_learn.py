@@ -1,4 +1,6 @@
-"""A training that ends with its first update, as warm-up and benchmarks run it, and the caches that it fills."""
+"""A training that ends with its first update, as warm-up and benchmarks run it, and the caches that
+it fills.
+"""
 
 import io
 import json
@@ -41,7 +43,9 @@ def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
 
     reported = []
     monkeypatch.setattr(training, "learn", learn)
-    training.until_first_update(RunConfig(), "native", threading.Event(), lambda: reported.append(1))
+    training.until_first_update(
+        RunConfig(), "native", threading.Event(), lambda: reported.append(1)
+    )
     assert not reported
 
 
@@ -55,7 +59,9 @@ def test_an_engine_in_this_process_is_prepared_before_the_learner(monkeypatch, t
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """Makes this a machine with empty caches and a version of JAX; returns the caches' parent folder."""
+    """Makes this a machine with empty caches and a version of JAX; returns the caches' parent
+    folder.
+    """
 
     def become(name, version="1.2"):
         folders = {kind: tmp_path / name / "caches" / kind for kind in ("jax", "warp")}
@@ -70,7 +76,11 @@ def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
     caches, file = machine("a") / "caches", tmp_path / "caches.tar"
 
     def first_update(config, physics, stop, report):
-        for name, content in (("jax/program", b"1"), ("warp/module/kernel.cubin", b"2"), ("warp/.module.tmp", b"3")):
+        for name, content in (
+            ("jax/program", b"1"),
+            ("warp/module/kernel.cubin", b"2"),
+            ("warp/.module.tmp", b"3"),
+        ):
             (caches / name).parent.mkdir(parents=True, exist_ok=True)
             (caches / name).write_bytes(content)
         (caches / "jax/link").symlink_to("program")
@@ -90,19 +100,27 @@ def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
     (there / "jax").mkdir(parents=True)
     (there / "jax/program").write_bytes(b"in use")
     assert warmup.warmup(source=file) == 0
-    files = {str(path.relative_to(there)): path.read_bytes() for path in there.rglob("*") if path.is_file()}
+    files = {
+        str(path.relative_to(there)): path.read_bytes()
+        for path in there.rglob("*")
+        if path.is_file()
+    }
     assert files == {"jax/program": b"in use", "warp/module/kernel.cubin": b"2"}
 
 
 def _written(path, *members, manifest=None):
-    """A file of caches with a manifest and these members, of which each is a name or a `TarInfo`."""
+    """A file of caches with a manifest and these members, of which each is a name or a
+    `TarInfo`.
+    """
     text = json.dumps({"JAX": "1.2", "device": "GPU"} if manifest is None else manifest).encode()
     with tarfile.open(path, "w") as archive:
         about = tarfile.TarInfo("caches.json")
         about.size = len(text)
         archive.addfile(about, io.BytesIO(text))
         for member in members:
-            archive.addfile(member if isinstance(member, tarfile.TarInfo) else tarfile.TarInfo(member))
+            archive.addfile(
+                member if isinstance(member, tarfile.TarInfo) else tarfile.TarInfo(member)
+            )
     return path
 
 
@@ -127,7 +145,9 @@ def _link(kind, target):
         _link(tarfile.LNKTYPE, "caches.json"),
         _link(tarfile.FIFOTYPE, ""),
     ],
-    ids=lambda member: member if isinstance(member, str) else f"{member.type.decode()}:{member.linkname}",
+    ids=lambda member: (
+        member if isinstance(member, str) else f"{member.type.decode()}:{member.linkname}"
+    ),
 )
 def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, member):
     file, here = _written(tmp_path / "caches.tar", "jax/program", member), machine("a")
@@ -139,9 +159,14 @@ def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, 
 def test_caches_of_other_versions_and_files_of_other_kinds_are_one_line(machine, tmp_path):
     machine("a")
     with pytest.raises(CongraspError, match=r"made for JAX '1.1', but this machine has 1.2"):
-        warmup.import_caches(_written(tmp_path / "old.tar", manifest={"JAX": "1.1", "device": "GPU"}))
+        warmup.import_caches(
+            _written(tmp_path / "old.tar", manifest={"JAX": "1.1", "device": "GPU"})
+        )
     (tmp_path / "text").write_text("no archive")
-    other = [_written(tmp_path / f"{n}.tar", manifest=made_for) for n, made_for in enumerate(([], {}, "text"))]
+    other = [
+        _written(tmp_path / f"{n}.tar", manifest=made_for)
+        for n, made_for in enumerate(([], {}, "text"))
+    ]
     with tarfile.open(tmp_path / "plain.tar", "w") as archive:
         archive.addfile(tarfile.TarInfo("jax/program"))
     for path in (tmp_path / "text", tmp_path / "plain.tar", *other):

@@ -1,4 +1,6 @@
-"""From a hand's file to its report, stage by stage; scripts stand in for the stages' commands, but for one real run."""
+"""From a hand's file to its report, stage by stage; scripts stand in for the stages' commands, but
+for one real run.
+"""
 
 import dataclasses
 import json
@@ -26,7 +28,8 @@ from tests.services.train.conftest import CLAW
 from tests.waits import eventually
 
 TINY = (
-    "--actors 0 --environments 4 --rollout-steps 8 --updates {} --checkpoint-every 1 --ppo.minibatches 2 "
+    "--actors 0 --environments 4 --rollout-steps 8 --updates {} --checkpoint-every 1 "
+    "--ppo.minibatches 2 "
     "--network.hidden 16 --objects.count 1 --objects.families box"
 )
 GOOD = [Finding("palm", "passed", "fingers begin on it")]
@@ -35,7 +38,9 @@ BAD = [*GOOD, Finding("ball", "failed", "falls", "close further")]
 
 @pytest.fixture
 def stages(monkeypatch, tmp_path, claw):
-    """Which stages ran, in their order, and what they do: `findings` of the check, `steps` of the policy."""
+    """Which stages ran, in their order, and what they do: `findings` of the check, `steps` of the
+    policy.
+    """
     ran, does = [], {"findings": GOOD, "steps": 1000}
 
     def check_or_report(child, patience, progress=lambda line: None):
@@ -43,11 +48,20 @@ def stages(monkeypatch, tmp_path, claw):
         option = dict(zip(child.arguments, child.arguments[1:], strict=False))
         if child.name == "check":
             write_findings(pathlib.Path(option["--json"]), does["findings"])
-            assert child.arguments[:3] == ["hands", "check", "claw"] and child.environment["JAX_PLATFORMS"] == "cpu"
+            assert (
+                child.arguments[:3] == ["hands", "check", "claw"]
+                and child.environment["JAX_PLATFORMS"] == "cpu"
+            )
             return int(does["findings"] is BAD)
-        content = bundles.content_hash((pathlib.Path(child.arguments[1]) / "policy.safetensors").read_bytes())
+        content = bundles.content_hash(
+            (pathlib.Path(child.arguments[1]) / "policy.safetensors").read_bytes()
+        )
         rows = [{"constraint": "heading", "success": 0.953}]
-        about = {"content": content, "episodes": int(option["--episodes"]), "pool": int(option["--pool"])}
+        about = {
+            "content": content,
+            "episodes": int(option["--episodes"]),
+            "pool": int(option["--pool"]),
+        }
         pathlib.Path(option["--json"]).write_text(json.dumps({**about, "rows": rows}))
         pathlib.Path(option["--out"]).touch()
         return 0
@@ -56,9 +70,14 @@ def stages(monkeypatch, tmp_path, claw):
         ran.append(f"train {' '.join([*chosen, *options])}")
         run_dir.mkdir()
         config = get_preset("quickstart", "claw")
-        config = dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,)))
+        config = dataclasses.replace(
+            config, network=dataclasses.replace(config.network, hidden=(8,))
+        )
         (run_dir / CONFIG_FILE).write_text("{}")
-        bundles.save(dataclasses.replace(untrained(config), transitions=does["steps"]), run_dir / "policy.safetensors")
+        bundles.save(
+            dataclasses.replace(untrained(config), transitions=does["steps"]),
+            run_dir / "policy.safetensors",
+        )
         (run_dir / "trained.json").write_text('{"seconds": 90}')
 
     monkeypatch.setattr(own_hand, "run_child", check_or_report)
@@ -78,7 +97,14 @@ def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
     assert ran == ["check", "train --preset quickstart --hand claw --updates 3", "report"]
     assert policy_file(None, "claw").read_bytes() == policy.read_bytes()
     text = "\n".join(notes)
-    for words in ("passed  palm", "no GPU", "184 million steps", "heading", "95.3 %", str(tmp_path / "out" / REPORT)):
+    for words in (
+        "passed  palm",
+        "no GPU",
+        "184 million steps",
+        "heading",
+        "95.3 %",
+        str(tmp_path / "out" / REPORT),
+    ):
         assert words in text
     train_hand(request(claw, tmp_path / "out"), notes.append)
     assert len(ran) == 3
@@ -90,7 +116,10 @@ def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
     # A GPU trains the full task, beside what was trained without one.
     notes.clear()
     train_hand(request(claw, tmp_path / "out", full=True), notes.append)
-    assert ran[5:] == ["train --preset full --hand claw --physics auto --updates 560 --updates 3", "report"]
+    assert ran[5:] == [
+        "train --preset full --hand claw --physics auto --updates 560 --updates 3",
+        "report",
+    ]
     assert "no GPU" not in "\n".join(notes)
 
 
@@ -122,7 +151,9 @@ def test_a_policy_of_more_experience_stays(stages, claw, tmp_path):
     assert own_policy_file("claw").read_bytes() == best.read_bytes()
     assert "has more training (100,000,000 steps) and remains" in "\n".join(notes)
     # But one of the hand as it was before is replaced.
-    (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(claw, object_scale=0.8)))
+    (tmp_path / "hands" / "claw.json").write_text(
+        hand_text(dataclasses.replace(claw, object_scale=0.8))
+    )
     get_hand.cache_clear()
     fresh = train_hand(request(get_hand("claw"), tmp_path / "new"), lambda text: None)
     assert own_policy_file("claw").read_bytes() == fresh.read_bytes() != best.read_bytes()
@@ -132,18 +163,28 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     ran, _ = stages
     monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
     (tmp_path / "hands" / "claw.json").unlink()
-    command = ["hands", "train", str(CLAW), "--out", str(tmp_path / "out"), "--training=--updates 3"]
+    command = [
+        "hands",
+        "train",
+        str(CLAW),
+        "--out",
+        str(tmp_path / "out"),
+        "--training=--updates 3",
+    ]
     assert main.run(command) == 0
     said = capsys.readouterr().out
     assert (
-        "thumb        opposing_lower - opposing_upper" in said and "congrasp grasp examples/mug.obj --hand claw" in said
+        "thumb        opposing_lower - opposing_upper" in said
+        and "congrasp grasp examples/mug.obj --hand claw" in said
     )
     file = tmp_path / "hands" / "claw.json"
     made = file.read_text()
     assert main.run(command) == 0 and len(ran) == 3 and file.read_text() == made
     assert f"The hand 'claw' is {file}" in capsys.readouterr().out
     assert main.run(["hands", "list"]) == 0
-    (row,) = [line for line in capsys.readouterr().out.splitlines() if "claw" in line and "own" in line]
+    (row,) = [
+        line for line in capsys.readouterr().out.splitlines() if "claw" in line and "own" in line
+    ]
     assert "x 1" in row
     with pytest.raises(CongraspError, match="no hand 'paw'"):
         main.run(["hands", "train", "paw"])
@@ -151,7 +192,9 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.timeout(300)
 @pytest.mark.slow
-def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(claw, monkeypatch, tmp_path):
+def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(
+    claw, monkeypatch, tmp_path
+):
     out = tmp_path / "out"
     out.mkdir()
     (out / HAND).write_text(hand_text(claw))
@@ -159,7 +202,10 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(claw,
     run_dir = out / "short"
     command = [sys.executable, "-m", "congrasp", "hands", "train", "claw", "--out", str(out)]
     process = subprocess.Popen(
-        [*command, f"--training={TINY.format(10_000)}"], stdout=subprocess.PIPE, start_new_session=True, env=os.environ
+        [*command, f"--training={TINY.format(10_000)}"],
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        env=os.environ,
     )
     try:
         written = lambda: [*(run_dir / CHECKPOINTS).glob("*.safetensors")]  # noqa: E731

@@ -1,4 +1,6 @@
-"""Presets: they can be had by name, they travel, and they say how they differ from the full task."""
+"""Presets: they can be had by name, they travel, and they say how they differ from the full
+task.
+"""
 
 import dataclasses
 
@@ -11,18 +13,31 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import fitting_scale, tip_forces
 from congrasp.common.objects import procedural
 from congrasp.services.cli.train import defaults
-from congrasp.services.train.presets import PRESETS, Rules, easier, get_preset, recipe, rules, with_hand
+from congrasp.services.train.presets import (
+    PRESETS,
+    Rules,
+    easier,
+    get_preset,
+    recipe,
+    rules,
+    with_hand,
+)
 
 
 def test_an_unknown_preset_lists_those_that_exist():
-    with pytest.raises(CongraspError, match=r"no preset 'nonsense'. Choose one of: .*quickstart.*full.*human"):
+    with pytest.raises(
+        CongraspError, match=r"no preset 'nonsense'. Choose one of: .*quickstart.*full.*human"
+    ):
         get_preset("nonsense")
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_travels_and_its_batch_can_be_cut(name):
     config = get_preset(name)
-    assert config.name == (name if name != "full" else "human") and run_config_from_json(to_json(config)) == config
+    assert (
+        config.name == (name if name != "full" else "human")
+        and run_config_from_json(to_json(config)) == config
+    )
     get_hand(config.task.hand)
     procedural.family_turns(1, 0, config.objects.families)  # a CongraspError where one is unknown
     transitions = config.environments * config.rollout_steps * config.rollouts_per_update
@@ -51,7 +66,9 @@ def test_what_was_made_easier_is_said_and_nothing_else():
     assert f"no episode has another constraint ({', '.join(absent)})" in words
     human = get_preset("human")
     task = dataclasses.replace(human.task, p_trajectory=0.0)
-    assert easier(dataclasses.replace(human, task=task)) == ["no episode has another constraint (wrist trajectory)"]
+    assert easier(dataclasses.replace(human, task=task)) == [
+        "no episode has another constraint (wrist trajectory)"
+    ]
 
 
 RULES = {
@@ -77,22 +94,31 @@ def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
     weights = dataclasses.replace(human.curriculum.reward, **ruled)
     assert own.curriculum == dataclasses.replace(human.curriculum, reward=weights)
     assert own.task.reward == dataclasses.replace(human.task.reward, force_max=ruled["force_max"])
-    task = dataclasses.replace(human.task, hand=name, reward=own.task.reward, **{"p_affordance": share})
+    task = dataclasses.replace(
+        human.task, hand=name, reward=own.task.reward, **{"p_affordance": share}
+    )
     assert own == dataclasses.replace(human, name=name, task=task, curriculum=own.curriculum)
 
 
 def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever():
-    # Allegro's straight finger: the second joint is 119 mm from the tip, its 0.7 N.m make 5.9 N there, less than the
-    # next ones' on shorter levers; the thumb's first joint is 151 mm from its tip and makes 4.6 N.
+    # Allegro's straight finger: the second joint is 119 mm from the tip, its 0.7 N.m make 5.9 N
+    # there, less than the next ones' on shorter levers; the thumb's first joint is 151 mm from its
+    # tip and makes 4.6 N.
     allegro = get_hand("allegro")
     assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
     links = tuple(
         dataclasses.replace(
-            link, joints=tuple(dataclasses.replace(joint, torque_limit=2 * joint.torque_limit) for joint in link.joints)
+            link,
+            joints=tuple(
+                dataclasses.replace(joint, torque_limit=2 * joint.torque_limit)
+                for joint in link.joints
+            ),
         )
         for link in allegro.links
     )
-    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(2 * tip_forces(allegro))
+    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(
+        2 * tip_forces(allegro)
+    )
 
 
 def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
@@ -101,13 +127,19 @@ def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
     def with_torque(factor):
         links = tuple(
             dataclasses.replace(
-                link, joints=tuple(dataclasses.replace(j, torque_limit=factor * j.torque_limit) for j in link.joints)
+                link,
+                joints=tuple(
+                    dataclasses.replace(j, torque_limit=factor * j.torque_limit)
+                    for j in link.joints
+                ),
             )
             for link in allegro.links
         )
         return rules(dataclasses.replace(allegro, links=links))
 
     found = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
-    assert [one.p_affordance for one in found] == sorted((one.p_affordance for one in found), reverse=True)
+    assert [one.p_affordance for one in found] == sorted(
+        (one.p_affordance for one in found), reverse=True
+    )
     assert found[0].p_affordance == 0.8 and found[-1].p_affordance == 0.6
     assert len({one.force_max for one in found}) == 1

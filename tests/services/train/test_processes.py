@@ -22,8 +22,23 @@ WAITS = "import time; time.sleep(60)"
 
 
 def test_options_become_arguments():
-    given = {"run_dir": "a", "resume": True, "certs": None, "insecure": False, "port": 0, "metric_writers": ()}
-    assert command("learner", **given) == ["learner", "--run-dir", "a", "--resume", "--port", "0", "--metric-writers"]
+    given = {
+        "run_dir": "a",
+        "resume": True,
+        "certs": None,
+        "insecure": False,
+        "port": 0,
+        "metric_writers": (),
+    }
+    assert command("learner", **given) == [
+        "learner",
+        "--run-dir",
+        "a",
+        "--resume",
+        "--port",
+        "0",
+        "--metric-writers",
+    ]
 
 
 class Script(Child):
@@ -40,11 +55,15 @@ def supervise(tmp_path: pathlib.Path):
     notes: list[str] = []
 
     def run(*lives: list[str]) -> list[str]:
-        children.extend(Script(f"rank-{i}", programs, tmp_path / f"{i}.log") for i, programs in enumerate(lives))
+        children.extend(
+            Script(f"rank-{i}", programs, tmp_path / f"{i}.log") for i, programs in enumerate(lives)
+        )
         for child in children:
             child.start()
         with MemoryTransport(MemoryHub()) as transport:
-            processes._supervise(children, [], transport, "run", threading.Event(), lambda status: None, notes.append)
+            processes._supervise(
+                children, [], transport, "run", threading.Event(), lambda status: None, notes.append
+            )
         return notes
 
     yield run
@@ -55,7 +74,8 @@ def supervise(tmp_path: pathlib.Path):
 def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp_path):
     writes = f"import pathlib; pathlib.Path({str(tmp_path)!r}, 'again').touch(); {WAITS}"
     waits_for_it = (
-        f"import pathlib, time\nwhile not pathlib.Path({str(tmp_path)!r}, 'again').exists(): time.sleep(0.05)"
+        f"import pathlib, time\nwhile not pathlib.Path({str(tmp_path)!r}, 'again').exists(): "
+        f"time.sleep(0.05)"
     )
     notes = supervise([WAITS, waits_for_it], ["print('No memory.'); raise SystemExit(9)", writes])
     assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
@@ -72,7 +92,9 @@ def test_the_rank_that_failed_is_named_and_not_those_that_lost_it(supervise):
 
 def test_the_rank_that_failed_too_often_ends_the_run(supervise, monkeypatch):
     monkeypatch.setattr(processes, "MAX_RESTARTS", 0)
-    with pytest.raises(CongraspError, match=r"The rank-1 died \(exit code 9\): No memory\. Its log is .*1\.log"):
+    with pytest.raises(
+        CongraspError, match=r"The rank-1 died \(exit code 9\): No memory\. Its log is .*1\.log"
+    ):
         supervise([LOST], [FULL])
 
 
@@ -81,14 +103,19 @@ def test_a_killed_rank_is_named_with_its_signal_and_each_life_with_its_own_words
     killed = "import os; print('info: Update 3.', flush=True); os.kill(os.getpid(), 9)"
     silent = "import os, time; time.sleep(0.5); os._exit(1)"
     first, second = supervise([killed, silent, "pass"], [FULL, LOST, "pass"])
-    assert first == "The rank-0 was killed by SIGKILL. The rank-1 died (exit code 9): No memory. Restarting all ranks."
+    assert first == (
+        "The rank-0 was killed by SIGKILL. The rank-1 died (exit code 9): No memory. "
+        "Restarting all ranks."
+    )
     assert second == "The rank-0 died (exit code 1): its log is empty. Restarting all ranks."
 
 
 def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
     complains = "import sys; print('congrasp: error: The port is in use.'); sys.exit(2)"
     follows = "import sys, time; time.sleep(0.2); print('Rank 1 ended.'); sys.exit(4)"
-    with pytest.raises(CongraspError, match=r"The rank-1 died \(exit code 2\): The port is in use\. Its log is"):
+    with pytest.raises(
+        CongraspError, match=r"The rank-1 died \(exit code 2\): The port is in use\. Its log is"
+    ):
         supervise([follows], [complains])
 
 
@@ -101,8 +128,13 @@ def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
 # --- trainings of a reproduction ---
 
 
-OURS, GRAPSXL, PHASES = (RequiredPolicy("human", method) for method in ("ours", "graspxl", "two-phase"))
-FINISHES = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'policy.safetensors').touch()"
+OURS, GRAPSXL, PHASES = (
+    RequiredPolicy("human", method) for method in ("ours", "graspxl", "two-phase")
+)
+FINISHES = (
+    "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / "
+    "'policy.safetensors').touch()"
+)
 FAILS = "print('compiling'); print('congrasp: error: The disk is full.'); raise SystemExit(2)"
 HANGS = "import time; print('update 3', flush=True); time.sleep(60)"
 
@@ -140,10 +172,16 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     wanted = request(tmp_path, 3.0)
     failures = train_all(wanted, [OURS, GRAPSXL, PHASES], silent)
     assert set(failures) == {OURS, GRAPSXL}
-    assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
+    assert (
+        "human-ours failed: The disk is full." in failures[OURS]
+        and "human-ours.log" in failures[OURS]
+    )
     assert "human-graspxl was stopped" in failures[GRAPSXL]
     runs = wanted.runs
-    assert processes.trained(runs / OURS.name) is None and processes.training_seconds(runs / OURS.name) is None
+    assert (
+        processes.trained(runs / OURS.name) is None
+        and processes.training_seconds(runs / OURS.name) is None
+    )
     assert processes.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
     assert processes.training_seconds(runs / PHASES.name) > 0.0
     assert not any("--resume" in child.arguments for child in started)
@@ -161,11 +199,16 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
     ours, graspxl = (child.arguments for child in started)
     assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
     run = str(wanted.runs / GRAPSXL.name)
-    assert graspxl[graspxl.index("--run-dir") + 1] == run and graspxl[graspxl.index("--evaluation") + 1] == "0"
+    assert (
+        graspxl[graspxl.index("--run-dir") + 1] == run
+        and graspxl[graspxl.index("--evaluation") + 1] == "0"
+    )
     assert "--resume" not in graspxl and not (wanted.runs / GRAPSXL.name / "config.json").exists()
 
 
-@pytest.mark.parametrize("policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name)
+@pytest.mark.parametrize(
+    "policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name
+)
 def test_its_command_lines_are_those_of_train(policy):
     arguments = [*policy.training, "--environments", "4096"]
     train = main._parsed("train", main.load("train"), arguments)

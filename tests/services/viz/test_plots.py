@@ -40,16 +40,25 @@ def record(directory: pathlib.Path, updates: int = 30) -> None:
     for i in range(updates):
         values = nest({name: value * (1 + i / updates) for name, value in METRICS.items()})
         writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": values}))
-        writer.write(channels.entry("/metrics/actor/a0", i, {"version": i, "values": {"steps_per_second": 400.0}}))
+        writer.write(
+            channels.entry(
+                "/metrics/actor/a0", i, {"version": i, "values": {"steps_per_second": 400.0}}
+            )
+        )
     writer.close()
 
 
 def test_every_metric_is_in_exactly_one_panel() -> None:
     series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
     groups = figures({"run": series})
-    shown = [metric for _, panels in groups.values() for panel in panels for metric in panel.metrics]
+    shown = [
+        metric for _, panels in groups.values() for panel in panels for metric in panel.metrics
+    ]
     assert sorted(shown) == sorted(METRICS)
-    assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",), ("term/force_excess",)]
+    assert [panel.metrics for panel in groups["reward_terms"][1]] == [
+        ("term/contact",),
+        ("term/force_excess",),
+    ]
     assert groups["episodes"][1] == [Panel("Heading error: angle", "rad", ("episode/heading_rad",))]
     assert groups["details"][1] == [Panel("Queue length", "", ("queue_length",))]
     assert {panel.title for panel in groups["learning"][1]} == {
@@ -57,12 +66,16 @@ def test_every_metric_is_in_exactly_one_panel() -> None:
     }
 
 
-def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_becomes_png_files(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     record(tmp_path / "run" / "logs")
     assert plot((tmp_path / "run",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     figures = ("learning", "reward_terms", "episodes", "details")
-    assert [file.name for file in files] == [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
+    assert [file.name for file in files] == [
+        f"{name}.{kind}" for name in figures for kind in ("png", "pdf")
+    ]
     assert all(file.read_bytes().startswith(b"%PDF-") for file in files if file.suffix == ".pdf")
     assert all(file.parent == tmp_path / "run" / "plots" for file in files)
     learning = np.asarray(Image.open(files[0]).convert("RGB")).astype(int)
@@ -74,8 +87,17 @@ def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureF
 
 def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Path) -> None:
     rising, flat = np.arange(4.0), np.full(4, 2.0)
-    one = {"learner/0/kl": rising, "learner/0/term/drop": flat, "learner/0/term/contact": flat, "actor/a/queue": rising}
-    two = {"learner/0/kl": 2 * rising, "learner/0/term/drop": flat, "learner/0/term/contact": 3 * flat}
+    one = {
+        "learner/0/kl": rising,
+        "learner/0/term/drop": flat,
+        "learner/0/term/contact": flat,
+        "actor/a/queue": rising,
+    }
+    two = {
+        "learner/0/kl": 2 * rising,
+        "learner/0/term/drop": flat,
+        "learner/0/term/contact": 3 * flat,
+    }
     runs = {
         name: {metric: (np.arange(4), values) for metric, values in run.items()}
         for name, run in (("a", one), ("b", two))
@@ -84,7 +106,9 @@ def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Pa
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",)]
     figure = draw("Learning", groups["learning"][1], runs)
     (axes,) = [axes for axes in figure.axes if axes.get_lines()]
-    for line, (name, values) in zip(axes.get_lines(), (("a", rising), ("b", 2 * rising)), strict=True):
+    for line, (name, values) in zip(
+        axes.get_lines(), (("a", rising), ("b", 2 * rising)), strict=True
+    ):
         assert line.get_label() == name
         np.testing.assert_array_equal(line.get_xydata(), np.stack([np.arange(4), values], -1))
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a", "b"]
@@ -96,7 +120,11 @@ def test_every_metric_of_an_episode_has_a_different_title() -> None:
     task = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
     titles = {name: titled(name)[0] for name in episode_fields(task)}
     assert len(set(titles.values())) == len(titles)
-    assert not [name for name, title in titles.items() if "_" in title or "/" in title or not title[0].isupper()]
+    assert not [
+        name
+        for name, title in titles.items()
+        if "_" in title or "/" in title or not title[0].isupper()
+    ]
     assert titled("episode/heading_m") == ("Heading error: distance", "m")
     assert titled("term/force_excess") == ("Force excess", "reward")
     assert titled("failure/bowl") == ("Lost objects: bowl", "share of episodes")
@@ -110,7 +138,9 @@ def test_smoothing_is_the_mean_of_the_last_values(values: list[float], window: i
 
 
 def test_smoothing_ignores_nan_and_keeps_constants() -> None:
-    np.testing.assert_allclose(smooth(np.array([np.nan, 1.0, np.nan, 3.0]), 3), [np.nan, 1.0, 1.0, 2.0])
+    np.testing.assert_allclose(
+        smooth(np.array([np.nan, 1.0, np.nan, 3.0]), 3), [np.nan, 1.0, 1.0, 2.0]
+    )
     assert (smooth(np.full(500, 5e-4), 12) == 5e-4).all()
 
 
@@ -133,7 +163,9 @@ MEASURED = metric_names(TASK)
 
 
 def evaluation(path: pathlib.Path) -> list[dict]:
-    """Three rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to 0.4."""
+    """Three rows of 40 episodes, of which 30 succeeded with errors that rise evenly from 0.1 to
+    0.4.
+    """
     rows = []
     for constraint in ("heading", "trajectory+affordance", "fingers"):
         values = {name: np.zeros(40) for name in (*MEASURED, "mass_kg", "identity")}
@@ -142,14 +174,18 @@ def evaluation(path: pathlib.Path) -> list[dict]:
             if name.endswith(("_rad", "_m", "_ratio")):
                 values[name] = np.concatenate([np.linspace(0.1, 0.4, 30), np.full(10, 9.0)])
         sample = Sample(values, np.zeros((0, 1, 1)), np.zeros((0, 1, 1)))
-        rows.append(summarise(constraint, "human", sample, held_2s=True, objects=["box"], paper="captured"))
+        rows.append(
+            summarise(constraint, "human", sample, held_2s=True, objects=["box"], paper="captured")
+        )
     write_json(rows, path, {})
     return json.loads(path.read_text())["rows"]
 
 
 def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> None:
     heading, composed, fingers = evaluation(tmp_path / "e.json")
-    np.testing.assert_allclose(heading["quantiles"]["heading_rad"], np.linspace(0.1, 0.4, 101), atol=1e-6)
+    np.testing.assert_allclose(
+        heading["quantiles"]["heading_rad"], np.linspace(0.1, 0.4, 101), atol=1e-6
+    )
     assert set(heading["quantiles"]) == {"heading_rad", "heading_m"}
     assert set(composed["quantiles"]) == {"traj_rad", "traj_m", "affordance_ratio"}
     assert set(fingers["quantiles"]) == {"fingers_ratio"}
@@ -170,21 +206,30 @@ def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> Non
 def test_rows_of_several_policies_have_different_labels(tmp_path: pathlib.Path) -> None:
     heading, *_ = evaluation(tmp_path / "e.json")
     rows = [Row.from_json(row) for row in (heading, {**heading, "method": "pd", "group": "small"})]
-    assert [line[0] for line in compared(rows).rows] == ["heading, human, ours", "heading, small, human, pd"]
+    assert [line[0] for line in compared(rows).rows] == [
+        "heading, human, ours",
+        "heading, small, human, pd",
+    ]
 
 
-def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_evaluation_becomes_png_and_pdf(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     evaluation(tmp_path / "e.json")
     assert plot((tmp_path / "e.json",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
-    assert [f.name for f in files] == [f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")]
+    assert [f.name for f in files] == [
+        f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")
+    ]
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF-"}
     assert all(file.read_bytes().startswith(starts[file.suffix]) for file in files)
 
 
 def test_other_files_are_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.json").write_text("[1]")
-    with pytest.raises(CongraspError, match=r"a\.json is not the result of an evaluation .*evaluate --json"):
+    with pytest.raises(
+        CongraspError, match=r"a\.json is not the result of an evaluation .*evaluate --json"
+    ):
         plot_evaluation(tmp_path / "a.json", tmp_path, ("png",))
     with pytest.raises(CongraspError, match="cannot be read"):
         plot_evaluation(tmp_path / "b.json", tmp_path, ("png",))

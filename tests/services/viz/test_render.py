@@ -30,7 +30,16 @@ from congrasp.services.viz.render import (
     render_episode_frames,
     save_episode_video,
 )
-from congrasp.services.viz.shapes import Camera, Shape, arrow, beads, between, capsule_shapes, fit, skin_colours
+from congrasp.services.viz.shapes import (
+    Camera,
+    Shape,
+    arrow,
+    beads,
+    between,
+    capsule_shapes,
+    fit,
+    skin_colours,
+)
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
 from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
@@ -41,15 +50,28 @@ WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
 
 
-def ball(radius: float = 0.1, colour: tuple[float, float, float] = RED, at: tuple[float, ...] = (0, 0, 0)) -> Shape:
+def ball(
+    radius: float = 0.1, colour: tuple[float, float, float] = RED, at: tuple[float, ...] = (0, 0, 0)
+) -> Shape:
     return Shape("sphere", (radius, 0), colour, np.array(at, float))
 
 
 def box(
-    sides: tuple[float, ...], colour: tuple[float, float, float], at: tuple[float, ...], alpha: float = 1.0
+    sides: tuple[float, ...],
+    colour: tuple[float, float, float],
+    at: tuple[float, ...],
+    alpha: float = 1.0,
 ) -> Shape:
     mesh = trimesh.creation.box(sides)
-    return Shape("mesh", (0, 0), colour, np.array(at, float), alpha=alpha, vertices=mesh.vertices, faces=mesh.faces)
+    return Shape(
+        "mesh",
+        (0, 0),
+        colour,
+        np.array(at, float),
+        alpha=alpha,
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+    )
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -64,7 +86,9 @@ def test_a_ball_covers_its_projection() -> None:
     radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(15)) * 100
     assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
     rows, columns = np.nonzero(seen)
-    assert rows.mean() == pytest.approx(99.5, abs=0.1) and columns.mean() == pytest.approx(99.5, abs=0.1)
+    assert rows.mean() == pytest.approx(99.5, abs=0.1) and columns.mean() == pytest.approx(
+        99.5, abs=0.1
+    )
 
 
 def test_right_is_right_and_up_is_up():
@@ -81,32 +105,43 @@ def test_the_nearer_shape_hides_the_other() -> None:
 
 def test_a_transparent_shape_takes_its_share_of_the_colour() -> None:
     pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
-    plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
+    plain, through = (
+        render_scene([ball()], FRONT, (61, 61)),
+        render_scene([ball(), pane], FRONT, (61, 61)),
+    )
     center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
     assert center[0] < center_plain[0] and center[2] > center_plain[2]
     assert center[0] > 40  # the red ball is still seen
     hidden = box((0.02, 0.04, 0.04), BLUE, (-0.3, 0, 0), alpha=0.5)
-    np.testing.assert_array_equal(render_scene([ball(), hidden], FRONT, (61, 61))[30, 30], plain[30, 30])
+    np.testing.assert_array_equal(
+        render_scene([ball(), hidden], FRONT, (61, 61))[30, 30], plain[30, 30]
+    )
 
 
 def test_a_ball_darkens_the_ground_beneath_it() -> None:
     ground = Shape("table", (1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0, shadow=False)
     above = Camera(np.array([0.5, 0.0, 0.5]), np.zeros(3), 40.0)
     bare = render_scene([ground], above, (80, 80)).astype(int).sum(-1)
-    shaded = render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
+    shaded = (
+        render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
+    )
     floor = visible([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)) == 0
     assert (bare - shaded)[floor].max() > 100
     corner = np.zeros_like(floor)
     corner[:10, :10] = True
     assert np.abs(bare - shaded)[floor & corner].max() < 30
-    marked = render_scene([ground, dataclasses.replace(ball(0.05, at=(0, 0, 0.05)), shadow=False)], above, (80, 80))
+    marked = render_scene(
+        [ground, dataclasses.replace(ball(0.05, at=(0, 0, 0.05)), shadow=False)], above, (80, 80)
+    )
     inside = binary_erosion(floor, iterations=2)  # without pixels that show some of the ball
     np.testing.assert_array_equal(marked.astype(int).sum(-1)[inside], bare[inside])
 
 
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
-    points = np.array([[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)])
+    points = np.array(
+        [[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)]
+    )
     paint = Colours(points, np.where(points[:, 2:] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
     painted = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)
     image = render_scene([painted], FRONT, (60, 60)).astype(int)
@@ -126,7 +161,9 @@ def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
     corners, smooth = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
-    np.testing.assert_allclose(smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6)
+    np.testing.assert_allclose(
+        smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6
+    )
 
 
 def flat_normals(corners: np.ndarray) -> np.ndarray:
@@ -139,7 +176,9 @@ def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     corners, _ = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert sides.max() <= 0.00501  # at most 5 mm
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(
+        corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
+    )
     assert mesh.area == pytest.approx(box.area) and mesh.volume == pytest.approx(box.volume)
 
 
@@ -147,7 +186,9 @@ def test_between_and_arrow_connect_their_points() -> None:
     start, end = np.array([0.1, -0.2, 0.3]), np.array([-0.2, 0.1, 0.1])
     capsule = between(start, end, 0.01, RED)
     axis = Rotation.from_quat(capsule.quaternion, scalar_first=True).apply([0, 0, capsule.size[1]])
-    np.testing.assert_allclose([capsule.position - axis, capsule.position + axis], [start, end], atol=1e-12)
+    np.testing.assert_allclose(
+        [capsule.position - axis, capsule.position + axis], [start, end], atol=1e-12
+    )
     shaft, cone = arrow(start, end, 0.01, RED)
     turn = Rotation.from_quat(cone.quaternion, scalar_first=True)
     corners = turn.apply(cone.vertices) + cone.position
@@ -190,10 +231,14 @@ def test_links_in_contact_and_the_avoid_region_are_coloured() -> None:
     assert set(owner[changed & (skin_of(hand).weights.max(1) > 0.9)]) == set(hand.tip_links)
     thumb = skinned.colours[skin_of(hand).weights[:, hand.tip_links[0]] > 0.99]
     # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
-    np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
+    np.testing.assert_allclose(
+        thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01
+    )
     assert body.paint is not None
     minus = episode().arrays["surface_avoid"]
-    np.testing.assert_array_equal(body.paint.values, np.where(minus[:, None], (204, 41, 41), (51, 166, 82)))
+    np.testing.assert_array_equal(
+        body.paint.values, np.where(minus[:, None], (204, 41, 41), (51, 166, 82))
+    )
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint is None
 
 
@@ -202,7 +247,9 @@ def test_the_table_is_drawn_until_its_removal_and_the_reference_pose_is_transpar
         return any(shape.kind == "table" for shape in episode_shapes(episode(), step))
 
     assert flat(7) and not flat(8)
-    (ghost,) = [shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1]
+    (ghost,) = [
+        shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1
+    ]
     # The last step has reached the pose: ghost and hand coincide.
     np.testing.assert_allclose(ghost.vertices, episode_shapes(episode(), 11)[0].vertices, atol=1e-5)
 
@@ -210,13 +257,21 @@ def test_the_table_is_drawn_until_its_removal_and_the_reference_pose_is_transpar
 def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
     camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
-        assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
+        assert (
+            np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max()
+            < 1
+        )
     near, far = (camera_of(episode(), [11], overlays=overlays) for overlays in (False, True))
-    assert np.linalg.norm(far.position - far.target) > 1.1 * np.linalg.norm(near.position - near.target)  # its path
+    # Its path
+    assert np.linalg.norm(far.position - far.target) > 1.1 * np.linalg.norm(
+        near.position - near.target
+    )
     frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
     fallen = episode()
     fallen.arrays["object_position"][-1, 2] -= 5.0
-    np.testing.assert_allclose(camera_of(fallen, [0, 11]).target[2], camera_of(episode(), [0, 11]).target[2], atol=0.1)
+    np.testing.assert_allclose(
+        camera_of(fallen, [0, 11]).target[2], camera_of(episode(), [0, 11]).target[2], atol=0.1
+    )
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
     picture = grasp_picture(episode(), 11, (96, 54))
     assert picture.shape == (54, 96, 3)
@@ -254,15 +309,23 @@ def test_sheets(tmp_path: pathlib.Path) -> None:
 
 def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
     images = [np.full((20, 30, 3), shade, np.uint8) for shade in (0, 80, 160)]
-    sheet = contact_sheet(images, ["a", "b", "c"], 2, "a title that is much too long for so narrow a sheet")
+    sheet = contact_sheet(
+        images, ["a", "b", "c"], 2, "a title that is much too long for so narrow a sheet"
+    )
     assert sheet.shape == (44 + 2 * (20 + 24) + 10, 2 * 40 + 10, 3)
     assert (
-        (sheet[44:64, 10:40] == 0).all() and (sheet[44:64, 50:80] == 80).all() and (sheet[88:108, 10:40] == 160).all()
+        (sheet[44:64, 10:40] == 0).all()
+        and (sheet[44:64, 50:80] == 80).all()
+        and (sheet[88:108, 10:40] == 160).all()
     )
     wide = [np.zeros((20, 100, 3), np.uint8)] * 2
-    labels = contact_sheet(wide, ["tendon_of_a_joint_and_of_another_one_and_more -0.35"] * 2, 2)[30:54]
+    labels = contact_sheet(wide, ["tendon_of_a_joint_and_of_another_one_and_more -0.35"] * 2, 2)[
+        30:54
+    ]
     assert (labels[:, 114:120] == labels[0, 0]).all() and (labels[:, 12:112] != labels[0, 0]).any()
-    labels = contact_sheet(wide, [f"the_proximal_joint_of_the_{x}_finger_is_bent -0.35" for x in ("ring", "long")], 2)
+    labels = contact_sheet(
+        wide, [f"the_proximal_joint_of_the_{x}_finger_is_bent -0.35" for x in ("ring", "long")], 2
+    )
     assert (labels[30:54, 10:110] != labels[30:54, 120:220]).any()
     with pytest.raises(CongraspError, match="3 pictures and 1 labels"):
         contact_sheet(images, ["a"], 2)
@@ -270,7 +333,14 @@ def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
 
 def test_the_title_names_the_constraints_and_the_outcome() -> None:
     title = episode_title(episode(mask=(1, 0, 0, 1), success=False))
-    for words in ("human hand", "cylinder-0", "heading + affordance + trajectory", "no success", "return 12.5", "3"):
+    for words in (
+        "human hand",
+        "cylinder-0",
+        "heading + affordance + trajectory",
+        "no success",
+        "return 12.5",
+        "3",
+    ):
         assert words in title
 
 
@@ -281,16 +351,23 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
     for steps, success in ((4, True), (5, False), (6, False)):
         writer.write(Entry(channel, steps, encode(episode(steps, removal=3, success=success))))
     writer.close()
-    lengths = [len(pick_episode(tmp_path / "run", i).arrays["table"]) for i in (0, 1, 2, -1, -2, -3)]
+    lengths = [
+        len(pick_episode(tmp_path / "run", i).arrays["table"]) for i in (0, 1, 2, -1, -2, -3)
+    ]
     assert lengths == [4, 5, 6, 6, 5, 4]
     assert len(pick_episode(tmp_path / "run", -1, success=True).arrays["table"]) == 4
     for index, success in ((3, False), (-4, False), (1, True)):
-        with pytest.raises(CongraspError, match=r"holds \d .*none with index .*Choose from -\d to "):
+        with pytest.raises(
+            CongraspError, match=r"holds \d .*none with index .*Choose from -\d to "
+        ):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
     # An older name of --frames.
     assert (
-        load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--moments", "1"])() == 0
+        load("render")(
+            ["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--moments", "1"]
+        )()
+        == 0
     )
     assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
@@ -299,7 +376,9 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
 
 
 def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_path) -> None:
-    """Ten of twelve steps of 10 ms at 50 frames a second are five frames; a constraint's arrow is an overlay."""
+    """Ten of twelve steps of 10 ms at 50 frames a second are five frames; a constraint's arrow is
+    an overlay.
+    """
     path = tmp_path / "film.mp4"
     save_episode_video(path, episode(), Film((64, 48), 0.5 / CONTROL_DT), until=10)
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -311,7 +390,8 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
 
 def test_pictures_need_no_writable_folder() -> None:
     script = (
-        "import numpy as np; from congrasp.services.viz import kernels; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
+        "import numpy as np; from congrasp.services.viz import kernels; "
+        "print(kernels.averaged(np.ones((2, 2, 3)), 2))"
     )
     done = python("-c", script, env={"XDG_CACHE_HOME": "/proc/nowhere"})
     assert done.stdout.split() == ["[[[255", "255", "255]]]"], done.stderr

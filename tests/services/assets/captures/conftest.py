@@ -22,7 +22,9 @@ def run_import(tmp_path):
     def run(kind, path, *options, code=0):
         out = tmp_path / "out"
         folders = ["--out", str(out), "--objects", str(tmp_path / "objects")]
-        assert load("constraints")(["import", kind, str(path), *folders, *map(str, options)])() == code
+        assert (
+            load("constraints")(["import", kind, str(path), *folders, *map(str, options)])() == code
+        )
         sets = {file.name.split(".")[0]: load_set(file) for file in out.glob("*.safetensors")}
         rows = json.loads((out / "import.json").read_text())
         return sets, Report(rows["kept"], rows["dropped"])

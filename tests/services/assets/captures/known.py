@@ -1,4 +1,6 @@
-"""A captured grasp whose answer is known: a box pinched by thumb and index finger, after an approach along a curve."""
+"""A captured grasp whose answer is known: a box pinched by thumb and index finger, after an
+approach along a curve.
+"""
 
 import dataclasses
 import pathlib
@@ -20,8 +22,12 @@ ORIGIN = np.array([0.02, -0.01, 0.03])
 
 
 def q_closed(rng: np.random.Generator) -> np.ndarray:
-    """(20,) a pinch within the limits, a little different each time, with no finger in another or the box."""
-    share = np.where([joint.name.startswith(("thumb", "index")) for joint in HUMAN.joints], 0.35, 0.1)
+    """(20,) a pinch within the limits, a little different each time, with no finger in another or
+    the box.
+    """
+    share = np.where(
+        [joint.name.startswith(("thumb", "index")) for joint in HUMAN.joints], 0.35, 0.1
+    )
     q = HUMAN.q_open + share * (HUMAN.q_closed - HUMAN.q_open) + rng.uniform(-0.05, 0.05, 20)
     return separated(HUMAN, np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)[None])[0]
 
@@ -61,7 +67,9 @@ class Known:
         return position, Slerp(length, self.turns)(wanted)
 
 
-def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, tail: float = 0.0) -> Known:
+def make(
+    name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, tail: float = 0.0
+) -> Known:
     """A grasp of a box.
 
     Args:
@@ -69,14 +77,16 @@ def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, 
       object_name: of the box.
       seed: of poses, path and world.
       farthest: metres from which the wrist comes, along its approach.
-      tail: metres by which the box is longer than its pinched end, away from the wrist along its -z axis.
+      tail: metres by which the box is longer than its pinched end, away from the wrist along its -z
+      axis.
     """
     q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
     tips = joint_positions(q)[:2, 3]
     middle, across = tips.mean(0), tips[1] - tips[0]
     width = float(np.linalg.norm(across))
-    # The box's x axis is the pinch; its other edges are shorter than a hand, and any roll about the pinch will do.
+    # The box's x axis is the pinch; its other edges are shorter than a hand, and any roll about the
+    # pinch will do.
     x = across / width
     y = np.cross(x, [0, -1.0, 0])
     y /= np.linalg.norm(y)
@@ -93,13 +103,17 @@ def make(name: str, object_name: str, seed: int = 0, *, farthest: float = 0.27, 
     def wrist(s: np.ndarray) -> tuple[np.ndarray, Rotation]:
         away = (1 - s)[:, None]
         swing = 0.02 * np.sin(np.pi * s)[:, None]
-        return grasp_at + farthest * away * outward + swing * side, Rotation.from_rotvec(away * axis) * grasp_turn
+        return grasp_at + farthest * away * outward + swing * side, Rotation.from_rotvec(
+            away * axis
+        ) * grasp_turn
 
     s = np.concatenate([np.linspace(0, 1, GRASP + 1), np.ones(FRAMES - GRASP - 1)])
     position, rotation = wrist(s)
     lifted = np.concatenate([np.zeros(GRASP + 1), np.linspace(0, 0.2, FRAMES - GRASP - 1)])
     world_turn = Rotation.random(rng=rng)
-    world_turns = Rotation.concatenate([Rotation.from_rotvec([0, 0, 2 * lift]) * world_turn for lift in lifted])
+    world_turns = Rotation.concatenate(
+        [Rotation.from_rotvec([0, 0, 2 * lift]) * world_turn for lift in lifted]
+    )
     center = rng.uniform(-0.2, 0.2, 3) + np.outer(lifted, [0.3, 0, 1])
 
     dense_s = np.linspace(0, 1, 4001)
@@ -140,7 +154,9 @@ def check(arrays: dict[str, np.ndarray], m: int, known: Known) -> None:
 
 
 def mano_rotations(fingers: np.ndarray) -> np.ndarray:
-    """(T, 15, 3, 3) rotations of MANO's joints against their parents that pose the human hand like angles (T, 20)."""
+    """(T, 15, 3, 3) rotations of MANO's joints against their parents that pose the human hand like
+    angles (T, 20).
+    """
     names = [link.name for link in HUMAN.links]
     rows = []
     different, which = np.unique(fingers, axis=0, return_inverse=True)
@@ -148,7 +164,11 @@ def mano_rotations(fingers: np.ndarray) -> np.ndarray:
         turns = Rotation.from_quat(mujoco_link_poses(HUMAN, q)[1], scalar_first=True).as_matrix()
         turns = TO_HUMAN.T @ turns @ TO_HUMAN
         for finger in MANO_FINGERS:
-            links = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
+            links = (
+                ("metacarpal", "proximal", "distal")
+                if finger == "thumb"
+                else ("proximal", "middle", "distal")
+            )
             parent = np.eye(3)
             for link in links:
                 turn = turns[names.index(f"{finger}_{link}")]

@@ -1,4 +1,6 @@
-"""An importer that nobody ships: one NPZ file a sequence, whose arrays have the names of `Sequence`'s fields."""
+"""An importer that nobody ships: one NPZ file a sequence, whose arrays have the names of
+`Sequence`'s fields.
+"""
 
 import pathlib
 from collections.abc import Iterator
@@ -11,7 +13,9 @@ from congrasp.services.assets.captures.sequence import Dropped, Meshes, Sequence
 HOLDS = "*.capture.npz"
 
 
-def read(path: pathlib.Path, meshes: Meshes, mano: ManoModel | None) -> Iterator[Sequence | Dropped]:
+def read(
+    path: pathlib.Path, meshes: Meshes, mano: ManoModel | None
+) -> Iterator[Sequence | Dropped]:
     for file in sorted(path.glob(HOLDS)):
         yield read_or_drop(file.stem, _sequence, file, meshes)
 
@@ -20,4 +24,6 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     name = file.name.split(".")[0]
     object_name = name.split("_")[0]
     with np.load(file) as arrays:
-        return Sequence(name=name, object_name=object_name, mesh=meshes.find(name, object_name), **arrays)
+        return Sequence(
+            name=name, object_name=object_name, mesh=meshes.find(name, object_name), **arrays
+        )

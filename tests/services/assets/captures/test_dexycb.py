@@ -16,13 +16,22 @@ MUG = OBJECTS.index("025_mug") + 1
 def write(case, root, session, *, meta=None, change=lambda poses: None):
     """One session, the mug's mesh and the subject's calibration."""
     values = content()
-    angles = Rotation.from_matrix(known.mano_rotations(case.fingers).reshape(-1, 3, 3)).as_rotvec().reshape(-1, 45)
-    coefficients = np.linalg.solve(values["hands_components"].T, (angles - values["hands_mean"]).T).T
+    angles = (
+        Rotation.from_matrix(known.mano_rotations(case.fingers).reshape(-1, 3, 3))
+        .as_rotvec()
+        .reshape(-1, 45)
+    )
+    coefficients = np.linalg.solve(
+        values["hands_components"].T, (angles - values["hands_mean"]).T
+    ).T
     root_turn = known.mano_root(case.wrist_rotation).as_rotvec()
     hand = np.concatenate([root_turn, coefficients, case.wrist_position - skeleton()[0][0]], 1)
     other = np.tile([0, 0, 0, 1, 0.5, 0, 0], (len(hand), 1))
     place = np.concatenate([case.object_rotation.as_quat(), case.object_position], 1)
-    poses = {"pose_y": np.stack([other, place], 1).astype(np.float32), "pose_m": hand[:, None].astype(np.float32)}
+    poses = {
+        "pose_y": np.stack([other, place], 1).astype(np.float32),
+        "pose_m": hand[:, None].astype(np.float32),
+    }
     change(poses)
     folder = root / "20200709-subject-01" / session
     folder.mkdir(parents=True)
@@ -36,7 +45,9 @@ def write(case, root, session, *, meta=None, change=lambda poses: None):
         "mano_calib": ["20200709-subject-01_right"],
         "extrinsics": "20200702_151821",
     }
-    (folder / "meta.yml").write_text(yaml.safe_dump({k: v for k, v in (facts | (meta or {})).items() if v is not None}))
+    (folder / "meta.yml").write_text(
+        yaml.safe_dump({k: v for k, v in (facts | (meta or {})).items() if v is not None})
+    )
     calibration = root / "calibration" / "mano_20200709-subject-01_right"
     calibration.mkdir(parents=True, exist_ok=True)
     (calibration / "mano.yml").write_text(yaml.safe_dump({"betas": [0.0] * 10}))
@@ -69,7 +80,9 @@ def test_what_is_wrong_with_a_session_is_said(run_import, tmp_path, mano):
     write(case, tmp_path, "nokey", meta={"ycb_grasp_ind": None})
     write(case, tmp_path, "noobject", meta={"ycb_grasp_ind": 4})
     write(case, tmp_path, "nopose", change=lambda poses: poses.pop("pose_m"))
-    write(case, tmp_path, "shape", change=lambda poses: poses.update(pose_m=poses["pose_m"][..., :48]))
+    write(
+        case, tmp_path, "shape", change=lambda poses: poses.update(pose_m=poses["pose_m"][..., :48])
+    )
     write(case, tmp_path, "unseen", change=unseen)
     write(case, tmp_path, "hidden", change=hidden)
     write(case, tmp_path, "uncalibrated", meta={"mano_calib": ["someone"]})

@@ -22,10 +22,15 @@ def write(case, root, wrist, *, labels=None, change=lambda data: None):
         "global_orient": known.mano_root(case.wrist_rotation).as_rotvec(),
         "hand_pose": np.zeros((frames, 24)),
         "transl": case.wrist_position - wrist,
-        "fullpose": Rotation.from_matrix(known.mano_rotations(case.fingers).reshape(-1, 3, 3)).as_rotvec(),
+        "fullpose": Rotation.from_matrix(
+            known.mano_rotations(case.fingers).reshape(-1, 3, 3)
+        ).as_rotvec(),
     }
     hand["fullpose"] = hand["fullpose"].reshape(frames, 45)
-    thing = {"transl": case.object_position, "global_orient": case.object_rotation.inv().as_rotvec()}
+    thing = {
+        "transl": case.object_position,
+        "global_orient": case.object_rotation.inv().as_rotvec(),
+    }
     data = {
         "gender": "male",
         "sbj_id": "s1",
@@ -34,14 +39,19 @@ def write(case, root, wrist, *, labels=None, change=lambda data: None):
         "n_frames": frames,
         "rhand": {"params": hand, "vtemp": "tools/subject_meshes/male/s1_rhand.ply"},
         "lhand": {"params": {}, "vtemp": "tools/subject_meshes/male/s1_lhand.ply"},
-        "object": {"params": thing, "object_mesh": f"tools/object_meshes/contact_meshes/{case.object_name}.ply"},
+        "object": {
+            "params": thing,
+            "object_mesh": f"tools/object_meshes/contact_meshes/{case.object_name}.ply",
+        },
         "contact": {"body": np.zeros((frames, 3), int), "object": labels},
     }
     change(data)
     path = root / "grab" / "s1" / f"{case.name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **data)
-    known.write_mesh(case, root / "tools" / "object_meshes" / "contact_meshes" / f"{case.object_name}.ply")
+    known.write_mesh(
+        case, root / "tools" / "object_meshes" / "contact_meshes" / f"{case.object_name}.ply"
+    )
 
 
 def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tmp_path, mano):
@@ -53,9 +63,14 @@ def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tm
     case = known.make("box_lift_1", "box", 3)
     write(case, tmp_path, skeleton()[0][0] + np.array([0.003, -0.002, 0.004]))
     sets, report = run_import("grab", tmp_path, "--mano", mano)
-    assert not report.dropped and report.kept[0]["residual_rad"] < 1e-3 and report.kept[0]["residual_tip_m"] < 1e-4
+    assert (
+        not report.dropped
+        and report.kept[0]["residual_rad"] < 1e-3
+        and report.kept[0]["residual_tip_m"] < 1e-4
+    )
     known.check(sets["box"].arrays, 0, case)
-    assert not sets["box"].arrays["surface/avoid"].any()  # no labelled parts: everything may be grasped
+    # No labelled parts: everything may be grasped
+    assert not sets["box"].arrays["surface/avoid"].any()
 
 
 def test_without_a_mano_file_the_human_hands_bones_stand_in(run_import, tmp_path):
@@ -69,7 +84,9 @@ def test_grabnet_names_the_grasping_frame(run_import, tmp_path):
     case = known.make("box_lift_1", "box", 5)
     write(case, tmp_path, MEAN_WRIST)
     (tmp_path / "data" / "train").mkdir(parents=True)
-    names = [f"data/train/s1/box_lift_1/{frame}.npz" for frame in (75, 70, 80)] + ["data/train/s2/box_lift_1/3.npz"]
+    names = [f"data/train/s1/box_lift_1/{frame}.npz" for frame in (75, 70, 80)] + [
+        "data/train/s2/box_lift_1/3.npz"
+    ]
     np.savez(tmp_path / "data" / "train" / "frame_names.npz", frame_names=np.array(names))
     _, report = run_import("grab", tmp_path)
     assert [row["frame"] for row in report.kept] == [70]
@@ -86,7 +103,10 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     variant("box_left_1", lambda data: data.pop("rhand"))
     variant("box_nokey_1", lambda data: data["rhand"]["params"].pop("fullpose"))
     variant("box_noobject_1", lambda data: data.pop("object"))
-    variant("box_millimetres_1", lambda data: data["object"]["params"].update(transl=1000 * case.object_position))
+    variant(
+        "box_millimetres_1",
+        lambda data: data["object"]["params"].update(transl=1000 * case.object_position),
+    )
     gone = case.wrist_position.copy()
     gone[known.GRASP - 10 :] = np.nan
     variant("box_gone_1", lambda data: data["rhand"]["params"].update(transl=gone))
@@ -94,7 +114,10 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     variant("cup_lift_1", lambda data: data.update(obj_name="cup"))
     sets, report = run_import("grab", tmp_path)
     assert [row["sequence"] for row in report.kept] == ["s1/box_right_1"] and list(sets) == ["box"]
-    assert {row["sequence"].removeprefix("s1/").removesuffix("_1"): row["rule"] for row in report.dropped} == {
+    assert {
+        row["sequence"].removeprefix("s1/").removesuffix("_1"): row["rule"]
+        for row in report.dropped
+    } == {
         "box_left": "left hand",
         "box_nokey": "wrong layout",
         "box_noobject": "wrong layout",
@@ -106,5 +129,7 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
 
 
 def test_a_folder_of_another_kind_is_refused(run_import, tmp_path):
-    with pytest.raises(CongraspError, match=r"holds no sequence of grab\. Pass the folder with s1/"):
+    with pytest.raises(
+        CongraspError, match=r"holds no sequence of grab\. Pass the folder with s1/"
+    ):
         run_import("grab", tmp_path)

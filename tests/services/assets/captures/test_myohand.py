@@ -35,7 +35,9 @@ def arm_for(position, rotation, rng):
 
 def write(case, path, **changes):
     rng = np.random.default_rng(1)
-    robot = np.concatenate([arm_for(case.wrist_position, case.wrist_rotation, rng), case.fingers], 1)
+    robot = np.concatenate(
+        [arm_for(case.wrist_position, case.wrist_rotation, rng), case.fingers], 1
+    )
     place = case.object_position - [0, 0, 0.035]
     arrays = {
         "time": 0.02 * np.arange(len(robot)),
@@ -45,7 +47,9 @@ def write(case, path, **changes):
         "object_init": np.zeros(7),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, **{name: array for name, array in (arrays | changes).items() if array is not None})
+    np.savez(
+        path, **{name: array for name, array in (arrays | changes).items() if array is not None}
+    )
     return arrays
 
 
@@ -77,7 +81,9 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
 
 @pytest.mark.parametrize("headings", ["sampled", "demonstrated"])
 @pytest.mark.slow
-def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(run_import, tmp_path, headings):
+def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(
+    run_import, tmp_path, headings
+):
     for seed, name in enumerate("abcde"):
         case = known.make(f"MyoHand_{name}_lift", name, seed)
         write(case, tmp_path / "data" / f"{case.name}.npz")
@@ -93,7 +99,9 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
         if headings == "demonstrated":  # a heading belongs where its demonstration does
             assert {obj.name for obj in objects} == names
         valid = bank_of(chosen, split).pose_valid[:, 0].any((1, 2))
-        assert {obj.name for obj, any_valid in zip(objects, valid, strict=True) if any_valid} == names
+        assert {
+            obj.name for obj, any_valid in zip(objects, valid, strict=True) if any_valid
+        } == names
 
 
 def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
@@ -119,8 +127,12 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     write(case, folder / "MyoHand_box_limits.npz", robot=limits)
     known.write_mesh(case, tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", folder, "--meshes", tmp_path / "meshes")
-    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"] and list(sets) == ["box"]
-    reasons = {row["sequence"].split("_")[-1]: (row["rule"], row["reason"]) for row in report.dropped}
+    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"] and list(sets) == [
+        "box"
+    ]
+    reasons = {
+        row["sequence"].split("_")[-1]: (row["rule"], row["reason"]) for row in report.dropped
+    }
     for name, rule, words in (
         ("nokey", "wrong layout", "no 'object'"),
         ("back", "wrong layout", "time runs back"),

@@ -30,13 +30,18 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
 
 def test_objects_of_one_name_and_different_meshes_get_different_names(tmp_path, monkeypatch):
     named = []
-    monkeypatch.setattr(build, "import_sources", lambda sources, options: named.extend(sources) or [])
+    monkeypatch.setattr(
+        build, "import_sources", lambda sources, options: named.extend(sources) or []
+    )
     files = [tmp_path / folder / "cup.obj" for folder in "aba"]
     for file in files[:2]:
         file.parent.mkdir()
         file.write_text("v 0 0 0\n")
     build._shapes([types.SimpleNamespace(mesh=file, object_name="cup") for file in files], print)
-    assert [(source.path, source.name) for source in named] == [(files[0], "cup"), (files[1], "cup-2")]
+    assert [(source.path, source.name) for source in named] == [
+        (files[0], "cup"),
+        (files[1], "cup-2"),
+    ]
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: " * 5, "\x00", "- a", "a: &x [1]\nb: [*x, *x]"])

@@ -1,4 +1,6 @@
-"""OakInk-Image's annotations, with tensors as PyTorch pickles them: a known answer, affordance, and what is wrong."""
+"""OakInk-Image's annotations, with tensors as PyTorch pickles them: a known answer, affordance, and
+what is wrong.
+"""
 
 import json
 import pickle
@@ -19,19 +21,32 @@ STAMP = "2021-09-26-19-59-58"
 
 
 def tensor(values):
-    """PyTorch's pickle of a tensor of 32-bit floats: pickles of facts about the storage, and its numbers."""
+    """PyTorch's pickle of a tensor of 32-bit floats: pickles of facts about the storage, and its
+    numbers.
+    """
     values = np.ascontiguousarray(values, np.float32)
-    machine = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
-    facts = [pickle.dumps(fact, 2) for fact in (0x1950A86A20F9469CFC6C, 1001, machine, values.size, ["94"])]
+    machine = {
+        "protocol_version": 1001,
+        "little_endian": True,
+        "type_sizes": {"short": 2, "int": 4, "long": 4},
+    }
+    facts = [
+        pickle.dumps(fact, 2)
+        for fact in (0x1950A86A20F9469CFC6C, 1001, machine, values.size, ["94"])
+    ]
     reference = b"\x80\x02(" + b"".join(
         dumps(word)[2:-1] for word in ("storage", Global("torch FloatStorage"), "94", "cpu")
     )
     facts[3] = reference + facts[3][2:-1] + b"NtQ."
     stored = b"".join(facts) + struct.pack("<q", values.size) + values.tobytes()
-    storage = Reduced("torch.storage _load_from_bytes", (Reduced("_codecs encode", (stored, "latin1")),))
+    storage = Reduced(
+        "torch.storage _load_from_bytes", (Reduced("_codecs encode", (stored, "latin1")),)
+    )
     strides = tuple(stride // 4 for stride in values.strides)
     ordered = Reduced("collections OrderedDict")
-    return Reduced("torch._utils _rebuild_tensor_v2", (storage, 0, values.shape, strides, False, ordered))
+    return Reduced(
+        "torch._utils _rebuild_tensor_v2", (storage, 0, values.shape, strides, False, ordered)
+    )
 
 
 def pickled(info):
@@ -42,14 +57,17 @@ def pickled(info):
 
 
 def write(case, root, *, cameras=(3, 1), every=1, change=lambda frame, info: info):
-    """Annotations of one sequence, seen by some cameras; its name is `<object>_<intent>_<subject>`."""
+    """Annotations of one sequence, seen by some cameras; its name is
+    `<object>_<intent>_<subject>`.
+    """
     folder = root / "anno" / "general_info"
     folder.mkdir(parents=True, exist_ok=True)
     index = root / "anno" / "seq_all.json"
     rows = json.loads(index.read_text()) if index.is_file() else []
     rotations = known.mano_rotations(case.fingers)
     roots = known.mano_root(case.wrist_rotation).as_matrix()
-    middle = case.object_position + case.object_rotation.apply(known.ORIGIN)  # OakInk centres the mesh first
+    # OakInk centres the mesh first
+    middle = case.object_position + case.object_rotation.apply(known.ORIGIN)
     for frame in range(0, len(rotations), every):
         turns = Rotation.from_matrix(np.concatenate([roots[frame][None], rotations[frame]]))
         pose = np.eye(4)
@@ -59,11 +77,16 @@ def write(case, root, *, cameras=(3, 1), every=1, change=lambda frame, info: inf
             "hand_shape": np.zeros(10),
             "hand_tsl": case.wrist_position[frame],
         }
-        info = change(frame, {"hand_anno": hand, "obj_anno": pose, "cam_extr": np.eye(4), "cam_intr": np.eye(3)})
+        info = change(
+            frame,
+            {"hand_anno": hand, "obj_anno": pose, "cam_extr": np.eye(4), "cam_intr": np.eye(3)},
+        )
         for camera in cameras:
             rows.append([f"{case.name}/{STAMP}", 0, frame, camera])
             if info is not None:
-                (folder / f"{case.name}__{STAMP}__0__{frame}__{camera}.pkl").write_bytes(dumps(pickled(info)))
+                (folder / f"{case.name}__{STAMP}__0__{frame}__{camera}.pkl").write_bytes(
+                    dumps(pickled(info))
+                )
     index.write_text(json.dumps(rows))
     known.write_mesh(case, root / "obj" / f"{case.object_name}.obj")
 
@@ -98,7 +121,8 @@ def test_an_affordance_of_less_than_a_tenth_is_dropped(run_import, tmp_path):
     write_parts(case, tmp_path, case.size[2] / 2 - 0.045)
     _, report = run_import("oakink", tmp_path, code=2)
     assert (
-        report.dropped[0]["rule"] == "graspable region too small" and "% of its surface" in report.dropped[0]["reason"]
+        report.dropped[0]["rule"] == "graspable region too small"
+        and "% of its surface" in report.dropped[0]["reason"]
     )
     _, report = run_import("oakink", tmp_path, "--affordance", "none")
     assert [row["object"] for row in report.kept] == ["A01001"]
@@ -174,5 +198,7 @@ def test_a_folder_without_annotations_is_refused(run_import, tmp_path):
 def test_a_list_of_other_rows_is_refused(tmp_path, text):
     (tmp_path / "anno").mkdir()
     (tmp_path / "anno" / "seq_all.json").write_text(text)
-    with pytest.raises(CongraspError, match=r"holds other rows than \[sequence, subject, frame, camera\]"):
+    with pytest.raises(
+        CongraspError, match=r"holds other rows than \[sequence, subject, frame, camera\]"
+    ):
         list(read(tmp_path, Meshes(()), None))

@@ -1,4 +1,6 @@
-"""References from captures: when fingers have closed, fingers apart, resting poses, and other hands."""
+"""References from captures: when fingers have closed, fingers apart, resting poses, and other
+hands.
+"""
 
 import dataclasses
 import pathlib
@@ -61,7 +63,9 @@ class Slab:
 
 
 def moving(joints, lift, wrist=0.0, present=True):
-    """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at (T, 5, 4, 3)."""
+    """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at
+    (T, 5, 4, 3).
+    """
     count, up = len(joints), np.array([0.0, 0.0, 1.0])
     return Sequence(
         name="lift",
@@ -77,7 +81,9 @@ def moving(joints, lift, wrist=0.0, present=True):
 
 
 def opposed(thumb, index, lift=0.0, present=True, surface=None):
-    """Frame found for skins of thumb and index so far (T,) from a slab, m, which rises by `lift` (T,)."""
+    """Frame found for skins of thumb and index so far (T,) from a slab, m, which rises by `lift`
+    (T,).
+    """
     joints = np.full((FRAMES, 5, 4, 3), 0.3)  # other fingers stay away
     joints[:, 0, :, 0] = (0.02 + THUMB + thumb * np.ones(FRAMES))[:, None]
     joints[:, 1, :, 0] = -(0.02 + INDEX + index * np.ones(FRAMES))[:, None]
@@ -85,7 +91,8 @@ def opposed(thumb, index, lift=0.0, present=True, surface=None):
 
 
 AT = np.arange(FRAMES)
-CLOSING = 0.0005 * np.maximum(FIRST + 8 - AT, 0)  # 4 mm off at the first touch, half a millimetre less a frame
+# 4 mm off at the first touch, half a millimetre less a frame
+CLOSING = 0.0005 * np.maximum(FIRST + 8 - AT, 0)
 
 
 def test_the_reference_is_taken_when_thumb_and_finger_have_closed():
@@ -98,7 +105,8 @@ def test_fingers_that_never_close_give_the_nearest_frame_within_reach():
     assert opposed(0.003 + CLOSING, 0.0) == FIRST + 8
     slow = 0.01 - 0.0001 * AT
     assert opposed(slow, 0.0) == FIRST + LATER
-    # The object is lifted by 1 cm a frame from the eighth frame on: three centimetres at the eleventh.
+    # The object is lifted by 1 cm a frame from the eighth frame on: three centimetres at the
+    # eleventh.
     assert opposed(slow, 0.0, 0.01 * np.maximum(AT - 8, 0)) == 10
     assert opposed(CLOSING, 0.0, present=(AT != FIRST + 4)) == FIRST + 5
 
@@ -109,7 +117,8 @@ def test_fingers_on_one_side_do_not_oppose():
     assert opposed(CLOSING, 0.0, surface=side) == FIRST
 
 
-# For 11 frames the wrist comes down by 2 cm a frame; then the object rises by 6 mm a frame, 6 cm at frame 20.
+# For 11 frames the wrist comes down by 2 cm a frame; then the object rises by 6 mm a frame, 6 cm at
+# frame 20.
 WRIST = np.concatenate([np.arange(0.30, 0.095, -0.02), np.full(10, 0.10)])
 LIFT = np.concatenate([np.zeros(11), 0.006 * np.arange(1, 11)])
 
@@ -161,7 +170,9 @@ def test_a_reference_that_is_deep_in_its_object_is_dropped_and_counted(pinch):
 
 
 def straight(contact):
-    """A demonstration with the hand's frame that of the object, which is touched at points (n, 3)."""
+    """A demonstration with the hand's frame that of the object, which is touched at points (n,
+    3).
+    """
     return types.SimpleNamespace(
         name="wide",
         q=HUMAN.q_open,
@@ -187,18 +198,23 @@ def test_what_is_wider_than_the_hand_opens_is_too_wide():
 def test_depth_is_that_of_the_deepest_skin():
     """By hand: below the open hand, a block rises into its lowest skin."""
     held = straight(np.zeros((0, 3)))
-    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(-1, 3)
+    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(
+        -1, 3
+    )
     lowest = (ends[:, 2] - np.repeat(HUMAN.capsule_radii, 2)).min()
 
     def block(deep):
-        return plain_object("block", (Piece("box", (0.3, 0.3, 0.1), (0.0, 0.0, lowest + deep - 0.1)),), 500.0)
+        return plain_object(
+            "block", (Piece("box", (0.3, 0.3, 0.1), (0.0, 0.0, lowest + deep - 0.1)),), 500.0
+        )
 
     for deep in (-0.02, 0.003, 0.012):
         assert depth(held, block(deep)) == pytest.approx(deep, abs=1e-6)
     check_reference(HUMAN, held, block(0.9 * DEEPEST), 1.0)
     with pytest.raises(Dropped, match="12 mm deep in the object"):
         check_reference(HUMAN, held, block(0.012), 1.0)
-    check_reference(get_hand("allegro"), held, block(0.012), 1.0)  # it closes around the object by itself
+    # It closes around the object by itself
+    check_reference(get_hand("allegro"), held, block(0.012), 1.0)
 
 
 def test_normals_of_a_surface_point_outwards():
@@ -215,9 +231,11 @@ ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
 
 
 def two_fingers(upper=1.0, couplings=()):
-    """Fingers of 5 cm at x = -2 and 2 cm along y, that turn about z: `a` towards -x and `b` towards +x.
+    """Fingers of 5 cm at x = -2 and 2 cm along y, that turn about z: `a` towards -x and `b` towards
+    +x.
 
-    So +x of `a` needs a negative angle: turned by -t and t, their tips are 2 (2 cm - 5 cm sin t) apart.
+    So +x of `a` needs a negative angle: turned by -t and t, their tips are 2 (2 cm - 5 cm sin t)
+    apart.
     """
     links = [Link("palm", "", (), (Capsule((0, -0.05, 0), (0, -0.04, 0), RADIUS),), 0.1, 1.0)]
     for name, x, limits in (("a", -ASIDE, (-upper, 1.0)), ("b", ASIDE, (-1.0, 1.0))):
@@ -228,7 +246,9 @@ def two_fingers(upper=1.0, couplings=()):
 
 
 def test_two_fingers_part_evenly():
-    """Turned by 0.38 rad each they overlap by 7 mm; at t with 2 (2 cm - 5 cm sin t) = 1 cm - 1 mm by 1 mm."""
+    """Turned by 0.38 rad each they overlap by 7 mm; at t with 2 (2 cm - 5 cm sin t) = 1 cm - 1 mm
+    by 1 mm.
+    """
     hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
     overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
     np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
@@ -237,11 +257,14 @@ def test_two_fingers_part_evenly():
 
 
 def test_where_one_may_not_go_the_other_does():
-    """`a` cannot leave -0.38 rad, where its tip is at 2 cm - 5 cm sin(0.38) from the middle: `b` makes all the room."""
+    """`a` cannot leave -0.38 rad, where its tip is at 2 cm - 5 cm sin(0.38) from the middle: `b`
+    makes all the room.
+    """
     stiff = two_fingers()
     a = dataclasses.replace(stiff.links[1].joints[0], upper=-0.38)
     hand = dataclasses.replace(
-        stiff, links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2])
+        stiff,
+        links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2]),
     )
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
     found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
@@ -261,14 +284,20 @@ def test_followers_still_follow():
 def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
     hand, rng = get_hand(name), np.random.default_rng(3)
     share = rng.uniform(0.0, 1.0, (12, 1))
-    q = hand.q_open + share * (hand.q_closed - hand.q_open) + rng.normal(0, 0.25, (12, len(hand.joints)))
+    q = (
+        hand.q_open
+        + share * (hand.q_closed - hand.q_open)
+        + rng.normal(0, 0.25, (12, len(hand.joints)))
+    )
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
     before, found = np.asarray(deepest(hand, q)), separated(hand, q)
     deep = before > OVERLAP
     assert deep.any() and not deep.all()
     np.testing.assert_array_equal(found[~deep], q[~deep])
     assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
-    np.testing.assert_array_less(hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5)
+    np.testing.assert_array_less(
+        hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5
+    )
     np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)
 
 
@@ -276,13 +305,16 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
 
 
 def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
-    """A hand from straight above, in resting poses in which the table is 1 mm, 15 mm and 45 mm too high for it.
+    """A hand from straight above, in resting poses in which the table is 1 mm, 15 mm and 45 mm too
+    high for it.
 
-    Further hands are 3 and 15 mm lower: one is requested in the first of them alone, 4 mm in the table, and the other,
-    16 mm in it, in none.
+    Further hands are 3 and 15 mm lower: one is requested in the first of them alone, 4 mm in the
+    table, and the other, 16 mm in it, in none.
     """
     turn = pointing(-1.0)
-    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(-1, 3)
+    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(
+        -1, 3
+    )
     ends = np.asarray(rotations.rotate(jnp.broadcast_to(turn, (len(ends), 4)), jnp.array(ends)))
     reach = -(ends[:, 2] - np.repeat(HUMAN.capsule_radii, 2)).min()
     path = np.zeros((3, 4, 3), np.float32)
@@ -292,17 +324,23 @@ def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
     rest = np.array([[0, 0, -depth, 1, 0, 0, 0] for depth in (0.001, 0.015, 0.045)], np.float32)
     q = np.stack([HUMAN.q_open] * 3).astype(np.float32)
     allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
-    np.testing.assert_array_equal(allowed, [[True, False, False], [True, False, False], [False, False, False]])
+    np.testing.assert_array_equal(
+        allowed, [[True, False, False], [True, False, False], [False, False, False]]
+    )
     rest[1, 2] = 0.02
     allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
-    np.testing.assert_array_equal(allowed, [[True, True, False], [False, True, False], [False, True, False]])
+    np.testing.assert_array_equal(
+        allowed, [[True, True, False], [False, True, False], [False, True, False]]
+    )
 
 
 # --- sequences of which no episode is drawn ---
 
 
 def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
-    """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming down, up and up."""
+    """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming
+    down, up and up.
+    """
     turns = [pointing(z) for z in (-1.0, 1.0, 1.0)]
     path = np.zeros((2, 3, 15, 3), np.float32)
     path[..., 2] = np.array([0.05, 0.05, -0.09])[:, None]
@@ -315,8 +353,14 @@ def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
 
 
 def test_the_report_names_them(capsys):
-    def row(name: str, *, clear: bool, below: bool, overlap: float = 0.0, moved: float = 0.0) -> dict:
-        place = {"clear_of_table": clear, "from_below": below, "split": "held-out" if name == "dig" else "training"}
+    def row(
+        name: str, *, clear: bool, below: bool, overlap: float = 0.0, moved: float = 0.0
+    ) -> dict:
+        place = {
+            "clear_of_table": clear,
+            "from_below": below,
+            "split": "held-out" if name == "dig" else "training",
+        }
         apart = {"overlap_m": overlap, "moved_apart_rad": moved}
         later = {"frames_after_touch": 4 if below else 0}
         return {"sequence": name, "object": "box", "residual_rad": 0.0} | place | apart | later
@@ -334,7 +378,10 @@ def test_the_report_names_them(capsys):
     assert "the reference is taken then, 4 frames later on average" in said
     assert "of 2 overlapped, by up to 4.0 mm (scoop)" in said
     assert "by 0.15 rad on average, at most 0.20 rad (push)" in said
-    assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
+    assert (
+        "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, "
+        "dig." in said
+    )
     assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
     assert "3 sequences are for training, 1 held out." in said
 
@@ -359,7 +406,9 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
     known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
     options = ["--meshes", tmp_path / "meshes", "--headings", "demonstrated"]
     sets, report = run_import("myohand", tmp_path / "data", "--hand", name, *options)
-    assert not report.dropped and "finger angles do not fit" in " ".join(capsys.readouterr().out.split())
+    assert not report.dropped and "finger angles do not fit" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
     hand, scale = get_hand(name), get_hand(name).object_scale
     made = sets["box"]
@@ -377,12 +426,15 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
         wanted = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
         found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
         path = arrays["trajectory/position"][0, m]
-        held = found[-1].inv().apply(wanted[-1] - path[-1])  # the hand centre of the closed hand, wrist frame
+        # The hand centre of the closed hand, wrist frame
+        held = found[-1].inv().apply(wanted[-1] - path[-1])
         np.testing.assert_allclose(path + found.apply(held), wanted, atol=1e-3)
         assert np.linalg.norm(held - center) < 0.03  # fingers that close again move it a little
         for own, theirs in zip(axes(hand), axes(HUMAN), strict=True):
             assert (np.linalg.norm(found.apply(own) - turns.apply(theirs), axis=-1) < 0.01).all()
         np.testing.assert_allclose(arrays["heading/position"][0, m], wanted[-1], atol=1e-3)
-        np.testing.assert_array_equal(arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1])
+        np.testing.assert_array_equal(
+            arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1]
+        )
     assert arrays["heading/position"].shape[1] == HEADINGS
     assert bank_of([made]).pose_q.shape[-1] == len(hand.joints)

@@ -1,4 +1,6 @@
-"""The self-check: good hands pass, and what is wrong with a hand is found by the line that is about it."""
+"""The self-check: good hands pass, and what is wrong with a hand is found by the line that is about
+it.
+"""
 
 import dataclasses
 import functools
@@ -28,7 +30,10 @@ def with_joints(hand, change, only=""):
     """The hand with `change` of each joint, or of the one of this name."""
     links = tuple(
         dataclasses.replace(
-            link, joints=tuple(change(joint) if only in ("", joint.name) else joint for joint in link.joints)
+            link,
+            joints=tuple(
+                change(joint) if only in ("", joint.name) else joint for joint in link.joints
+            ),
         )
         for link in hand.links
     )
@@ -47,7 +52,9 @@ def verdicts(hand):
     return lines, found
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS]
+)
 def test_good_hands_pass_every_check(name):
     lines, found = verdicts(HANDS[name])
     assert not found.failed and {finding.verdict for finding in lines.values()} == {"passed"}
@@ -57,9 +64,15 @@ def test_good_hands_pass_every_check(name):
 
 
 def test_a_reversed_axis_is_found_and_named():
-    turned = with_joints(CLAW, lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)), only="opposing_root")
+    turned = with_joints(
+        CLAW, lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)), only="opposing_root"
+    )
     lines, found = verdicts(turned)
-    assert found.failed and lines["joint"].verdict == "failed" and "'opposing_root'" in lines["joint"].measured
+    assert (
+        found.failed
+        and lines["joint"].verdict == "failed"
+        and "'opposing_root'" in lines["joint"].measured
+    )
     assert "axis" in lines["joint"].remedy and "closed_pose" in lines["joint"].remedy
 
 
@@ -76,7 +89,11 @@ def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, ve
 
 def test_both_pads_of_a_gripper_of_one_motor_stay_parallel():
     hand = propose(pathlib.Path(__file__).parents[3] / "hands" / "pincher.urdf").hand
-    found = {one.measured.split("'")[1]: one.verdict for one in check._joints(hand) if one.check == "joint"}
+    found = {
+        one.measured.split("'")[1]: one.verdict
+        for one in check._joints(hand)
+        if one.check == "joint"
+    }
     assert found == {"left_parallel": "doubt", "right_parallel": "doubt"}
 
 
@@ -89,7 +106,10 @@ def shifted(link, by):
     return dataclasses.replace(
         link,
         joints=tuple(dataclasses.replace(j, anchor=moved(j.anchor, by)) for j in link.joints),
-        capsules=tuple(dataclasses.replace(c, start=moved(c.start, by), end=moved(c.end, by)) for c in link.capsules),
+        capsules=tuple(
+            dataclasses.replace(c, start=moved(c.start, by), end=moved(c.end, by))
+            for c in link.capsules
+        ),
         tip=link.tip and moved(link.tip, by),
     )
 
@@ -97,23 +117,37 @@ def shifted(link, by):
 def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
     palm = CLAW.links[0]
     away = tuple(
-        dataclasses.replace(one, start=moved(one.start, (0, 0, -0.2)), end=moved(one.end, (0, 0, -0.2)))
+        dataclasses.replace(
+            one, start=moved(one.start, (0, 0, -0.2)), end=moved(one.end, (0, 0, -0.2))
+        )
         for one in palm.capsules
     )
-    hand = dataclasses.replace(CLAW, links=(dataclasses.replace(palm, capsules=away), *CLAW.links[1:]))
+    hand = dataclasses.replace(
+        CLAW, links=(dataclasses.replace(palm, capsules=away), *CLAW.links[1:])
+    )
     finding = check._palm(hand)
-    assert finding.verdict == "failed" and "20.1 cm" in finding.measured and "--palm" in finding.remedy
+    assert (
+        finding.verdict == "failed" and "20.1 cm" in finding.measured and "--palm" in finding.remedy
+    )
     # All of the hand at the end of a forearm of 40 cm, whose wrist does not move.
     by = np.array([0, 0, 0.4])
     links = tuple(shifted(link, by) for link in CLAW.links)
     finding = check._palm(dataclasses.replace(CLAW, links=links))
-    assert finding.verdict == "failed" and re.search(r" 5\.\d fingers' lengths from the wrist", finding.measured)
+    assert finding.verdict == "failed" and re.search(
+        r" 5\.\d fingers' lengths from the wrist", finding.measured
+    )
 
 
 def test_gains_that_shake_are_found_and_named():
-    loose = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0), only="left_middle")
+    loose = with_joints(
+        CLAW,
+        lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0),
+        only="left_middle",
+    )
     found = check._servos(loose, trials.responses(loose, recipe(loose).task, 2))
-    assert [finding.verdict for finding in found] == ["failed"] and "'left_middle'" in found[0].measured
+    assert [finding.verdict for finding in found] == ["failed"] and "'left_middle'" in found[
+        0
+    ].measured
     assert "raise kv" in found[0].remedy
     soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
     found = check._servos(soft, trials.responses(soft, recipe(soft).task, 2))
@@ -124,19 +158,32 @@ def test_torques_that_are_too_weak_are_found_and_hold_nothing():
     weak = with_joints(CLAW, lambda j: dataclasses.replace(j, torque_limit=0.01 * j.torque_limit))
     lines, _ = verdicts(weak)
     assert lines["strength"].verdict == "failed" and "torque_limit" in lines["strength"].remedy
-    assert lines["cylinder"].verdict == "failed" and "repair the failures above first" in lines["cylinder"].remedy
-    assert {lines[name].verdict for name in ("palm", "joints", "opening", "open", "closed")} == {"passed"}
+    assert (
+        lines["cylinder"].verdict == "failed"
+        and "repair the failures above first" in lines["cylinder"].remedy
+    )
+    assert {lines[name].verdict for name in ("palm", "joints", "opening", "open", "closed")} == {
+        "passed"
+    }
 
 
 def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     finding = check._opening(dataclasses.replace(CLAW, object_scale=3.0))
     assert finding.verdict == "failed" and re.match(r"object_scale 1\.\d \(import", finding.remedy)
     wide = dataclasses.replace(CLAW, open_pose={}, closed_pose={})  # never closes
-    assert check._joints(wide)[0].verdict == "failed" and "closed_pose" in check._joints(wide)[0].remedy
+    assert (
+        check._joints(wide)[0].verdict == "failed"
+        and "closed_pose" in check._joints(wide)[0].remedy
+    )
     by = np.array([0.0, 0.05, 0.0])
-    links = tuple(shifted(link, by) if link.name.startswith("right") else link for link in CLAW.links)
+    links = tuple(
+        shifted(link, by) if link.name.startswith("right") else link for link in CLAW.links
+    )
     crossed = dataclasses.replace(CLAW, links=links)
-    assert check._open_overlap(crossed).verdict == "failed" and "left_lower" in check._open_overlap(crossed).measured
+    assert (
+        check._open_overlap(crossed).verdict == "failed"
+        and "left_lower" in check._open_overlap(crossed).measured
+    )
 
 
 def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
@@ -148,9 +195,14 @@ def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(made.findings) + 1 and lines[0].startswith("passed  palm")
     assert (tmp_path / "claw.png").stat().st_size > 20_000
-    failed = made._replace(findings=[made.findings[0]._replace(verdict="failed", remedy="another palm")])
+    failed = made._replace(
+        findings=[made.findings[0]._replace(verdict="failed", remedy="another palm")]
+    )
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: failed)
-    monkeypatch.setattr(hand_sheets, "check_sheet", lambda hand, grips: np.zeros((4, 4, 3), np.uint8))  # drawn above
+    # Drawn above
+    monkeypatch.setattr(
+        hand_sheets, "check_sheet", lambda hand, grips: np.zeros((4, 4, 3), np.uint8)
+    )
     assert main.run(["hands", "check", str(file), "--png", str(tmp_path / "claw.png")]) == 1
     assert "-> another palm" in capsys.readouterr().out
     with pytest.raises(CongraspError, match="no hand 'paw'"):

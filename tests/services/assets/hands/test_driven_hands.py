@@ -1,4 +1,6 @@
-"""Files with fewer motors than joints, on arms and in scenes, left and right, of hands of our own making."""
+"""Files with fewer motors than joints, on arms and in scenes, left and right, of hands of our own
+making.
+"""
 
 import pathlib
 
@@ -46,7 +48,12 @@ def _mirrored(path, out):
 def test_one_motor_moves_a_gripper_of_two_fingers():
     proposal = propose(HANDS / "pincher.urdf")
     hand = proposal.hand
-    assert (len(hand.joints), len(hand.motors), len(hand.tip_links), proposal.palm) == (4, 1, 2, "housing")
+    assert (len(hand.joints), len(hand.motors), len(hand.tip_links), proposal.palm) == (
+        4,
+        1,
+        2,
+        "housing",
+    )
     follow = {x.joint: (x.leader, x.ratio, x.offset) for x in hand.couplings}
     assert follow == {  # that of the last joint through the one that it mimics
         "left_parallel": ("left", -1.0, 0.0),
@@ -75,12 +82,20 @@ def test_tendons_and_curves_become_couplings_and_motors(driven):
     hand = driven.hand
     assert (len(hand.joints), len(hand.motors)) == (16, 13)
     (tendon,) = hand.tendons
-    assert tendon.joints == {"index_middle_joint": 1.0, "index_end_joint": 0.8}  # apart from links of those names
+    # Apart from links of those names
+    assert tendon.joints == {
+        "index_middle_joint": 1.0,
+        "index_end_joint": 0.8,
+    }
     # 30,000 N/m and 60 N at a radius of 0.01 m.
     assert (tendon.kp, tendon.torque_limit) == pytest.approx((3.0, 0.6))
     follow = {x.joint: x for x in hand.couplings}
     ring, middle = follow["ring_end_joint"], follow["middle_end_joint"]
-    assert (ring.leader, ring.ratio, ring.offset) == ("ring_middle_joint", pytest.approx(5 / 7, abs=1e-5), 0.0)
+    assert (ring.leader, ring.ratio, ring.offset) == (
+        "ring_middle_joint",
+        pytest.approx(5 / 7, abs=1e-5),
+        0.0,
+    )
     x = np.linspace(0.0, 1.57, 200)
     assert np.abs(middle.offset + middle.ratio * x - (0.5 * x + 0.1 * x**2)).max() < 0.05
     assert any("'middle_end' follows a curve" in note for note in driven.notes)
@@ -91,8 +106,11 @@ def test_the_thumb_of_the_open_hand_is_turned_against_the_fingers(driven):
     hand = driven.hand
     assert hand.open_pose["side_turn"] > 1.2
     frame = grasp_frame(hand)
-    assert frame.heading[0] > 0.9 and frame.cross[2] > 0.9  # objects lie on the side +x, between fingers and thumb
-    closing = [name for name in hand.closed_pose if name.endswith(("root", "middle", "side_end_joint"))]
+    # Objects lie on the side +x, between fingers and thumb
+    assert frame.heading[0] > 0.9 and frame.cross[2] > 0.9
+    closing = [
+        name for name in hand.closed_pose if name.endswith(("root", "middle", "side_end_joint"))
+    ]
     assert all(hand.closed_pose[name] > hand.open_pose.get(name, 0.0) for name in closing)
 
 
@@ -115,10 +133,14 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     found = load_meshes(path, driven.hand)
     assert found.keys() == {link.name for link in driven.hand.links}
     vertices, faces = found["palm"]  # the box of the file, in the palm's frame
-    np.testing.assert_allclose([vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]])
+    np.testing.assert_allclose(
+        [vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]]
+    )
     assert len(faces) == 12
     skin = skin_of_meshes(driven.hand, {"palm": found["palm"]})  # of the other links their capsules
-    assert np.abs(skin.points[:8] - vertices).max() == 0 and len(skin.weights.T) == len(driven.hand.links)
+    assert np.abs(skin.points[:8] - vertices).max() == 0 and len(skin.weights.T) == len(
+        driven.hand.links
+    )
     drawn, own = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
     assert np.abs(drawn.astype(int) - own).max() > 30
     assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
@@ -141,7 +163,9 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
 
 
 def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
-    """Every geom of the file that collides is in the hand's model, where it is in the file, and the masses stay."""
+    """Every geom of the file that collides is in the hand's model, where it is in the file, and the
+    masses stay.
+    """
     hand = propose(HANDS / "driven.xml", Choices(own_collision=True)).hand
     assert hand_from_text(hand_text(hand)) is hand and all(link.solids for link in hand.links)
     theirs = mujoco.MjModel.from_xml_path(str(HANDS / "driven.xml"))
@@ -154,7 +178,11 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         root, turn = data.body(palm).xpos, data.body(palm).xmat.reshape(3, 3)
-        geoms = [g for g in range(model.ngeom) if bodies(g) and model.geom_contype[g] | model.geom_conaffinity[g]]
+        geoms = [
+            g
+            for g in range(model.ngeom)
+            if bodies(g) and model.geom_contype[g] | model.geom_conaffinity[g]
+        ]
         rows = [(*model.geom_size[g], *((data.geom_xpos[g] - root) @ turn)) for g in geoms]
         return np.array(sorted(rows)), sorted(model.geom_type[geoms].tolist())
 
@@ -186,7 +214,9 @@ def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
 def test_a_fine_mesh_is_simplified(tmp_path):
     trimesh.creation.icosphere(5, 0.009).export(tmp_path / "pad.stl")
     text = (
-        (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
+        (HANDS / "claw.urdf")
+        .read_text()
+        .replace('<sphere radius="0.009"/>', '<mesh filename="package://x/pad.stl"/>')
     )
     (tmp_path / "claw.urdf").write_text(text)
     proposal = propose(tmp_path / "claw.urdf")
@@ -200,14 +230,20 @@ def test_a_fine_mesh_is_simplified(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["stl", "obj"])
 def test_a_mesh_of_many_triangles_keeps_its_shape(suffix, tmp_path):
-    """81,920 triangles, which are merged at their corners, also where a texture is cut, and reduced for MuJoCo."""
+    """81,920 triangles, which are merged at their corners, also where a texture is cut, and reduced
+    for MuJoCo.
+    """
     ball = trimesh.creation.icosphere(6, 0.009)
     if suffix == "obj":
         ball.unmerge_vertices()
         cut = np.random.default_rng(0).random((len(ball.vertices), 2))
         ball.visual = trimesh.visual.TextureVisuals(uv=cut)
     ball.export(tmp_path / f"pad.{suffix}")
-    text = (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', f'<mesh filename="pad.{suffix}"/>')
+    text = (
+        (HANDS / "claw.urdf")
+        .read_text()
+        .replace('<sphere radius="0.009"/>', f'<mesh filename="pad.{suffix}"/>')
+    )
     (tmp_path / "claw.urdf").write_text(text)
     drawn = trimesh.Trimesh(*propose(tmp_path / "claw.urdf").meshes["left_upper"])
     pad = max(drawn.split(only_watertight=False), key=lambda body: len(body.faces))

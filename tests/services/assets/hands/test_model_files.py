@@ -40,7 +40,11 @@ def test_a_urdf_is_understood(claw):
     hand = claw.hand
     assert [link.name for link in hand.links] == [
         "palm",
-        *(f"{finger}_{part}" for finger in ("left", "right", "opposing") for part in ("lower", "upper")),
+        *(
+            f"{finger}_{part}"
+            for finger in ("left", "right", "opposing")
+            for part in ("lower", "upper")
+        ),
     ]
     joints = {joint.name: joint for joint in hand.joints}
     assert len(joints) == 6
@@ -71,11 +75,14 @@ def test_thumb_tips_poses_and_frame_are_proposed(claw):
 def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
     other = propose(HANDS / "claw.xml", Choices(name="claw")).hand
     hand = claw.hand
-    assert [link.name for link in other.links] == [link.name for link in hand.links]  # the wrist joint is left out
+    # The wrist joint is left out
+    assert [link.name for link in other.links] == [link.name for link in hand.links]
     for a, b in zip(hand.joints, other.joints, strict=True):
         assert a.name == b.name
         np.testing.assert_allclose(
-            [*a.anchor, *a.axis, a.lower, a.upper], [*b.anchor, *b.axis, b.lower, b.upper], atol=1e-9
+            [*a.anchor, *a.axis, a.lower, a.upper],
+            [*b.anchor, *b.axis, b.lower, b.upper],
+            atol=1e-9,
         )
         assert (b.kp, b.torque_limit) == (5.0, 1.2)  # of its motors
     np.testing.assert_allclose(hand.q_closed, other.q_closed)
@@ -98,7 +105,8 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
             [*b.anchor, *b.axis, b.lower, b.upper, b.kp, b.torque_limit],
             atol=1e-4,
         )
-    # What is proposed is near to what was chosen by hand: the frame, and the thumb turned against the fingers.
+    # What is proposed is near to what was chosen by hand: the frame, and the thumb turned against
+    # the fingers.
     ours, theirs = grasp_frame(original), grasp_frame(found)
     assert np.degrees(np.arccos(ours.heading @ theirs.heading)) < 20
     assert np.degrees(np.arccos(ours.cross @ theirs.cross)) < 20
@@ -109,7 +117,9 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
     said = capsys.readouterr().out
     assert "6 joints, 6 motors, 7 links" in said and "congrasp train --hand gripper" in said
-    assert (tmp_path / "own" / "gripper.json").exists() and (tmp_path / "own" / "gripper.png").stat().st_size > 10_000
+    assert (tmp_path / "own" / "gripper.json").exists() and (
+        tmp_path / "own" / "gripper.png"
+    ).stat().st_size > 10_000
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
@@ -126,12 +136,16 @@ def test_a_zero_axis_of_inertia_gets_the_least_and_keeps_the_others(tmp_path):
     notes = []
     _, model = compile.robot_spec(tmp_path / "hand.urdf", notes)
     np.testing.assert_allclose(model.body("palm").inertia, [3e-5, 2e-5, 1.01e-5])
-    assert notes == ["links with inertia about two axes get the least possible about the third: palm"]
+    assert notes == [
+        "links with inertia about two axes get the least possible about the third: palm"
+    ]
 
 
 def test_an_obj_of_points_is_a_hull(tmp_path):
     text = (PINCH / "pinch.urdf").read_text()
-    (tmp_path / "hand.urdf").write_text(text.replace('<box size="0.06 0.1 0.03"/>', '<mesh filename="points.obj"/>'))
+    (tmp_path / "hand.urdf").write_text(
+        text.replace('<box size="0.06 0.1 0.03"/>', '<mesh filename="points.obj"/>')
+    )
     corners = itertools.product((-0.03, 0.03), (-0.05, 0.05), (0.0, 0.03))
     (tmp_path / "points.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners))
     notes = []
@@ -140,18 +154,27 @@ def test_an_obj_of_points_is_a_hull(tmp_path):
 
 
 def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
-    """1,000 tetrahedra around a ball, which cannot be reduced to the triangles that a link may have."""
+    """1,000 tetrahedra around a ball, which cannot be reduced to the triangles that a link may
+    have.
+    """
     turn, height = np.arange(1000) * np.pi * (3 - np.sqrt(5)), np.linspace(-1, 1, 1000)
     axes = np.sqrt(1 - height**2) * [np.cos(turn), np.sin(turn)]
     corners = (
-        0.0005 * np.random.default_rng(0).normal(size=(1000, 4, 3)) + 0.03 * np.column_stack([*axes, height])[:, None]
+        0.0005 * np.random.default_rng(0).normal(size=(1000, 4, 3))
+        + 0.03 * np.column_stack([*axes, height])[:, None]
     )
-    faces = np.arange(4000).reshape(-1, 1, 4)[..., [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]].reshape(-1, 3)
+    faces = (
+        np.arange(4000)
+        .reshape(-1, 1, 4)[..., [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]]
+        .reshape(-1, 3)
+    )
     trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(tmp_path / "ball.obj")
     box = '<geom type="box" size=".03 .05 .015" pos="0 0 .015"/>'
     text = (pathlib.Path(__file__).parents[3] / "cases/_hand/pinch.xml").read_text()
     assert box in text and "<asset/>" in text
-    text = text.replace("<asset/>", '<asset><mesh name="ball" file="ball.obj" inertia="shell"/></asset>')
+    text = text.replace(
+        "<asset/>", '<asset><mesh name="ball" file="ball.obj" inertia="shell"/></asset>'
+    )
     (tmp_path / "hand.xml").write_text(text.replace(box, '<geom type="mesh" mesh="ball"/>'))
     vertices, drawn = propose(tmp_path / "hand.xml").meshes["palm"]
     assert 1000 < len(drawn) <= MAX_FACES
@@ -180,17 +203,23 @@ def _drive(actuators: str) -> Drive:
 
 
 def test_a_motor_of_a_tendon_through_space_has_the_tendons_mean_levers():
-    """The sites of the far joint are (.012, .03) and (.006 cos q + .02 sin q, .06 + .02 cos q - .006 sin q)."""
+    """The sites of the far joint are (.012, .03) and (.006 cos q + .02 sin q, .06 + .02 cos q -
+    .006 sin q).
+    """
     model = mujoco.MjModel.from_xml_string(_FINGER.format(""))
     (servo,) = servos(model, notes := [])
     assert set(servo.joints) == {0, 1} and servo.kp == 20000 and servo.reach is None
     lengths = [
-        np.hypot(0.006 * np.cos(q) + 0.02 * np.sin(q) - 0.012, 0.03 + 0.02 * np.cos(q) - 0.006 * np.sin(q))
+        np.hypot(
+            0.006 * np.cos(q) + 0.02 * np.sin(q) - 0.012,
+            0.03 + 0.02 * np.cos(q) - 0.006 * np.sin(q),
+        )
         for q in (0.0, 0.8)
     ]
     assert servo.joints[1] == pytest.approx((lengths[1] - lengths[0]) / 0.8, rel=1e-6)
     below, above, radius = np.hypot(0.012, 0.05), np.hypot(0.012, 0.03), 0.01
-    between = np.arctan2(0.05, 0.012) + np.arctan2(0.03, 0.012)  # rad around the axis at 0, on the tendon's side
+    # Rad around the axis at 0, on the tendon's side
+    between = np.arctan2(0.05, 0.012) + np.arctan2(0.03, 0.012)
     straight = np.sqrt(below**2 + above**2 - 2 * below * above * np.cos(between - 0.4))
     around = between + 0.4 - np.arccos(radius / below) - np.arccos(radius / above)
     wrapped = np.sqrt(below**2 - radius**2) + np.sqrt(above**2 - radius**2) + radius * around
@@ -199,10 +228,14 @@ def test_a_motor_of_a_tendon_through_space_has_the_tendons_mean_levers():
 
 
 def test_a_joint_hangs_on_the_tendon_that_pulls_it_most():
-    """Of a flexor of two joints and an extensor of one, the one that pulls a joint alone keeps it."""
+    """Of a flexor of two joints and an extensor of one, the one that pulls a joint alone keeps
+    it.
+    """
     drive = _drive('<position name="push" tendon="extensor" kp="10000"/>')
     assert drive.tendons() == ()
     both = _drive('<position name="again" tendon="flexor" kp="10000"/>')
     (tendon,) = both.tendons()
     assert set(tendon.joints) == {"root", "end"}
-    assert any("1 motors that only pull joints of others are dropped" in note for note in both.remarks())
+    assert any(
+        "1 motors that only pull joints of others are dropped" in note for note in both.remarks()
+    )

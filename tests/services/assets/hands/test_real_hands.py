@@ -1,6 +1,7 @@
 """Real hands, as packages on the index ship them, against what is known of them.
 
-None of their files is here. They are found in installed packages, or below the folder that CONGRASP_TEST_HANDS names:
+None of their files is here. They are found in installed packages, or below the folder that
+CONGRASP_TEST_HANDS names:
 
     pip download --no-deps -d wheels gymnasium-robotics myosuite==2.8.0 mani_skill robosuite \
         dm_control playground genesis-world example-robot-data
@@ -24,9 +25,9 @@ from congrasp.services.assets.hands.model_files import Proposal, propose
 
 VARIABLE = "CONGRASP_TEST_HANDS"
 HANDS = json.loads((pathlib.Path(__file__).parents[3] / "hands" / "real.json").read_text())
-"""What is known of each hand: `file`, `palm`, numbers of `joints`, `motors` and `fingers`, a word in the names of the
-`thumb`'s links (empty where any finger may be it), the sign in which joints close (`flexes`), and the `opening` between
-thumb and fingers of the open hand, m."""
+"""What is known of each hand: `file`, `palm`, numbers of `joints`, `motors` and `fingers`, a word
+in the names of the `thumb`'s links (empty where any finger may be it), the sign in which joints
+close (`flexes`), and the `opening` between thumb and fingers of the open hand, m."""
 
 
 def _find(file: str) -> pathlib.Path:
@@ -60,11 +61,16 @@ def test_a_real_hand_is_understood_without_an_option(name):
     found = (proposal.palm, len(hand.joints), len(hand.motors), len(hand.tip_links))
     assert found == tuple(known[fact] for fact in ("palm", "joints", "motors", "fingers"))
     assert any(re.search(known["thumb"], link) for link in chain_of(hand, hand.thumb))
-    closed = dict(zip((joint.name for joint in hand.joints), hand.q_closed - hand.q_open, strict=True))
+    closed = dict(
+        zip((joint.name for joint in hand.joints), hand.q_closed - hand.q_open, strict=True)
+    )
     assert {joint: np.sign(closed[joint]) for joint in known["flexes"]} == known["flexes"]
     assert known["opening"][0] < grasp_frame(hand).opening < known["opening"][1]
     # Closing brings thumb and fingers together, to less than half of the opening.
-    gaps = [float(np.linalg.norm(tips[1:].mean(0) - tips[0])) for tips in (_tips(hand, q) for q in _ways(hand))]
+    gaps = [
+        float(np.linalg.norm(tips[1:].mean(0) - tips[0]))
+        for tips in (_tips(hand, q) for q in _ways(hand))
+    ]
     assert min(gaps) < 0.5 * gaps[0]
     # The hand centre is ahead of the palm, on the side to which the heading points.
     frame = grasp_frame(hand)
@@ -73,7 +79,9 @@ def test_a_real_hand_is_understood_without_an_option(name):
 
 def _ways(hand):
     """Poses from the open hand to the closed one."""
-    return [hand.q_open + share * (hand.q_closed - hand.q_open) for share in np.linspace(0.0, 1.0, 9)]
+    return [
+        hand.q_open + share * (hand.q_closed - hand.q_open) for share in np.linspace(0.0, 1.0, 9)
+    ]
 
 
 def test_shadows_last_joints_follow_by_its_tendons_and_its_thumb_is_turned():
@@ -87,7 +95,10 @@ def test_shadows_last_joints_follow_by_its_tendons_and_its_thumb_is_turned():
 
 
 def test_a_left_hand_is_the_mirror_image_of_the_right():
-    left, right = (_imported(HANDS["ability"]["file"].replace("right", side)).hand for side in ("left", "right"))
+    left, right = (
+        _imported(HANDS["ability"]["file"].replace("right", side)).hand
+        for side in ("left", "right")
+    )
     assert [joint.name for joint in left.joints] == [joint.name for joint in right.joints]
     np.testing.assert_allclose(left.q_open, right.q_open, atol=0.15)
     assert grasp_frame(left).opening == pytest.approx(grasp_frame(right).opening, abs=0.005)

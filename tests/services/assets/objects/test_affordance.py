@@ -1,4 +1,6 @@
-"""Partitions from part meshes, painted vertices, half-spaces and cuts that a hand can hold; and what is refused."""
+"""Partitions from part meshes, painted vertices, half-spaces and cuts that a hand can hold; and
+what is refused.
+"""
 
 import dataclasses
 
@@ -10,7 +12,12 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import affordance
-from congrasp.services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
+from congrasp.services.assets.objects.affordance import (
+    in_half_space,
+    on_part_mesh,
+    painted,
+    two_parts,
+)
 from congrasp.services.assets.objects.meshes import UNLABELLED
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
@@ -27,22 +34,29 @@ def folder(tmp_path_factory):
     mesh = trimesh.creation.box(EDGES * 1000).apply_translation(SHIFT * 1000)
     mesh = mesh.subdivide().subdivide().subdivide()
     mesh.export(folder / "box.stl")
-    low = trimesh.creation.box(EDGES * [1000, 1000, 500]).apply_translation(SHIFT * 1000 - [0, 0, 30])
+    low = trimesh.creation.box(EDGES * [1000, 1000, 500]).apply_translation(
+        SHIFT * 1000 - [0, 0, 30]
+    )
     low.export(folder / "low.stl")
     colours = np.where((mesh.vertices[:, 2] < 60)[:, None], [0, 255, 0, 255], [255, 0, 0, 255])
-    trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False).export(folder / "painted.ply")
+    trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False).export(
+        folder / "painted.ply"
+    )
     return folder
 
 
 @pytest.fixture(scope="module")
 def box(folder):
     with quick_imports():
-        return objects_of(folder / "box.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
+        return objects_of(
+            folder / "box.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache"))
+        )[0]
 
 
 def test_each_source_finds_the_lower_half(box, folder):
     below = box.points[:, 2] < 0
-    near = np.abs(box.points[:, 2]) < 0.009  # a border lies between two vertices, or on the part's own lid
+    # A border lies between two vertices, or on the part's own lid
+    near = np.abs(box.points[:, 2]) < 0.009
     for plus in (
         in_half_space(box, (0, 0, -2), 0.0),
         on_part_mesh(box, folder / "low.stl"),
@@ -61,7 +75,9 @@ def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
     patch = mesh.submesh([mesh.triangles_center[:, 0] > mesh.bounds[1, 0] - 1e-3], append=True)
     if kind == "flat":
         (_, y, z), (x, y1, z1) = patch.bounds
-        patch = trimesh.Trimesh([(x, y, z), (x, y1, z), (x, y1, z1), (x, y, z1)], [[0, 1, 2], [0, 2, 3]])
+        patch = trimesh.Trimesh(
+            [(x, y, z), (x, y1, z), (x, y1, z1), (x, y, z1)], [[0, 1, 2], [0, 2, 3]]
+        )
     if kind == "points":
         patch = trimesh.PointCloud(trimesh.sample.sample_surface(patch, 3000, seed=0)[0])
     patch.export(tmp_path / "part.ply")
@@ -73,7 +89,8 @@ def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
 def test_a_part_whose_triangles_lack_vertices_is_refused(box, tmp_path):
     points = "".join(f"property float {axis}\n" for axis in "xyz")
     header = (
-        f"ply\nformat ascii 1.0\nelement vertex 3\n{points}element face 1\nproperty list uchar int vertex_indices\n"
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{points}element face 1\nproperty list uchar int "
+        f"vertex_indices\n"
     )
     (tmp_path / "part.ply").write_text(f"{header}end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n")
     with pytest.raises(CongraspError, match=r"part\.ply has triangles without vertices"):
@@ -85,7 +102,12 @@ def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
     catalogue.add(box)
     run = ["affordance", "box", "--folder", str(tmp_path)]
     assert load("objects")([*run, "--painted", str(folder / "painted.ply"), "--name", "low"])() == 0
-    assert load("objects")([*run, "--half-space", "0", "0", "1", "0", "--invert", "--name", "also-low"])() == 0
+    assert (
+        load("objects")(
+            [*run, "--half-space", "0", "0", "1", "0", "--invert", "--name", "also-low"]
+        )()
+        == 0
+    )
     assert "may be grasped" in capsys.readouterr().out
     for name in ("low", "also-low"):
         obj = catalogue.get(name)
@@ -98,7 +120,9 @@ def imported(tmp_path, quick_import):
 
     def run(mesh):
         mesh.export(tmp_path / "thing.stl")
-        (obj,) = objects_of(tmp_path / "thing.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
+        (obj,) = objects_of(
+            tmp_path / "thing.stl", ImportOptions(cache_dir=str(tmp_path / "cache"))
+        )
         return affordance.cut_to_hold(obj)
 
     return run
@@ -111,12 +135,16 @@ def test_halves_that_can_be_held_stay(imported):
 
 
 def test_halves_that_cannot_be_held_are_cut_elsewhere(imported):
-    """A can of 4 x 4 cm: of neither half fingers keep a centimetre off the other, as they are that thick."""
+    """A can of 4 x 4 cm: of neither half fingers keep a centimetre off the other, as they are that
+    thick.
+    """
     obj = imported(trimesh.creation.cylinder(0.02, 0.04))
     assert affordance.covered(obj).any()
     halved = obj.points[:, 2] > 0
     for half in (halved, ~halved):
-        plain = dataclasses.replace(obj, labels=np.where(half, 0, 1), graspable=np.array([True, False]))
+        plain = dataclasses.replace(
+            obj, labels=np.where(half, 0, 1), graspable=np.array([True, False])
+        )
         assert affordance.covered(plain).sum() < affordance.covered(obj).sum()
     # The pieces follow the labels.
     assert {piece.part for piece in obj.pieces} <= {0, 1}
@@ -126,7 +154,11 @@ def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
     free = affordance.covered
 
     def never(obj, *, use_affordance=True):
-        return np.zeros(len(obj.rest_poses), bool) if use_affordance else free(obj, use_affordance=False)
+        return (
+            np.zeros(len(obj.rest_poses), bool)
+            if use_affordance
+            else free(obj, use_affordance=False)
+        )
 
     monkeypatch.setattr(affordance, "covered", never)
     obj = generate(3, "cylinder")
@@ -136,7 +168,9 @@ def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
 
 
 @pytest.mark.parametrize("family", ["ball", "prism", "box", "lathed"])
-@pytest.mark.parametrize("seed", [1_000_000, *(pytest.param(1_000_000 + i, marks=pytest.mark.slow) for i in (1, 2))])
+@pytest.mark.parametrize(
+    "seed", [1_000_000, *(pytest.param(1_000_000 + i, marks=pytest.mark.slow) for i in (1, 2))]
+)
 def test_a_cut_covers_no_fewer_resting_poses(family, seed):
     obj = generate(seed, family)
     cut = affordance.cut_to_hold(obj)

@@ -21,7 +21,23 @@ parse = load("objects")
 
 def test_generate_list_and_show(tmp_path, capsys):
     folder = str(tmp_path / "things")
-    assert parse(["generate", "--out", folder, "--count", "4", "--seed", "3", "--families", "mug", "knife"])() == 0
+    assert (
+        parse(
+            [
+                "generate",
+                "--out",
+                folder,
+                "--count",
+                "4",
+                "--seed",
+                "3",
+                "--families",
+                "mug",
+                "knife",
+            ]
+        )()
+        == 0
+    )
     assert Catalogue(folder).list() == ["knife_3", "knife_5", "mug_4", "mug_6"]
     assert parse(["list", folder])() == 0
     output = capsys.readouterr().out
@@ -50,14 +66,20 @@ def test_generate_list_and_show(tmp_path, capsys):
 def test_resting_poses_are_listed_and_drawn(tmp_path, capsys):
     poses = find_object("mug:7").rest_poses
     assert parse(["rests", "mug:7", "--png", str(tmp_path / "rests.png")])() == 0
-    rows = [line.strip("│ ").split("│") for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    rows = [
+        line.strip("│ ").split("│")
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("│")
+    ]
     assert [int(row[0]) for row in rows] == list(range(1, len(poses) + 1))
     assert float(rows[0][1]) == pytest.approx(100 * poses[0][2], abs=0.05)
     assert {0, 180} < {int(row[2]) for row in rows}  # it stands on its bottom, and on its rim
     assert Image.open(tmp_path / "rests.png").width == len(poses) * (240 + 10) + 10
 
 
-def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys, quick_import):
+def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(
+    tmp_path, capsys, quick_import
+):
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
     trimesh.creation.box((40, 50, 60)).export(tmp_path / "big.stl")
     (tmp_path / "text.ply").write_text("no mesh")
@@ -76,7 +98,9 @@ def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, 
     assert Catalogue(tmp_path / "out").get("good").mass == 0.25
 
 
-def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, capsys, quick_import):
+def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(
+    tmp_path, capsys, quick_import
+):
     things = tmp_path / "things"
     (things / "folder.stl").mkdir(parents=True)
     os.mkfifo(things / "pipe.obj")
@@ -86,12 +110,32 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
     (things / "x.ply").write_text(text.replace("float x", "float X"))
     (things / "list.ply").write_text(text.replace("list uchar int vertex_indices", "int corners"))
     (things / "zip.obj").write_text("PK\3\4 box.obj\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert parse(["import", str(things), "--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")])() == 2
+    assert (
+        parse(
+            [
+                "import",
+                str(things),
+                "--out",
+                str(tmp_path / "out"),
+                "--cache-dir",
+                str(tmp_path / "cache"),
+            ]
+        )()
+        == 2
+    )
     captured = capsys.readouterr()
     assert "1 of 7 imported" in captured.out and len(errors(captured.err)) == 6
     for words in (
-        *("folder.stl is not a regular", "pipe.obj is not a regular", "gone.obj cannot be read: No such file"),
-        *("x.ply .* lack x, y or z", "list.ply .* lack vertex_indices", "zip.obj is a zip archive that is damaged"),
+        *(
+            "folder.stl is not a regular",
+            "pipe.obj is not a regular",
+            "gone.obj cannot be read: No such file",
+        ),
+        *(
+            "x.ply .* lack x, y or z",
+            "list.ply .* lack vertex_indices",
+            "zip.obj is a zip archive that is damaged",
+        ),
     ):
         assert re.search(words, captured.err)
     with pytest.raises(CongraspError, match=r"no file .*gone\.obj\. Did you mean .*pipe\.obj"):
@@ -110,7 +154,19 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
 def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsys, material, fault):
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "a.stl")
     monkeypatch.setattr(decompose, "convex_pieces", None)
-    assert parse(["import", str(tmp_path / "a.stl"), "--material", material, "--cache-dir", str(tmp_path)])() == 2
+    assert (
+        parse(
+            [
+                "import",
+                str(tmp_path / "a.stl"),
+                "--material",
+                material,
+                "--cache-dir",
+                str(tmp_path),
+            ]
+        )()
+        == 2
+    )
     assert re.search(fault, capsys.readouterr().err)
 
 

@@ -29,7 +29,9 @@ SIDE = 0.1
 def cube() -> trimesh.Trimesh:
     """From the origin to (0.1, 0.1, 0.1) m, with corners of its own for each face."""
     box = trimesh.creation.box((SIDE, SIDE, SIDE)).apply_translation(np.full(3, SIDE / 2))
-    return trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+    return trimesh.Trimesh(
+        box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
+    )
 
 
 def textured(path: pathlib.Path) -> pathlib.Path:
@@ -80,23 +82,31 @@ def test_files_without_colours_have_none(tmp_path):
         assert sample_colours([tmp_path / f"cube.{suffix}"], seed=0) is None
 
 
-def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(tmp_path, quick_import):
+def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
+    tmp_path, quick_import
+):
     (source,) = find_sources(textured(tmp_path / "cube.glb"))
     obj = import_source(source, ImportOptions(scale=0.5, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is not None
     x = obj.colours.points[:, 0]
     assert x.min() == pytest.approx(-0.025, abs=1e-3) and x.max() == pytest.approx(0.025, abs=1e-3)
-    assert (obj.colours.values[x < -0.005] == RED).all() and (obj.colours.values[x > 0.005] == BLUE).all()
+    assert (obj.colours.values[x < -0.005] == RED).all() and (
+        obj.colours.values[x > 0.005] == BLUE
+    ).all()
     assert np.ptp(obj.scaled(2.0).colours.points) == pytest.approx(2 * np.ptp(obj.colours.points))
     store.save(obj, tmp_path / "cube.safetensors")
-    for ours, theirs in zip(obj.colours, store.load(tmp_path / "cube.safetensors").colours, strict=True):
+    for ours, theirs in zip(
+        obj.colours, store.load(tmp_path / "cube.safetensors").colours, strict=True
+    ):
         np.testing.assert_array_equal(ours, theirs)
 
     shown = episode()
     shown.arrays.update(_geometry(obj))
     picture = render_scene(
         [_object(shown, 0, painted=False)],
-        Camera(shown.arrays["object_position"][0] + [0, -0.5, 0.0], shown.arrays["object_position"][0]),
+        Camera(
+            shown.arrays["object_position"][0] + [0, -0.5, 0.0], shown.arrays["object_position"][0]
+        ),
         (60, 60),
     )
     left, right = picture[30, 25].astype(int), picture[30, 35].astype(int)
@@ -111,14 +121,20 @@ def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):
     assert sample_colours([tmp_path / "cube.glb"], seed=0) is None
 
 
-def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(tmp_path, quick_import):
+def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(
+    tmp_path, quick_import
+):
     box = cube()
-    box.visual = trimesh.visual.TextureVisuals(uv=np.full((36, 2), np.nan), image=Image.new("RGB", (4, 4), RED))
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.full((36, 2), np.nan), image=Image.new("RGB", (4, 4), RED)
+    )
     box.export(tmp_path / "cube.obj")
     (source,) = find_sources(tmp_path / "cube.obj")
     obj = import_source(source, ImportOptions(scale=1.0, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is None
-    assert any(re.fullmatch("its colours are left out: .*[^.]", note) for note in obj.notes), obj.notes
+    assert any(re.fullmatch("its colours are left out: .*[^.]", note) for note in obj.notes), (
+        obj.notes
+    )
 
 
 def test_an_object_file_with_half_of_its_colours_is_refused(tmp_path, quick_import):

@@ -1,4 +1,6 @@
-"""Import of meshes: known solids, every kind of source, and one line for every kind of bad input."""
+"""Import of meshes: known solids, every kind of source, and one line for every kind of bad
+input.
+"""
 
 import base64
 import dataclasses
@@ -36,7 +38,11 @@ def options(tmp_path):
 def test_mass_properties_of_a_block(tmp_path, options, quick_import, suffix):
     block(SIDES, (0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
     (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
-    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == ("block", "imported", ["mesh"])
+    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == (
+        "block",
+        "imported",
+        ["mesh"],
+    )
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
     np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
@@ -141,11 +147,14 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
     assert 2 <= len(obj.pieces) <= 3
     assert obj.surface_error < 3e-3
     assert abs(obj.volume_error) < 0.05
-    np.testing.assert_allclose(sum(shapes.volume(piece) for piece in obj.pieces), mesh.volume, rtol=0.02)
-    # The middle of the hull's longest side is 3 cm from either leg; the hull fills 36 cm^3 beside the 56 of the mesh,
-    # less what thinning takes: 2 * 3 mm of 20.
+    np.testing.assert_allclose(
+        sum(shapes.volume(piece) for piece in obj.pieces), mesh.volume, rtol=0.02
+    )
+    # The middle of the hull's longest side is 3 cm from either leg; the hull fills 36 cm^3 beside
+    # the 56 of the mesh, less what thinning takes: 2 * 3 mm of 20.
     said = re.search(
-        r"cut from its mesh, for its own 1 are coarser: .*most ([0-9.]+) mm off .* ([0-9.]+)% too large", obj.notes[-1]
+        r"cut from its mesh, for its own 1 are coarser: .*most ([0-9.]+) mm off .* ([0-9.]+)% too large",
+        obj.notes[-1],
     )
     assert abs(float(said[1]) - 30) < 0.3
     assert abs(float(said[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
@@ -154,16 +163,28 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
     monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
     monkeypatch.setattr(decompose, "decompose", lambda *_, **__: pytest.fail("cut"))
-    (obj,) = objects_of(folder_of(tmp_path / "block", block(SIDES), block(SIDES - [0, 0, 0.0024])), options)
-    np.testing.assert_allclose(np.sort(np.ptp(obj.pieces[0].vertices, axis=0)), [0.04, 0.06, 0.0776], rtol=1e-5)
-    assert obj.notes[-1].startswith("its own 1 convex piece stands for it: their surface is at most 1.2 mm off")
+    (obj,) = objects_of(
+        folder_of(tmp_path / "block", block(SIDES), block(SIDES - [0, 0, 0.0024])), options
+    )
+    np.testing.assert_allclose(
+        np.sort(np.ptp(obj.pieces[0].vertices, axis=0)), [0.04, 0.06, 0.0776], rtol=1e-5
+    )
+    assert obj.notes[-1].startswith(
+        "its own 1 convex piece stands for it: their surface is at most 1.2 mm off"
+    )
 
 
 def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
     mesh = ell()
-    pieces = [block((0.08, 0.02, 0.02), (0.04, 0.01, 0.01)), block((0.02, 0.05, 0.02), (0.01, 0.045, 0.01))]
-    (obj,) = objects_of(folder_of(tmp_path / "ell", mesh, *pieces), options)  # a leg is 1 cm too short
-    np.testing.assert_allclose(sorted(shapes.volume(piece) for piece in obj.pieces), [20e-6, 32e-6], rtol=1e-4)
+    pieces = [
+        block((0.08, 0.02, 0.02), (0.04, 0.01, 0.01)),
+        block((0.02, 0.05, 0.02), (0.01, 0.045, 0.01)),
+    ]
+    # A leg is 1 cm too short
+    (obj,) = objects_of(folder_of(tmp_path / "ell", mesh, *pieces), options)
+    np.testing.assert_allclose(
+        sorted(shapes.volume(piece) for piece in obj.pieces), [20e-6, 32e-6], rtol=1e-4
+    )
     np.testing.assert_allclose(obj.surface_error, 0.01, atol=5e-4)
     assert len(obj.notes) == 1
     assert obj.notes[0].startswith("its own 2 convex pieces stand for it: ")
@@ -178,7 +199,9 @@ def decomposed(mesh, time_limit):
 def test_an_open_sphere_is_cut_within_the_default_limit(tmp_path):
     sphere = trimesh.creation.icosphere(4, 0.04)
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.02)
-    found = decompose.decompose(sphere.vertices, sphere.faces, volume=None, time_limit=ImportOptions().time_limit)
+    found = decompose.decompose(
+        sphere.vertices, sphere.faces, volume=None, time_limit=ImportOptions().time_limit
+    )
     assert (found.method, found.notes) == ("coacd", [])
 
 
@@ -192,7 +215,9 @@ def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert (result.method, len(result.pieces)) == ("hull", 1)
-    np.testing.assert_allclose(shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6)
+    np.testing.assert_allclose(
+        shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6
+    )
     assert "hull" in result.notes[-1]
 
 
@@ -202,26 +227,34 @@ def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
     (obj,) = objects_of(tmp_path / "ell.stl", options)
     assert not obj.shape_reliable
     close = dataclasses.replace(obj, volume_error=0.0)
-    assert [dataclasses.replace(close, surface_error=d).shape_reliable for d in (0.0049, 0.0051)] == [True, False]
+    assert [
+        dataclasses.replace(close, surface_error=d).shape_reliable for d in (0.0049, 0.0051)
+    ] == [True, False]
 
 
 def test_a_busy_machine_changes_no_shape(monkeypatch):
     """A child that gets no processor time is no reason for another shape."""
     monkeypatch.setattr(decompose, "STARVED", 0.001)
     mesh = ell()
-    with pytest.raises(CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"):
+    with pytest.raises(
+        CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"
+    ):
         decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
 
 
 def test_a_decomposer_that_dies_is_reported(monkeypatch):
     mesh = ell()
-    pieces, failure = decompose._in_child("no such method", {"vertices": mesh.vertices}, mesh.volume, 8, 60)
+    pieces, failure = decompose._in_child(
+        "no such method", {"vertices": mesh.vertices}, mesh.volume, 8, 60
+    )
     assert pieces == []
     assert failure.startswith("f")
 
 
 # One whose own pieces are kept, one with holes, and two with parts.
-@pytest.mark.parametrize("name", ["cubemedium", "knife", *(pytest.param(x, marks=SLOW) for x in ("phone", "hammer"))])
+@pytest.mark.parametrize(
+    "name", ["cubemedium", "knife", *(pytest.param(x, marks=SLOW) for x in ("phone", "hammer"))]
+)
 def test_scanned_objects_come_within_the_budget_and_rest(shared_objects, options, name):
     (obj,) = objects_of(shared_objects / name, options)
     assert obj.name == name
@@ -241,11 +274,15 @@ def test_scanned_objects_come_within_the_budget_and_rest(shared_objects, options
 
 @pytest.mark.slow
 def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
-    """A hemisphere of 12 cm with a wall of 2 mm: the hulls of its pieces alone would be half as large again."""
+    """A hemisphere of 12 cm with a wall of 2 mm: the hulls of its pieces alone would be half as
+    large again.
+    """
     turn = np.linspace(-np.pi / 2, 0, 13)
     outside, inside = (r * np.column_stack([np.cos(turn), np.sin(turn)]) for r in (0.06, 0.058))
     outside[0, 0] = inside[0, 0] = 0.0
-    trimesh.creation.revolve(np.concatenate([outside, inside[::-1]]), sections=48).export(tmp_path / "bowl.stl")
+    trimesh.creation.revolve(np.concatenate([outside, inside[::-1]]), sections=48).export(
+        tmp_path / "bowl.stl"
+    )
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
     assert obj.surface_error < 3e-3 and abs(obj.volume_error) < 0.05
 
@@ -272,14 +309,17 @@ def test_coacd_cuts_an_ell_in_two():
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
     assert result.method == "coacd"
     assert 2 <= len(result.pieces) <= 3
-    np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)
+    np.testing.assert_allclose(
+        sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05
+    )
 
 
 # --- files that announce more than they hold ---
 
 
 _PLY = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\n"
+    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float "
+    b"y\nproperty float z\n"
 )
 _FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
 _POINTS = (
@@ -297,7 +337,11 @@ def _glb(change=lambda tree: None):
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+    return (
+        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+        + text
+        + rest
+    )
 
 
 def _many(tree):
@@ -310,33 +354,72 @@ def _twice(tree):
 
 
 def _fallback(tree):
-    tree.update(buffers=[{"byteLength": 1 << 20}, *tree["buffers"]], extensionsRequired=["EXT_meshopt_compression"])
+    tree.update(
+        buffers=[{"byteLength": 1 << 20}, *tree["buffers"]],
+        extensionsRequired=["EXT_meshopt_compression"],
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "data", "why"),
     [
-        pytest.param("a.ply", _PLY % 4_000_000_000 + _FACES % 1, "announces 4000000000 rows", id="PLY vertices"),
-        pytest.param("a.ply", _PLY % 0 + _FACES % 4_000_000_000 + bytes(99), "announces 4000000000", id="PLY faces"),
-        pytest.param("a.ply", b"ply\nformat ascii 1.0\nelement vertex -5\nend_header\n", "without values", id="PLY -5"),
-        pytest.param("a.ply", b"ply\n" + b"comment\n" * 10_000, "does not end", id="PLY without an end"),
+        pytest.param(
+            "a.ply",
+            _PLY % 4_000_000_000 + _FACES % 1,
+            "announces 4000000000 rows",
+            id="PLY vertices",
+        ),
+        pytest.param(
+            "a.ply",
+            _PLY % 0 + _FACES % 4_000_000_000 + bytes(99),
+            "announces 4000000000",
+            id="PLY faces",
+        ),
+        pytest.param(
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex -5\nend_header\n",
+            "without values",
+            id="PLY -5",
+        ),
+        pytest.param(
+            "a.ply", b"ply\n" + b"comment\n" * 10_000, "does not end", id="PLY without an end"
+        ),
         pytest.param("a.ply", _POINTS, "only 4 points. Make a surface", id="PLY without faces"),
-        pytest.param("a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "only 0 proper triangles", id="STL"),
-        pytest.param("a.glb", _glb(lambda t: t["accessors"][0].update(count=1 << 33)), "has a count", id="GLB count"),
+        pytest.param(
+            "a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "only 0 proper triangles", id="STL"
+        ),
         pytest.param(
             "a.glb",
-            _glb(lambda t: t["accessors"].extend([{"count": 900, "type": "MAT4", "componentType": 5126}] * 2000)),
+            _glb(lambda t: t["accessors"][0].update(count=1 << 33)),
+            "has a count",
+            id="GLB count",
+        ),
+        pytest.param(
+            "a.glb",
+            _glb(
+                lambda t: t["accessors"].extend(
+                    [{"count": 900, "type": "MAT4", "componentType": 5126}] * 2000
+                )
+            ),
             "accessors take",
             id="GLB accessors without data",
         ),
         pytest.param("a.glb", _glb(_twice), "two parents", id="GLB nodes that multiply"),
         pytest.param(
-            "a.glb", _glb(lambda t: t.update(nodes=[{"mesh": 0}] * 20_000)), "more than 10000", id="GLB nodes"
+            "a.glb",
+            _glb(lambda t: t.update(nodes=[{"mesh": 0}] * 20_000)),
+            "more than 10000",
+            id="GLB nodes",
         ),
         pytest.param("a.glb", b"glTF" + b"\xff" * 40, "announces", id="GLB length"),
         pytest.param("a.glb", _glb()[:-90], "it was cut: it has 150 of 240 bytes", id="GLB cut"),
         pytest.param("a.glb", _glb(_fallback), "is compressed with meshopt", id="GLB meshopt"),
-        pytest.param("a.glb", _glb(lambda t: t["bufferViews"][0].update(byteLength="x")), "of 'x'", id="GLB 'x'"),
+        pytest.param(
+            "a.glb",
+            _glb(lambda t: t["bufferViews"][0].update(byteLength="x")),
+            "of 'x'",
+            id="GLB 'x'",
+        ),
     ],
 )
 def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
@@ -346,7 +429,9 @@ def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path
 
 
 def _inline(tree):
-    tree["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{base64.b64encode(_glb()[-240:]).decode()}"
+    tree["buffers"][0]["uri"] = (
+        f"data:application/octet-stream;base64,{base64.b64encode(_glb()[-240:]).decode()}"
+    )
 
 
 def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
@@ -357,9 +442,16 @@ def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
 @pytest.mark.parametrize(
     "data",
     [
-        pytest.param(_glb(lambda t: [t.pop("scenes"), t.pop("scene", None)]), id="no scenes, all nodes are shown"),
-        pytest.param(_glb(lambda t: t["buffers"][0].update(byteLength=242)), id="padding is announced"),
-        pytest.param(_glb(lambda t: t["buffers"][0].update(byteLength="x")), id="a length that is of no use"),
+        pytest.param(
+            _glb(lambda t: [t.pop("scenes"), t.pop("scene", None)]),
+            id="no scenes, all nodes are shown",
+        ),
+        pytest.param(
+            _glb(lambda t: t["buffers"][0].update(byteLength=242)), id="padding is announced"
+        ),
+        pytest.param(
+            _glb(lambda t: t["buffers"][0].update(byteLength="x")), id="a length that is of no use"
+        ),
         pytest.param(_glb(_inline)[:-248], id="numbers in an address"),
     ],
 )

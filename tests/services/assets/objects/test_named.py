@@ -15,7 +15,9 @@ from congrasp.services.assets.objects.named import find_object, objects_at
 
 def test_a_family_and_a_seed_name_an_object_wherever_paths_do():
     (found,) = objects_at(pathlib.Path("mug:7"))
-    assert found.name == "mug_7" and digest(found.load()) == digest(find_object("mug:7")) == digest(generate(7, "mug"))
+    assert found.name == "mug_7" and digest(found.load()) == digest(find_object("mug:7")) == digest(
+        generate(7, "mug")
+    )
 
 
 @pytest.mark.parametrize("text", ["mug:", ":7", "mug:x", "nothing.obj"])
@@ -27,11 +29,19 @@ def test_other_text_is_a_path(tmp_path, monkeypatch, text):
 
 def test_meshes_deeper_inside_are_named_without_hidden_ones(tmp_path):
     folder = tmp_path / "sets"
-    for file in ("syn/.git/x.obj", "syn/__MACOSX/x.obj", "syn/a/._x.obj", "syn/id/models/model_normalized.obj"):
+    for file in (
+        "syn/.git/x.obj",
+        "syn/__MACOSX/x.obj",
+        "syn/a/._x.obj",
+        "syn/id/models/model_normalized.obj",
+    ):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).touch()
     (folder / "syn" / "a" / "folder.obj").mkdir()
-    with pytest.raises(CongraspError, match=r"deeper inside alone, such as \S+/syn/id/models/model_normalized\.obj\. "):
+    with pytest.raises(
+        CongraspError,
+        match=r"deeper inside alone, such as \S+/syn/id/models/model_normalized\.obj\. ",
+    ):
         objects_at(folder)
 
 
@@ -58,7 +68,9 @@ def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, qui
     obj = find_object("mug:7")
     path = Catalogue(tmp_path).add(obj)
     monkeypatch.chdir(tmp_path)
-    assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
+    assert (
+        digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
+    )
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
     assert find_object(str(tmp_path / "block.stl")).name == "block"
     with pytest.raises(CongraspError, match="no object 'mug_8'"):

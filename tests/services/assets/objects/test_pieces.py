@@ -1,4 +1,6 @@
-"""Convex pieces: joined and simplified where the shape stays, and their errors against known meshes."""
+"""Convex pieces: joined and simplified where the shape stays, and their errors against known
+meshes.
+"""
 
 import numpy as np
 import pytest
@@ -13,8 +15,14 @@ from tests.solids import block
 
 def prism(outline, depth):
     """Triangles of a prism over an outline (N, 2) that its first and its last corner see all of."""
-    low, high = (np.column_stack([outline, np.full(len(outline), z)]) for z in (-depth / 2, depth / 2))
-    caps = [[side[0], side[i], side[i + 1]] for side in (low[::-1], high) for i in range(1, len(side) - 1)]
+    low, high = (
+        np.column_stack([outline, np.full(len(outline), z)]) for z in (-depth / 2, depth / 2)
+    )
+    caps = [
+        [side[0], side[i], side[i + 1]]
+        for side in (low[::-1], high)
+        for i in range(1, len(side) - 1)
+    ]
     walls = [[low[i - 1], low[i], high[i]] for i in range(len(low))]
     return np.array(caps + walls + [[low[i - 1], high[i], high[i - 1]] for i in range(len(low))])
 
@@ -23,14 +31,18 @@ def joined(blocks, max_pieces, triangles=None):
     if triangles is None:
         triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in blocks])
     volume = sum(mesh.volume for mesh in blocks)
-    return decompose.merge([np.asarray(mesh.vertices) for mesh in blocks], max_pieces, triangles, volume)
+    return decompose.merge(
+        [np.asarray(mesh.vertices) for mesh in blocks], max_pieces, triangles, volume
+    )
 
 
 def test_pieces_that_form_a_convex_one_are_joined_without_need():
     blocks = [block((0.01, 0.01, 0.01), (x, 0, 0)) for x in (0, 0.01, 0.1, 0.11)]
     whole = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
     merged = joined(blocks, 8, np.concatenate(whole))
-    np.testing.assert_allclose([shapes.hull_of(piece).volume for piece in merged], [2e-6, 2e-6], rtol=1e-6)
+    np.testing.assert_allclose(
+        [shapes.hull_of(piece).volume for piece in merged], [2e-6, 2e-6], rtol=1e-6
+    )
 
 
 def test_a_corner_is_kept_while_there_is_room_and_filled_when_there_is_none():
@@ -38,13 +50,16 @@ def test_a_corner_is_kept_while_there_is_room_and_filled_when_there_is_none():
     assert len(joined(ell, 2)) == 2
     (hull,) = joined(ell, 1)
     # The corner's triangle of 4 x 4 cm is filled.
-    np.testing.assert_allclose(shapes.hull_of(hull).volume, (0.06 + 0.04) * 0.02**2 + 0.04**2 / 2 * 0.02, rtol=1e-6)
+    np.testing.assert_allclose(
+        shapes.hull_of(hull).volume, (0.06 + 0.04) * 0.02**2 + 0.04**2 / 2 * 0.02, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("closed", "counts"), [(False, (2, 1)), (True, (1, 1))])
 def test_a_thin_step_is_joined_for_its_small_depth_but_not_for_a_large_volume(closed, counts):
-    """The upper side of the lower half is buried by 0.5 mm at most, under a wedge of 2 x 2 cm x 0.25 mm: 5.6 % of a
-    slab of 2 mm, which thinning takes off a closed mesh, and 1.2 % of one of 1 cm."""
+    """The upper side of the lower half is buried by 0.5 mm at most, under a wedge of 2 x 2 cm x
+    0.25 mm: 5.6 % of a slab of 2 mm, which thinning takes off a closed mesh, and 1.2 % of one of 1
+    cm."""
 
     def pieces_of_step(height):
         low, high = block((0.02, height, 0.02), (0.01, height / 2, 0)), height + 0.0005
@@ -52,7 +67,12 @@ def test_a_thin_step_is_joined_for_its_small_depth_but_not_for_a_large_volume(cl
         outline = [[0, 0], [0.04, 0], [0.04, high], [0.02, high], [0.02, height], [0, height]]
         surface, volume = prism(np.array(outline), 0.02), sum(block.volume for block in blocks)
         return len(
-            decompose.merge([np.asarray(block.vertices) for block in blocks], 4, surface, volume if closed else None)
+            decompose.merge(
+                [np.asarray(block.vertices) for block in blocks],
+                4,
+                surface,
+                volume if closed else None,
+            )
         )
 
     assert (pieces_of_step(0.002), pieces_of_step(0.01)) == counts
@@ -81,10 +101,14 @@ def test_simplified_pieces_keep_shape_and_volume():
 
 @pytest.mark.parametrize("angle", [45, 90])
 def test_pieces_of_a_bent_wall_are_as_thin_as_the_wall(angle):
-    """Six parts of a wall of 2 mm around a radius of 4 cm become two: their hulls have up to three times the volume."""
+    """Six parts of a wall of 2 mm around a radius of 4 cm become two: their hulls have up to three
+    times the volume.
+    """
     turn = np.radians(np.linspace(0, angle, 25))
     inner, outer = (np.column_stack([r * np.cos(turn), r * np.sin(turn)]) for r in (0.039, 0.041))
-    sections = [prism(np.array([inner[i], outer[i], outer[i + 1], inner[i + 1]]), 0.03) for i in range(24)]
+    sections = [
+        prism(np.array([inner[i], outer[i], outer[i + 1], inner[i + 1]]), 0.03) for i in range(24)
+    ]
     wall, blocks = (
         np.concatenate(sections),
         [np.concatenate(some).reshape(-1, 3) for some in np.split(np.array(sections), 6)],
@@ -107,7 +131,9 @@ SIDES = np.array([0.04, 0.06, 0.08])
 
 
 def compared(mesh, pieces, closed=True):
-    return fidelity(np.asarray(mesh.triangles), [np.asarray(piece.vertices) for piece in pieces], closed)
+    return fidelity(
+        np.asarray(mesh.triangles), [np.asarray(piece.vertices) for piece in pieces], closed
+    )
 
 
 def test_a_convex_mesh_and_itself():
@@ -131,7 +157,10 @@ def test_a_part_that_is_missing():
 
 def test_pieces_that_overlap_count_once_and_pieces_that_touch_have_no_surface_between():
     upper = block((0.04, 0.06, 0.05), (0, 0, 0.015))
-    for lower in (block((0.04, 0.06, 0.05), (0, 0, -0.015)), block((0.04, 0.06, 0.03), (0, 0, -0.025))):
+    for lower in (
+        block((0.04, 0.06, 0.05), (0, 0, -0.015)),
+        block((0.04, 0.06, 0.03), (0, 0, -0.025)),
+    ):
         errors = compared(block(SIDES), [upper, lower])
         np.testing.assert_allclose(errors.volume, 0, atol=1e-6)
         assert errors.surface < 1e-6
@@ -150,7 +179,9 @@ def test_a_slot_counts_if_the_ball_gets_in(width, counts):
     sides = [block((half, 0.06, 0.08), (sign * (half + width) / 2, 0, 0)) for sign in (-1, 1)]
     slotted = trimesh.util.concatenate([*sides, block((0.04, 0.06, 0.02), (0, 0, -0.03))])
     errors = compared(slotted, [block(SIDES)])
-    if counts:  # the middle of the slot's floor lies 6 cm below the filled top, its walls up to 14 mm from the sides
+    # The middle of the slot's floor lies 6 cm below the filled top, its walls up to 14 mm
+    # from the sides
+    if counts:
         assert 0.014 < errors.surface < 0.031
     else:
         assert errors.surface < 0.002
@@ -161,7 +192,10 @@ def test_a_void_between_pieces_counts_if_the_ball_gets_in(top, counts):
     """Slabs around a void of 2 cm in a cube of 6 cm; the last leaves a slot of 5 mm, or none."""
     slabs = [block((0.06, 0.06, 0.02), (0, 0, z)) for z in (-0.02, 0.02)]
     slabs += [block((0.06, 0.02, 0.02), (0, y, 0)) for y in (-0.02, 0.02)]
-    slabs += [block((0.02, 0.02, 0.02), (-0.02, 0, 0)), block((0.02, 0.02, top + 0.01), (0.02, 0, (top - 0.01) / 2))]
+    slabs += [
+        block((0.02, 0.02, 0.02), (-0.02, 0, 0)),
+        block((0.02, 0.02, top + 0.01), (0.02, 0, (top - 0.01) / 2)),
+    ]
     assert (compared(block((0.06,) * 3), slabs).surface > 0.01) == counts
 
 
@@ -183,7 +217,9 @@ def test_wires_between_the_rays_have_exact_volumes():
     np.testing.assert_allclose(errors.volume, -0.5, atol=1e-6)
     np.testing.assert_allclose(errors.surface, 0.25, atol=1e-3)
     points = interior(np.asarray(mesh.triangles), 1000)
-    np.testing.assert_allclose(np.ptp(points, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.05, atol=1e-4)
+    np.testing.assert_allclose(
+        np.ptp(points, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.05, atol=1e-4
+    )
     assert voxels(np.asarray(mesh.triangles), 0.01).inside.sum() >= 2 * 127
 
 

@@ -31,11 +31,15 @@ def test_an_opening_is_left_and_bodies_that_touch_stay_together():
 @pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
 @pytest.mark.parametrize("unit", ["m", "mm"])
 def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
-    table = trimesh.creation.box((1.2, 0.8, 0.02)).apply_translation([0.0, 0.0, -0.01 - RADIUS - gap])
+    table = trimesh.creation.box((1.2, 0.8, 0.02)).apply_translation(
+        [0.0, 0.0, -0.01 - RADIUS - gap]
+    )
     crumb = trimesh.creation.icosphere(1, 0.002).apply_translation([0.3, 0.2, -0.05])
     scan = trimesh.util.concatenate([table, ball(), crumb]).apply_scale(1000 if unit == "mm" else 1)
     scan.export(tmp_path / "scan.stl")
-    obj = one_object(tmp_path / "scan.stl", ImportOptions(unit=unit, cache_dir=str(tmp_path / "cache")))
+    obj = one_object(
+        tmp_path / "scan.stl", ImportOptions(unit=unit, cache_dir=str(tmp_path / "cache"))
+    )
     np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.05)
     assert obj.notes[0] == "a flat body 13.3 times as wide as the rest was left out: a table"
 
@@ -51,12 +55,17 @@ def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
 )
 def test_a_flat_object_is_no_table(radius, depth, knob, at):
     flat = trimesh.creation.cylinder(radius, depth)
-    whole = trimesh.util.concatenate([flat, trimesh.creation.cylinder(*knob).apply_translation([0.0, 0.0, at])])
+    whole = trimesh.util.concatenate(
+        [flat, trimesh.creation.cylinder(*knob).apply_translation([0.0, 0.0, at])]
+    )
     assert repair.without_table(whole, 1.0, []) is whole
 
 
 def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
-    scan, speck = trimesh.creation.icosphere(7, 0.05), np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]])
+    scan, speck = (
+        trimesh.creation.icosphere(7, 0.05),
+        np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]]),
+    )
     volume = scan.volume
     trimesh.util.concatenate([scan, trimesh.Trimesh(speck, [[0, 1, 2]])]).export(tmp_path / "a.stl")
     found = largest_body(read_mesh(tmp_path / "a.stl"), [])
@@ -67,7 +76,9 @@ def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
 
 def _with_fin(mesh):
     edge = mesh.vertices[mesh.edges[0]]
-    return trimesh.util.concatenate([mesh, trimesh.Trimesh([*edge, 1.02 * edge.mean(0)], [[0, 1, 2]])])
+    return trimesh.util.concatenate(
+        [mesh, trimesh.Trimesh([*edge, 1.02 * edge.mean(0)], [[0, 1, 2]])]
+    )
 
 
 @pytest.mark.parametrize("rows", [3, 20])
@@ -77,7 +88,11 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     a = np.linspace(0, np.pi, rows)
     spine = np.stack([0.04 + 0.03 * np.sin(a), 0 * a, 0.025 * np.cos(a)], -1)[:, None]
     strap = (spine + np.array([[0, 0, 0], [0, 0.004, 0]])).reshape(-1, 3)
-    faces = [face for i in range(0, 2 * rows - 2, 2) for face in ((i, i + 1, i + 2), (i + 1, i + 3, i + 2))]
+    faces = [
+        face
+        for i in range(0, 2 * rows - 2, 2)
+        for face in ((i, i + 1, i + 2), (i + 1, i + 3, i + 2))
+    ]
     mug = trimesh.util.concatenate([cup, trimesh.Trimesh(strap, faces, process=False)])
     mug.merge_vertices()
     assert (mug.faces.shape, mug.body_count) == ((len(cup.faces) + len(faces), 3), 1)
@@ -94,10 +109,14 @@ def test_a_handle_of_one_sheet_is_kept(rows):
 )
 def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil, note):
     spoil(ball()).export(tmp_path / "a.obj", digits=9)
-    obj = one_object(tmp_path / "a.obj", ImportOptions(density=1000.0, cache_dir=str(tmp_path / "cache")))
+    obj = one_object(
+        tmp_path / "a.obj", ImportOptions(density=1000.0, cache_dir=str(tmp_path / "cache"))
+    )
     assert obj.mass == pytest.approx(1000 * ball().volume, rel=1e-3)
     np.testing.assert_allclose(
-        np.diag(obj.inertia) if np.ndim(obj.inertia) == 2 else obj.inertia[:3], 0.4 * obj.mass * RADIUS**2, rtol=0.05
+        np.diag(obj.inertia) if np.ndim(obj.inertia) == 2 else obj.inertia[:3],
+        0.4 * obj.mass * RADIUS**2,
+        rtol=0.05,
     )
     assert note in obj.notes if note else not [text for text in obj.notes if "open" in text]
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.06)
@@ -105,7 +124,10 @@ def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil
 
 def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
     ball().apply_translation([1e5, 0, 0]).export(tmp_path / "a.stl")
-    with pytest.raises(CongraspError, match=r"a\.stl is so far from its origin that .* rounded to 0\.0078\. Move it"):
+    with pytest.raises(
+        CongraspError,
+        match=r"a\.stl is so far from its origin that .* rounded to 0\.0078\. Move it",
+    ):
         read_mesh(tmp_path / "a.stl")
 
 
@@ -133,7 +155,9 @@ property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"""
     order = ">" if "big" in kind else "<"
     packed = [struct.pack(order + row[0], *row[1:]) for row in rows]
     return header.encode() + b"".join(
-        packed if number is None else [(" ".join(number % x for x in row[1:]) + "\n").encode() for row in rows]
+        packed
+        if number is None
+        else [(" ".join(number % x for x in row[1:]) + "\n").encode() for row in rows]
     )
 
 
@@ -144,9 +168,15 @@ _QUADS = _ply(_ARROW, "binary_little_endian")
     ("data", "volume"),
     [
         pytest.param(_ply(_ARROW, "ascii", " %.3e"), 3, id="text of np.savetxt"),
-        pytest.param(_ply(_CHANNEL, "ascii", "%g").replace(b"element face 10", b"element\tface\t10"), 36, id="tabs"),
+        pytest.param(
+            _ply(_CHANNEL, "ascii", "%g").replace(b"element face 10", b"element\tface\t10"),
+            36,
+            id="tabs",
+        ),
         pytest.param(_ply(_ARROW, "ascii", "%g").replace(b"\n", b"\r\n"), 3, id="lines of Windows"),
-        pytest.param(_ply(_ARROW, "binary_little_endian", comment="comment ascii big\n"), 3, id="comment"),
+        pytest.param(
+            _ply(_ARROW, "binary_little_endian", comment="comment ascii big\n"), 3, id="comment"
+        ),
         pytest.param(_ply(_ARROW, "binary_big_endian"), 3, id="big-endian quads"),
         pytest.param(_ply(_CHANNEL, "binary_big_endian"), 36, id="mixed polygons"),
         pytest.param(_QUADS, 3, id="dented quads"),
@@ -168,7 +198,10 @@ def test_polygons_of_a_ply_keep_their_volume_and_their_colours(tmp_path, data, v
         (_QUADS[:-1], "it ends within a face"),
         (_QUADS[:-30], "a row lacks values"),
         (_ply(_ARROW, "ascii", "%g")[:-4], "a row lacks values"),
-        (_QUADS.replace(b"list uchar", b"list char").replace(b"\4\3\0\0\0\2", b"\xfc\3\0\0\0\2"), "a negative number"),
+        (
+            _QUADS.replace(b"list uchar", b"list char").replace(b"\4\3\0\0\0\2", b"\xfc\3\0\0\0\2"),
+            "a negative number",
+        ),
     ],
 )
 def test_a_ply_of_other_faces_than_it_announces_is_refused(tmp_path, data, why):
@@ -179,20 +212,31 @@ def test_a_ply_of_other_faces_than_it_announces_is_refused(tmp_path, data, why):
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
-    """Faces of eight corners and of four, each with a colour, between points with one and an edge."""
+    """Faces of eight corners and of four, each with a colour, between points with one and an
+    edge.
+    """
     points, faces = _prism(_CHANNEL)
     numbers = "property float x\nproperty float y\nproperty float z\nproperty uchar red"
     face = "property uchar red\nproperty list uchar int vertex_indices\nproperty short rest"
     edge = "element edge 1\nproperty int vertex1\nproperty int vertex2"
-    header = f"ply\nformat {kind} 1.0\nelement vertex 16\n{numbers}\nelement face 10\n{face}\n{edge}\nend_header\n"
-    rows = [("3fB", *point, 7) for point in points] + [(f"BB{len(one)}ih", 9, len(one), *one, 1) for one in faces]
+    header = (
+        f"ply\nformat {kind} 1.0\nelement vertex 16\n{numbers}\nelement face "
+        f"10\n{face}\n{edge}\nend_header\n"
+    )
+    rows = [("3fB", *point, 7) for point in points] + [
+        (f"BB{len(one)}ih", 9, len(one), *one, 1) for one in faces
+    ]
     rows.append(("ii", 5, 6))
     order = ">" if "big" in kind else "<"
     data = b"".join(struct.pack(order + row[0], *row[1:]) for row in rows)
     text = "".join(" ".join(map(str, row[1:])) + "\n" for row in rows)
     (tmp_path / "a.ply").write_bytes(header.encode() + (text.encode() if kind == "ascii" else data))
     mesh = read_mesh(tmp_path / "a.ply")
-    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(36) and mesh.area == pytest.approx(24 + 26 * 3)
+    assert (
+        mesh.is_watertight
+        and abs(mesh.volume) == pytest.approx(36)
+        and mesh.area == pytest.approx(24 + 26 * 3)
+    )
 
 
 @pytest.mark.parametrize("turn", [1, -1])
@@ -202,7 +246,11 @@ def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
     text = "".join("v {} {} {}\n".format(*point) for point in points)
     (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
-    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(36) and mesh.area == pytest.approx(24 + 26 * 3)
+    assert (
+        mesh.is_watertight
+        and abs(mesh.volume) == pytest.approx(36)
+        and mesh.area == pytest.approx(24 + 26 * 3)
+    )
 
 
 def _row(face, end):
@@ -212,7 +260,9 @@ def _row(face, end):
 
 def _flat(outline, face=None):
     face = face or range(len(outline))
-    return "".join(f"v {x} {y} 0\n" for x, y in outline) + f"f {' '.join(str(i + 1) for i in face)}\n"
+    return (
+        "".join(f"v {x} {y} 0\n" for x, y in outline) + f"f {' '.join(str(i + 1) for i in face)}\n"
+    )
 
 
 def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
@@ -225,10 +275,14 @@ def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
 def test_many_corners_are_left_with_a_note(tmp_path):
     angle = np.linspace(0, 2 * np.pi, 66, endpoint=False)
     radius = np.where(np.arange(66) % 2, 1, 0.4)
-    (tmp_path / "a.obj").write_text(_flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)))
+    (tmp_path / "a.obj").write_text(
+        _flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+    )
     said = list[str]()
     assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 64
-    assert said == ["1 of its dented polygons could not be cut and may be filled (export it as triangles)"]
+    assert said == [
+        "1 of its dented polygons could not be cut and may be filled (export it as triangles)"
+    ]
     (tmp_path / "a.obj").write_text("v 0 0\n" + _flat(np.eye(4, 2)))
     with pytest.raises(CongraspError, match="a point has fewer than three numbers"):
         read_mesh(tmp_path / "a.obj")
@@ -240,7 +294,8 @@ def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
     outer = [(0, 0), (0.035, 0), (0.035, 0.12), (neck + 0.003, 0.15), (neck + 0.003, 0.18)]
     inner = [(neck, 0.18), (neck, 0.149), (0.032, 0.119), (0.032, 0.003), (0, 0.003)]
     bottle, full = (
-        trimesh.creation.revolve(np.array(line), sections=32) for line in (outer + inner, [*outer, (0, 0.18)])
+        trimesh.creation.revolve(np.array(line), sections=32)
+        for line in (outer + inner, [*outer, (0, 0.18)])
     )
     said = list[str]()
     shown = without_hollows(bottle, said)
@@ -267,7 +322,8 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     assert notes[0] == "its 81,920 triangles were reduced to 2,000: a hand does not feel the rest"
     assert len(obj.visual_faces) <= 2_000 and not [note for note in notes if "open" in note]
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
-    soup = fine.vertices[fine.faces].reshape(-1, 3)  # as STL files have it: no triangle shares a corner
+    # As STL files have it: no triangle shares a corner
+    soup = fine.vertices[fine.faces].reshape(-1, 3)
     vertices, faces = reduced(soup, np.arange(len(soup)).reshape(-1, 3), [])
     assert trimesh.Trimesh(vertices, faces).is_watertight
 
@@ -281,8 +337,15 @@ def test_a_surface_without_an_outside_is_unchanged():
 
 def _moebius():
     turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    rim = [(np.cos(t) * (1 + s * np.cos(t / 2)), np.sin(t) * (1 + s * np.cos(t / 2)), s * np.sin(t / 2))
-           for t in turns for s in (-0.2, 0.2)]  # fmt: skip
+    rim = [
+        (
+            np.cos(t) * (1 + s * np.cos(t / 2)),
+            np.sin(t) * (1 + s * np.cos(t / 2)),
+            s * np.sin(t / 2),
+        )
+        for t in turns
+        for s in (-0.2, 0.2)
+    ]
     faces = []
     for i in range(24):
         a, b = 2 * i, 2 * i + 1

@@ -1,4 +1,6 @@
-"""Units and masses of imported meshes: which unit makes a thing for a hand, and masses by material."""
+"""Units and masses of imported meshes: which unit makes a thing for a hand, and masses by
+material.
+"""
 
 import pathlib
 import sys
@@ -12,20 +14,40 @@ from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import options
 from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
-from congrasp.services.assets.objects.options import METRES, ImportOptions, guessed_unit, metres_per_unit, sizes_by_unit
+from congrasp.services.assets.objects.options import (
+    METRES,
+    ImportOptions,
+    guessed_unit,
+    metres_per_unit,
+    sizes_by_unit,
+)
 from congrasp.services.grasp.jobs import _load
 from congrasp.services.studio.catalogue import Importer
 
 
 def test_numbers_at_their_limits_are_accepted() -> None:
-    options.check_options(ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize))
+    options.check_options(
+        ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize)
+    )
 
 
 @pytest.mark.parametrize(
     ("longest", "unit"),
-    [(0.012, "m"), (0.2, "m"), (0.6, "m"), (0.8, "in"), (3.0, ""), (15.0, ""), (25.0, ""), (90.0, "mm"), (300.0, "mm")],
+    [
+        (0.012, "m"),
+        (0.2, "m"),
+        (0.6, "m"),
+        (0.8, "in"),
+        (3.0, ""),
+        (15.0, ""),
+        (25.0, ""),
+        (90.0, "mm"),
+        (300.0, "mm"),
+    ],
 )
-def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(longest: float, unit: str) -> None:
+def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(
+    longest: float, unit: str
+) -> None:
     sides = (longest / 2, longest, longest / 3)
     assert guessed_unit("a.stl", sides) == unit
     if unit:  # as an import that guesses takes it
@@ -55,7 +77,8 @@ def test_the_sides_of_a_mesh_are_read_in_its_own_unit(tmp_path: pathlib.Path) ->
     assert Importer().sides(tmp_path / "box.stl") == pytest.approx((30.0, 40.0, 50.0))
 
 
-# --- masses: solids, shells and sheets whose mass is worked out by hand; parts of different materials ---
+# --- masses: solids, shells and sheets whose mass is worked out by hand; parts of different
+# materials ---
 
 
 def weight(mesh, name):
@@ -67,20 +90,26 @@ def test_a_solid_weighs_its_volume():
     found = weight(block, "steel")
     assert found.mass == pytest.approx(7850 * 4e-5)
     np.testing.assert_allclose(found.center, (0.3, 0, 0), atol=1e-12)
-    np.testing.assert_allclose(np.diag(found.inertia), found.mass / 12 * np.array([0.0104, 0.0104, 0.0008]))
+    np.testing.assert_allclose(
+        np.diag(found.inertia), found.mass / 12 * np.array([0.0104, 0.0104, 0.0008])
+    )
 
 
 def test_what_is_too_thick_for_its_material_weighs_its_wall():
     ball = trimesh.creation.icosphere(4, radius=0.05)
     found = weight(ball, "ceramic")
     assert found.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
-    np.testing.assert_allclose(found.inertia, 2 / 3 * found.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9)
+    np.testing.assert_allclose(
+        found.inertia, 2 / 3 * found.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9
+    )
     assert weight(ball, "wood").mass == pytest.approx(640 * 4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
 def test_a_thin_shell_weighs_what_its_two_walls_enclose():
     tube = trimesh.creation.annulus(0.037, 0.04, 0.1)
-    assert weight(tube, "ceramic").mass == pytest.approx(2400 * np.pi * (0.04**2 - 0.037**2) * 0.1, rel=0.01)
+    assert weight(tube, "ceramic").mass == pytest.approx(
+        2400 * np.pi * (0.04**2 - 0.037**2) * 0.1, rel=0.01
+    )
 
 
 def test_an_open_sheet_weighs_its_wall():
@@ -137,6 +166,8 @@ def test_options_weigh_objects_of_the_generator_too():
     heavy = _load(at, ImportOptions(mass=0.4))
     assert heavy.mass == 0.4
     np.testing.assert_allclose(heavy.inertia, before.inertia * 0.4 / before.mass)
-    steel, wood = (_load(at, ImportOptions(material=name)).mass for name in ("body=wood,handle=steel", "wood"))
+    steel, wood = (
+        _load(at, ImportOptions(material=name)).mass for name in ("body=wood,handle=steel", "wood")
+    )
     assert steel > 1.2 * wood
     assert _load(at, ImportOptions()).mass == before.mass
