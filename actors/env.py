@@ -196,8 +196,7 @@ class GraspEnv:
           hand: the hand.
           task: the task.
           engine: an engine that JAX can trace, with the objects that initial conditions refer to by
-          index; None for
-            one that is stepped outside, between `targets` and `advance`.
+            index; None for one that is stepped outside, between `targets` and `advance`.
         """
         self.hand, self.task, self._engine = hand, task, engine
         self.settings = Settings(task.reward, task.control)
@@ -261,8 +260,9 @@ class GraspEnv:
 
         Args:
           state: the environments; an engine that is stepped outside is reset separately, to the new
-          `reset_state`. rows: (K,) int, environments in which the episodes start; numbers from B on
-          are ignored. initial: the episodes (K,).
+            `reset_state`.
+          rows: (K,) int, environments in which the episodes start; numbers from B on are ignored.
+          initial: the episodes (K,).
         """
 
         def placed(new: Any, old: Any) -> Any:

@@ -99,7 +99,8 @@ class Uploads:
     Attributes:
       failure: the reason why sending has stopped, if it has; also set by the owner.
       free: acquired by the owner for each queued rollout; released when that rollout has its
-      outcome. closed: set once sending has been stopped.
+        outcome.
+      closed: set once sending has been stopped.
     """
 
     def __init__(  # noqa: PLR0913
@@ -429,7 +430,8 @@ class ActorLink(Closing):
 
         Args:
           rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds the
-          identity. ticket: ticket of the rollout.
+            identity.
+          ticket: ticket of the rollout.
 
         Returns:
           Future of its outcome.

@@ -64,7 +64,8 @@ class Follower:
         Args:
           trace: (T, ...) trace of environment 0.
           before: the environments before the rollout, if environment 0 was at the beginning of an
-          episode. after: the environments after the rollout.
+            episode.
+          after: the environments after the rollout.
           due: follows an episode that begins in the rollout, if none is being followed.
 
         Returns:
@@ -130,7 +131,8 @@ def run_actor(  # noqa: PLR0913
       transport: transport connected to the learner.
       run: name of the run.
       actor: this actor's name, unique in the run; it also determines the actor's objects and random
-      numbers. stop: ends the actor between two rollouts.
+        numbers.
+      stop: ends the actor between two rollouts.
       physics: engine; that of the run by default.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.

@@ -211,7 +211,8 @@ def assess(
 
     Args:
       samples: samples of the approach, the hold and, if simulated, `stress`; NumPy arrays (T, B,
-      ...). held: (B,) bool, True if the object was held until the end of the hold.
+        ...).
+      held: (B,) bool, True if the object was held until the end of the hold.
       task: the task.
       hold: control steps without the table.
       height: height of the lift, m.
@@ -245,8 +246,7 @@ def survival(
 
     Args:
       object_position: (1 + T, B, 3) in the wrist frame, m, after the last control step of the hold
-      and after the
-        `stress_steps` that follow it.
+        and after the `stress_steps` that follow it.
       object_quaternion: (1 + T, B, 4) object frame to wrist frame.
       held: (B,) bool, True if the object was held until then.
       task: the task, for the length of a control step.

@@ -56,8 +56,7 @@ class RolloutWorker:
           task: the task.
           physics: the engine, with the objects of the bank.
           bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do
-          not restart at their
-            end.
+            not restart at their end.
           policy: a pure function; `collect` passes its parameters.
           batch: number B of environments.
           seed: seed of episodes and actions.
@@ -65,8 +64,7 @@ class RolloutWorker:
           probe: computes additional values to record at every step.
           traced: environments whose trace is recorded.
           staggered: ends the first episodes early at different times, so that short rollouts then
-          contain all phases of
-            the task.
+            contain all phases of the task.
           taught: records `Rollout.teacher_observation`.
           privileged: the engine's objects, if `Rollout.privileged` is recorded.
         """

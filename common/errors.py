@@ -28,7 +28,7 @@ class CongraspError(Exception):
     Attributes:
       exit_code: exit code of the command line for this error.
       code: kind of the error on the wire, alongside the message; empty where a program cannot
-      handle the kind.
+        handle the kind.
     """
 
     exit_code = 2

@@ -192,8 +192,7 @@ def stamped(header: Any, clock: float | None = None) -> float:
     Args:
       header: the message's.
       clock: simulated time, s, to which stamps refer. Without it they refer to the time of day;
-      those of a simulator
-        then count as now.
+        those of a simulator then count as now.
     """
     stamp = seconds(header.stamp)
     now = time.time() if clock is None else clock

@@ -195,7 +195,7 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
 
     Raises:
       CongraspError: a leaf is missing or has another shape or type; the message names `source` and
-      the first such leaf.
+        the first such leaf.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     restored: list[Any] = []

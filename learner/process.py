@@ -94,23 +94,24 @@ def run_learner(  # noqa: PLR0913
     Args:
       run_dir: created by `learner.run_directory.create_run`, if this is rank 0.
       config: the run, the same for all ranks; a resumed run may change settings that affect no
-      array. transport: endpoint of the learner; the caller closes it.
+        array.
+      transport: endpoint of the learner; the caller closes it.
       stop_event: ends training after the current update.
       resume: resumes from the newest intact checkpoint (of rank 0), which may come from any number
-      of ranks. ranks: processes of the learner, if there are several.
+        of ranks.
+      ranks: processes of the learner, if there are several.
       audit: writes the journal in `audit/` and, if configured, accepted rollouts in `accepted/`.
-      Both need rollouts on
-        the host, not on a device.
+        Both need rollouts on the host, not on a device.
       recorder: context entered while the learner runs, for example to write the run's logs.
       on_update: called with the metrics of every update.
       on_event: called with level and text of every event.
 
     Raises:
       CongraspError: the directory is not a run directory, or in use; the checkpoint does not match;
-      the disk is full; a
-        thread of this process died; training collapsed; another rank ended the run.
+        the disk is full; a thread of this process died; training collapsed; another rank ended the
+        run.
       PhysicsError: several batches in a row had values that were not finite; state and last batch
-      are in `failure/`.
+        are in `failure/`.
     """
     ranks = ranks or Ranks()
     check_lock: Callable[[], None] = lambda: None  # noqa: E731  of other ranks

@@ -59,12 +59,11 @@ def create_run(
       run_dir: path of the directory.
       config: the run.
       initial: initial policy instead of random weights: its networks and normalisers. Inputs of the
-      state and of the
-        critic that it lacks get zero weight.
+        state and of the critic that it lacks get zero weight.
 
     Raises:
       CongraspError: the directory already has a run, or remains of one; or the initial policy does
-      not match the run.
+        not match the run.
     """
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
@@ -185,7 +184,7 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
 
     Raises:
       CongraspError: the run had checkpoints that are gone; restarting it here would overwrite the
-      rest.
+        rest.
     """
     if Checkpoints(run_dir / CHECKPOINTS).files():
         return True
@@ -215,7 +214,7 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
 
     Raises:
       CongraspError: a setting differs that may not, this is not a run directory, or a learner is
-      using it.
+        using it.
     """
     before = open_run(run_dir)
     for field in dataclasses.fields(config):

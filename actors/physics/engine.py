@@ -96,7 +96,7 @@ class Physics(Protocol):
           target: (B, 6 + M) targets of the wrist's joints and of the fingers' motors.
           table: (B,) bool, True where the table is present.
           force: (B, 3) force on the object's centre of mass throughout the step, world frame, N;
-          none by default.
+            none by default.
         """
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
@@ -158,7 +158,8 @@ def physics_state(
       where: indices of the compiled scene.
       qpos: generalised positions.
       qvel: generalised velocities; the free joint's angular part is converted from the object frame
-      to the world frame. sensordata: contact sensors of all links, strongest contacts first.
+        to the world frame.
+      sensordata: contact sensors of all links, strongest contacts first.
       diverged: (B,) bool, returned unchanged.
       occupancy: (3,), returned unchanged.
     """

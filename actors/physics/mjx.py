@@ -62,7 +62,7 @@ class MjxPhysics:
 
         Raises:
           CongraspError: the hand has collision shapes other than capsules, for which MJX lacks some
-          pairs.
+            pairs.
         """
         if any(link.solids for link in hand.links):
             raise CongraspError(

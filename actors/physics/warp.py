@@ -442,8 +442,7 @@ class WarpPhysics:
           task: timing and collision settings.
           objects: the pool indexed by `ResetState.object_index`.
           mesh_slots: most mesh pieces of an object, 0 for primitives only; by default as many as in
-          this pool, at
-            least 8.
+            this pool, at least 8.
 
         Raises:
           CongraspError: an object has more pieces than slots.

@@ -83,8 +83,7 @@ def get_hand(reference: str) -> Hand:
 
     Args:
       reference: the name of a hand of the package (`human:left` for its mirror image) or of one in
-      `hands_folder`, the
-        path of a hand file, or all of its text (`Hand.reference`).
+        `hands_folder`, the path of a hand file, or all of its text (`Hand.reference`).
 
     Raises:
       CongraspError: there is no such hand; the message lists the available ones.

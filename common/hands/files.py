@@ -75,7 +75,7 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
 
     Raises:
       CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand is not
-      valid.
+        valid.
     """
     try:
         fields = json.loads(text) if len(text) <= MAX_BYTES else None

@@ -51,7 +51,7 @@ def file_name(text: object, what: str) -> str:
 
     Raises:
       CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special
-      character.
+        character.
     """
     if isinstance(text, str) and text and (text[0].isalnum() or text[0] == "_"):
         fits = len(text) <= LONGEST_NAME and len(text.encode(errors="replace")) <= _LONGEST_BYTES
@@ -189,7 +189,7 @@ def read_npz(
       largest: limit of the arrays' total size, bytes.
       most: limit of the number of arrays.
       pickled: returns arrays of objects as the bytes of their pickle; otherwise they are errors.
-      Nothing is unpickled.
+        Nothing is unpickled.
 
     Raises:
       CongraspError: the file is not an NPZ file, is damaged, or exceeds a limit.
@@ -263,8 +263,8 @@ def check_arrays(
     Args:
       arrays: arrays by name.
       meanings: descriptions of the required arrays: a shape of letters and numbers, then words,
-      such as `(T, 3) m,
-        world`. The word "text" after the shape, or "bool" anywhere, marks an array without numbers.
+        such as `(T, 3) m, world`. The word "text" after the shape, or "bool" anywhere, marks an
+        array without numbers.
       indices: names of integer arrays.
       largest: exclusive bound of the absolute values.
       sizes: known sizes by letter; any other letter takes the size of the first array that has it.
@@ -274,7 +274,8 @@ def check_arrays(
 
     Raises:
       ValueError: an array is empty, has the wrong shape or type, or holds numbers that are not
-      finite or too large. KeyError: an array is missing.
+        finite or too large.
+      KeyError: an array is missing.
     """
     known = dict(sizes or {})
     for name, meaning in meanings.items():

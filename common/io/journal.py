@@ -38,7 +38,7 @@ class Journal:
         Args:
           path: the file; its folder is created if needed.
           warn: called with one line when lines cannot be written; the process continues without
-          them.
+            them.
 
         Raises:
           CongraspError: the file cannot be opened.

@@ -89,8 +89,7 @@ def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
 
     Raises:
       CongraspError: it is not an NPZ file, exceeds the limits of `common.io.inputs`, or holds
-      anything but plain values
-        and arrays.
+        anything but plain values and arrays.
     """
     arrays = read_npz(path, "Download the file again.", pickled=True)
     pickles = {

@@ -91,7 +91,7 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
 
     Args:
       objects: N objects; beyond 2,048 grids become coarser, so that they need at most half a
-      gigabyte.
+        gigabyte.
     """
     cells = min(CELLS, _MOST // len(objects))
     lattices = [_lattice(obj, cells) for obj in objects]

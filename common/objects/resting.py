@@ -73,7 +73,7 @@ class TableScene:
           pose: (7,) initial pose.
           seconds: simulated time.
           overdamped: damps rotation so strongly that rocking stops quickly; False gives the task's
-          physics.
+            physics.
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = pose

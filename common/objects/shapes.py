@@ -369,8 +369,7 @@ def sample_mesh(
       pieces: collision pieces in the same frame.
       rng: generator for the start of the low-discrepancy sequence.
       oriented: True if all triangles have outward normals; otherwise, normals that point into the
-      pieces while the
-        other side is free are flipped.
+        pieces while the other side is free are flipped.
 
     Returns:
       Points (N, 3), outward unit normals (N, 3), and indices (N,) of each point's triangle.

@@ -60,7 +60,7 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
 
     Raises:
       CongraspError: the file is missing, of another kind, damaged, or has implausible values
-      (`faults`).
+        (`faults`).
     """
     path = pathlib.Path(path)
     remedy = "Run 'congrasp objects import' or 'congrasp objects generate' again."

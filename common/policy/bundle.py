@@ -196,7 +196,7 @@ class PolicyBundle:
 
         Raises:
           CongraspError: an entry is missing, has the wrong shape, or is out of range; the message
-          names the first.
+            names the first.
         """
         meta = message.meta
         if meta.get("format") != FORMAT:

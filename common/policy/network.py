@@ -257,8 +257,8 @@ def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Pa
     Args:
       params: parameters of actor and critic.
       state: for each input of the new state its index in the old one, all of which must occur, or
-      -1 if it is new. privileged: the same for the critic's privileged inputs, of which some may be
-      dropped.
+        -1 if it is new.
+      privileged: the same for the critic's privileged inputs, of which some may be dropped.
     """
     before = len(params["actor"]["network"]["trunk_0"]["kernel"])
     kept = np.concatenate([state, np.arange(np.count_nonzero(state >= 0), before)])

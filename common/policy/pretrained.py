@@ -80,7 +80,7 @@ def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path
 
     Raises:
       CongraspError: there is no such file, policy or hand, or the user's policy belongs to another
-      hand of this name.
+        hand of this name.
     """
     path = (_packaged(given) or given) if given else pretrained_file(hand)
     if (

@@ -97,7 +97,8 @@ def look(
       time: (B,) int control steps since the start of the episodes, including this one.
       state: true state of the engine after the step (`actors.physics.engine.PhysicsState`).
       start: initial state of the episodes (`actors.physics.engine.ResetState`), for the wrist's
-      base. surface: labelled surface points, object frame.
+        base.
+      surface: labelled surface points, object frame.
     """
     pose = jnp.concatenate([state.object_position, state.object_quaternion], -1)
     poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)

@@ -157,8 +157,7 @@ def evaluated_as(task: TaskConfig, name: str, source: str) -> TaskConfig:
     Args:
       task: task of the policy.
       name: name of the method. One that does not learn accepts any policy, takes its hand and
-      geometry, and ignores its
-        actions.
+        geometry, and ignores its actions.
       source: name of the policy in errors.
 
     Raises:

@@ -42,7 +42,7 @@ def estimated_normals(points: Array, eye: Array | None = None) -> Array:
     Args:
       points: points of the surface of an object, in any unit and frame.
       eye: (B, 3) positions of cameras toward which the normals point; None for clouds of whole
-      objects.
+        objects.
     """
     points = jnp.asarray(points, jnp.float32)
     middle = jnp.mean(points, 1, keepdims=True)

@@ -15,7 +15,8 @@ def resting_mean(
       xp: numpy or jax.numpy.
       mean: (..., 7) position, m, and quaternion so far.
       count: (...) number of readings in the mean; 0 for good once the object has moved or the table
-      is removed. reading: (..., 7) newest reading.
+        is removed.
+      reading: (..., 7) newest reading.
       table: (...) bool: the table is present.
       settle: largest distance of an included reading from the mean, m.
 

@@ -248,7 +248,8 @@ def seen_by(task: TaskSettings, state: SceneState, readings: Readings) -> SceneS
     Args:
       task: the task.
       state: the true state, except for the object's initial pose, which must be the first shown by
-      the tracker. readings: the last control steps.
+        the tracker.
+      readings: the last control steps.
     """
     newest = ("q_target", "u_target", "object_position", "object_quaternion")
     state = state._replace(**{name: getattr(readings, name)[:, 0] for name in newest})

@@ -115,12 +115,12 @@ class Transport(Closing, Protocol):
         Args:
           key: key or key expression.
           handler: returns the reply; called in a separate daemon thread. Message and code of its
-          CongraspError are
-            sent.
+            CongraspError are sent.
           workers: threads that run the handler.
           depth: length of the queue; further queries wait at their senders.
           on_damage: called for requests that cannot be decoded; these are refused without calling
-          the handler. admission: called before a request is decoded; it may reject it with a reply.
+            the handler.
+          admission: called before a request is decoded; it may reject it with a reply.
         """
         ...
 
@@ -134,8 +134,8 @@ class Transport(Closing, Protocol):
 
         Raises:
           RefusedError: the peer answered with an error; of the subclass that its code names
-          (`common.errors`). TransportError: no peer serves the key, or there was no response in
-          time.
+            (`common.errors`).
+          TransportError: no peer serves the key, or there was no response in time.
         """
         ...
 

@@ -20,7 +20,7 @@ def check_name(what: str, name: str) -> str:
 
     Raises:
       CongraspError: it is empty, too long, or has characters other than letters, digits, `_`, `.`
-      and `-`.
+        and `-`.
     """
     if not _NAME.fullmatch(name):
         raise CongraspError(

@@ -244,7 +244,7 @@ def secured(endpoint: str, credentials: Credentials | None) -> str:
 
     Raises:
       CongraspError: a TLS or QUIC endpoint has no credentials, or one with credentials is neither
-      TCP nor TLS.
+        TCP nor TLS.
     """
     protocol, _, rest = endpoint.partition("/")
     if credentials is None:

@@ -72,8 +72,7 @@ def connect(
 
     Raises:
       CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted,
-      or of another role or
-        run; or the listener's certificate does not allow it to listen.
+        or of another role or run; or the listener's certificate does not allow it to listen.
       TransportError: no listener responds.
     """
     return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait, run=run))
@@ -94,15 +93,15 @@ def listen(
       url: `SCHEME/ADDRESS`.
       role: learner or policy server.
       certs: folder of the role's certificate: enables mutual TLS, and restricts each role to its
-      rights. insecure: allows listening beyond loopback without certificates.
+        rights.
+      insecure: allows listening beyond loopback without certificates.
       run: required run of the certificate.
       longest_rollout: longest rollout accepted by a learner, in bytes; longer ones are dropped
-      undecoded.
+        undecoded.
 
     Raises:
       CongraspError: the URL is malformed or in use; or it is exposed to other machines without
-      protection; or the
-        certificates are missing, expired, or of another role or run.
+        protection; or the certificates are missing, expired, or of another role or run.
     """
     return _open(
         Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout)

@@ -183,7 +183,7 @@ def connect(
     Raises:
       TransportError: there is no response before the deadline.
       CongraspError: the listener rejects our certificate, or its certificate does not allow it to
-      listen for this run.
+        listen for this run.
     """
     while True:
         try:
@@ -357,7 +357,7 @@ class Sessions:
           credentials: credentials of this process.
           period: seconds between two checks.
           known: the certificates that were revoked when a listener's sessions were opened; None if
-          they connect.
+            they connect.
         """
         if known is None:
             self.start(heed_revocations, self, credentials, period)

@@ -119,7 +119,7 @@ class Outbox:
           payload: the whole reply.
           attachment: attachment of the query.
           account: account of the client. Its first chunk is short while others are being sent to
-          it.
+            it.
         """
         longest = min(_WISH.unpack(attachment)[0], _LONGEST) if len(attachment) == _WISH.size else 0
         if len(payload) <= _FIRST or longest <= _FIRST:
@@ -246,23 +246,24 @@ class ZenohTransport(Transport):
 
         Args:
           connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that responds
-          is used, and
-            reconnected whenever it returns.
+            is used, and reconnected whenever it returns.
           listen: endpoints to listen on instead.
           flows: flows to open; flow i uses the port i above the endpoint's, so the flows of both
-          ends must start alike. max_message: limit of a message's length in bytes;
-          `zenoh_session.LONGEST` has lower limits for some flows. wait: seconds to wait for a
-          listener at `connect`. credentials: credentials for mutual TLS; a listener restricts each
-          role to its rights in
+            ends must start alike.
+          max_message: limit of a message's length in bytes; `zenoh_session.LONGEST` has lower
+            limits for some flows.
+          wait: seconds to wait for a listener at `connect`.
+          credentials: credentials for mutual TLS; a listener restricts each role to its rights in
             `common.transport.security`. None uses plain TCP.
           longest_rollout: longest rollout accepted by a listener, in bytes; by default
-          `max_message`. revocation_seconds: period of the checks for revoked certificates. A
-          listener then reopens all connections; a
-            connecting transport closes if its listener's certificate is revoked.
+            `max_message`.
+          revocation_seconds: period of the checks for revoked certificates. A listener then reopens
+            all connections; a connecting transport closes if its listener's certificate is revoked.
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are
-          not accepted. TransportError: no listener responds.
+            not accepted.
+          TransportError: no listener responds.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")

@@ -116,7 +116,8 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
 
     Args:
       data: the bytes; the arrays of the result are views of them, and `encode` of the result
-      returns the same bytes. max_bytes: limit of the message's length.
+        returns the same bytes.
+      max_bytes: limit of the message's length.
 
     Raises:
       CongraspError: the bytes are not an intact message; the message names the fault.

@@ -241,7 +241,8 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
 
     Args:
       message: the message; device arrays are not checked for finite values, since they never left
-      this process. spec: specification of the kind.
+        this process.
+      spec: specification of the kind.
       **sizes: sizes of symbols known beforehand.
 
     Returns:
@@ -249,7 +250,7 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
 
     Raises:
       CongraspError: the message is invalid; the text names the array or the entry, and the violated
-      rule.
+        rule.
     """
     for name, kind in spec.meta.items():
         value = message.meta.get(name)
@@ -345,7 +346,7 @@ def validate_rollout(
 
     Raises:
       CongraspError: the rollout is invalid; the text names the array or the entry, and the violated
-      rule.
+        rule.
     """
     validate(
         message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes
@@ -378,7 +379,7 @@ def validate_bundle(message: Message, *, schema: str | None = None) -> None:
 
     Raises:
       CongraspError: the bundle is invalid; the text names the array or the entry, and the violated
-      rule.
+        rule.
     """
     validate(message, BUNDLE)
     if not any(name.startswith("actor/") for name in message.arrays):

@@ -86,8 +86,7 @@ class Distillation:
 
         Raises:
           CongraspError: no teacher is named, its file cannot be read, or its observations or
-          actions differ from this
-            task's.
+            actions differ from this task's.
         """
         teacher = read_teacher(config.distill.teacher)
         _check(teacher, spec, config.task)
@@ -118,7 +117,8 @@ class Distillation:
 
         Raises:
           NonFiniteUpdate: a term is not finite; the error names the first one and holds the state
-          before the update. CongraspError: there are more minibatches than transitions.
+            before the update.
+          CongraspError: there are more minibatches than transitions.
         """
         config = self._config
         transitions = batch["observation"].shape[0] * batch["observation"].shape[1]

@@ -48,12 +48,12 @@ def advantages(
       reward: (T, B).
       value: (T, B) values of the observations before each action, in the rewards' unit.
       last_value: (B,) value of the observation after the last step; ignored where that step was
-      terminal. terminal: (T, B) bool, True where an episode ended with this step.
+        terminal.
+      terminal: (T, B) bool, True where an episode ended with this step.
       gamma: discount.
       gae_lambda: lambda.
       truncated: (T, B) bool, terminal steps to bootstrap from, because a time limit ended the
-      episode. None for no
-        step.
+        episode. None for no step.
     """
     continues = 1.0 - terminal.astype(value.dtype)
     delta = td_errors(reward, value, last_value, terminal, gamma, truncated)

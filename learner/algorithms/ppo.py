@@ -124,8 +124,7 @@ class PPO:
 
         Raises:
           NonFiniteUpdate: a term is not finite, or the policy left its trust region by far; the
-          error names the first
-            term and holds the state before the update.
+            error names the first term and holds the state before the update.
           CongraspError: there are more minibatches than transitions.
         """
         config = self._config

@@ -103,15 +103,15 @@ class Algorithm(Protocol):
         Args:
           state: the training state; the arrays of its `optimizer` must not be used again.
           batch: the arrays of `batch_schema`, with the rollouts of this process along the axis B;
-          possibly `lag` (B,)
-            int32, versions between the policy that acted and the current one, 0 by default.
+            possibly `lag` (B,) int32, versions between the policy that acted and the current one, 0
+            by default.
           mesh: mesh of the ranks' devices along `collectives.AXIS`. Each rank calls this with the
-          same state and a
-            batch of the same shape, and gets the same result. None for a single process.
+            same state and a batch of the same shape, and gets the same result. None for a single
+            process.
 
         Raises:
           NonFiniteUpdate: a term is not finite; the error names the first one, and the batch is
-          dropped.
+            dropped.
         """
 
     def policy(self, state: TrainState) -> LearnedPolicy:

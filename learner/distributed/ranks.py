@@ -155,7 +155,7 @@ class Ranks:
       rank: number of this process.
       count: number of ranks.
       mesh: a device of every rank along `learner.distributed.collectives.AXIS`; None if this
-      process is alone.
+        process is alone.
     """
 
     def __init__(
@@ -194,7 +194,8 @@ class Ranks:
           rank: number of this process.
           count: number of ranks.
           coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the
-          ranks). on_lost: called with the reason when another rank is lost; it should not return.
+            ranks).
+          on_lost: called with the reason when another rank is lost; it should not return.
 
         Raises:
           CongraspError: the rank, the count or the address is invalid, or the port is in use.

@@ -88,7 +88,7 @@ class Admission:
 
         Raises:
           CongraspError: a value is out of range, or the task has no such metric; the message names
-          it.
+            it.
         """
         arrays = {
             name: array for name, array in message.arrays.items() if isinstance(array, np.ndarray)

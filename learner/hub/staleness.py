@@ -279,7 +279,7 @@ class StalenessManager:
           ticket_id: ticket of the rollout.
           version: policy version of the rollout.
           beyond_capacity: admits it without a ticket or capacity, because it had been admitted
-          before.
+            before.
         """
         with self._lock:
             self._expire()

@@ -93,8 +93,7 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
 
     Raises:
       CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges
-      nor slides, or the
-        speed limits are invalid.
+        nor slides, or the speed limits are invalid.
     """
     with confined(write_arm, path, {"flange": flange, "speed": speed}) as (answer, folder):
         arrays = read_npz(folder / _ARRAYS, "")

@@ -130,12 +130,13 @@ def bench_scaling(
       ranks: numbers of ranks; efficiency is relative to the first.
       seconds: duration of each measurement.
       actors: actor processes of each rank; by default none on GPUs (one runs inside each rank),
-      otherwise one. deadline: total time of one number of ranks, s.
+        otherwise one.
+      deadline: total time of one number of ranks, s.
       out: file for the results.
 
     Raises:
       CongraspError: the machine has too few GPUs, a process failed permanently, or a deadline
-      passed.
+        passed.
     """
     if not ranks or min(ranks) < 1:
         raise CongraspError("Name numbers of ranks from 1 on.", "For example --ranks 1 2 4.")

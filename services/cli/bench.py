@@ -22,7 +22,8 @@ def physics(
       environments: Number of parallel environments.
       threads: Threads of the native engine; 0 uses all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio
-      of the best. engines: Engines to measure; by default those that suit the machine.
+        of the best.
+      engines: Engines to measure; by default those that suit the machine.
 
     Examples:
       congrasp bench physics
@@ -95,8 +96,7 @@ def scaling(  # noqa: PLR0913
       environments: Environments in one actor; 0: those of the preset.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
       actors: Actor processes of each rank; by default none on GPUs, where each rank runs one in its
-      process, otherwise
-        one.
+        process, otherwise one.
       deadline: Deadline of one number of ranks, s.
       out: File for the results as JSON.
 

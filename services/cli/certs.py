@@ -30,7 +30,8 @@ def init(
       folder: Folder for the authority and the certificates.
       run: Name of the run.
       host: Names and addresses of this machine, under which others will connect to its learner or
-      policy server. force: Replace an existing authority; its certificates become invalid.
+        policy server.
+      force: Replace an existing authority; its certificates become invalid.
 
     Examples:
       congrasp certs init certs --run human --host 10.0.0.5
@@ -63,8 +64,7 @@ def issue(
     Args:
       folder: Folder of the authority.
       role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or
-      observer (status,
-        recorder).
+        observer (status, recorder).
       run: Name of the run; by default that of the authority.
       number: Distinguishes the certificates of a role; by default the lowest free one.
       host: Names and addresses under which others will connect to it (learner and server).

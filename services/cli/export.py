@@ -64,10 +64,10 @@ def motion(  # noqa: PLR0913
 
     Args:
       paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot
-      takes several. to: The format.
+        takes several.
+      to: The format.
       out: The file or folder to write; by default one named after the object, such as mug.glb, in
-      the working
-        directory.
+        the working directory.
       index: Index of the recorded episode, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       fps: Frames a second, such as 24 for a film; the motion's own 100 by default.

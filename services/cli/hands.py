@@ -111,14 +111,14 @@ def import_hand(  # noqa: PLR0913
       name: Its name; that of the file by default.
       palm: Body of the palm; by default the one from which most fingers branch.
       thumb: The last body of the finger that opposes the others; by default one called thumb, or
-      the one that best
-        faces the others.
+        the one that best faces the others.
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1
-      for a human hand's. collision: Collision shapes in physics: own uses the file's boxes,
-      cylinders, balls, ellipsoids and capsules, and
-        capsules for links that collide by meshes.
+        for a human hand's.
+      collision: Collision shapes in physics: own uses the file's boxes, cylinders, balls,
+        ellipsoids and capsules, and capsules for links that collide by meshes.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands
-      list' names it). png: The picture; by default next to the file.
+        list' names it).
+      png: The picture; by default next to the file.
 
     Examples:
       congrasp hands import hand.urdf

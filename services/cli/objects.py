@@ -41,8 +41,7 @@ def generate(
       count: Number of objects.
       seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
       families: Families, in turn, or groups of them: basic (if none is named), household, all
-      (both),
-        scans.
+        (both), scans.
 
     Examples:
       congrasp objects generate --count 100
@@ -188,7 +187,8 @@ def show(
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
-      mug:7. folder: Folder of objects.
+        mug:7.
+      folder: Folder of objects.
       png: Picture to write: labelled surface, convex pieces, headings on the table.
 
     Examples:
@@ -245,7 +245,8 @@ def rests(
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
-      mug:7. folder: Folder of objects.
+        mug:7.
+      folder: Folder of objects.
       png: Picture to write: a thumbnail of each.
 
     Examples:
@@ -305,12 +306,13 @@ def set_affordance(  # noqa: PLR0913
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
-      mug:7. part_mesh: A mesh of the graspable part, in the frame and unit of the object's file.
+        mug:7.
+      part_mesh: A mesh of the graspable part, in the frame and unit of the object's file.
       painted: A PLY file of the object with coloured vertices, in the same frame and unit.
       colour: Colour of the graspable region in the painted file: red, green, blue, yellow, or
-      #rrggbb. half_space: Three numbers of a direction and one in metres: the region farther than
-      that along the direction is
-        graspable. In the object's frame, whose origin is its centre of mass.
+        #rrggbb.
+      half_space: Three numbers of a direction and one in metres: the region farther than that along
+        the direction is graspable. In the object's frame, whose origin is its centre of mass.
       invert: Use the selection as the avoid region, and the rest as the graspable one.
       name: Name of the new object; by default it replaces the old one.
       folder: Folder of objects, to which the new one goes.

@@ -19,11 +19,9 @@ def plot(
 
     Args:
       paths: Runs' folders, or MCAP files, which are overlaid; a run in progress is drawn up to its
-      last half second. Or
-        the JSON file of one 'congrasp evaluate --json'.
+        last half second. Or the JSON file of one 'congrasp evaluate --json'.
       out: Folder for the figures; by default 'plots' next to the recordings or the JSON file.
-      Required for several
-        runs.
+        Required for several runs.
       formats: Formats of the files.
 
     Examples:

@@ -40,7 +40,8 @@ def record(
       run: Name of the run.
       out: Folder for the MCAP files.
       live: Also serve everything to the Foxglove app on this port of the loopback interface:
-      ws://127.0.0.1:PORT. duration: Seconds after which to stop; by default on Ctrl-C.
+        ws://127.0.0.1:PORT.
+      duration: Seconds after which to stop; by default on Ctrl-C.
       log_format: Text, or one JSON object per line: time, level, role, id, run, text, fields.
       certs: Folder of an observer's certificate (congrasp certs).
 

@@ -41,32 +41,28 @@ def train(  # noqa: PLR0913
       config: The run.
       launch: Its processes.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or
-      check, which trains
-        nothing and shows that physics, messages, log, server and pictures work here.
+        check, which trains nothing and shows that physics, messages, log, server and pictures work
+        here.
       method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl,
-      dgrasp,
-        no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots
+        dgrasp, no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots
         (student, with a tracker; camera, with a depth camera). By default that of the preset, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by
-      default the
-        preset's.
+        default the preset's.
       run_dir: Folder of the run; runs/NAME-DATE by default.
       initial: A policy to begin with instead of random weights, of the same networks:
-      `policy.safetensors` of a run. teacher: A policy file, or the hand of a pretrained policy, to
-      distil into a policy for robots, which sees the
-        joints, the wrist and a tracker's object poses, no forces and no velocities
-        (docs/students.md), or with `--method camera` a partial point cloud (docs/camera.md). The
-        task is the teacher's, the algorithm `distill`.
+        `policy.safetensors` of a run.
+      teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for
+        robots, which sees the joints, the wrist and a tracker's object poses, no forces and no
+        velocities (docs/students.md), or with `--method camera` a partial point cloud
+        (docs/camera.md). The task is the teacher's, the algorithm `distill`.
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp
-      constraints import'); their
-        objects are those of --objects.folder, and --objects.procedural adds others.
+        constraints import'); their objects are those of --objects.folder, and --objects.procedural
+        adds others.
       split: Split of these sets: training (the default), held out, or all.
       resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the
-      run; options that
-        only the learner uses, such as --updates and --ppo.…, may be changed.
+        run; options that only the learner uses, such as --updates and --ppo.…, may be changed.
       evaluation: Episodes of the evaluation after training, on held-out objects; by default 192, or
-      three times
-        --environments if that is less; 0 leaves it out.
+        three times --environments if that is less; 0 leaves it out.
 
     Examples:
       congrasp train --preset quickstart --run-dir runs/mine

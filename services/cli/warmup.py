@@ -50,8 +50,7 @@ def warmup(
       rollout_steps: Control steps of a rollout; 0: those of the preset.
       export: Tar file into which everything in these caches is then written.
       source: Such a file, from which the caches are filled instead. It holds programs that will run
-      here: import only
-        files that you trust.
+        here: import only files that you trust.
 
     Examples:
       congrasp warmup --preset human
@@ -117,7 +116,7 @@ def import_caches(path: pathlib.Path) -> int:
 
     Raises:
       CongraspError: the file cannot be read, is not of this command, or was made for other versions
-      or another device.
+        or another device.
     """
     folders, members = _folders(), dict[tarfile.TarInfo, pathlib.Path]()
     with _opened(path) as archive:

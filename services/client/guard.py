@@ -105,7 +105,7 @@ class Guard(Closing):
     Attributes:
       counters: counters of commands and answers.
       trouble: cause of the last query without an answer; empty while there are answers, also during
-      a fallback.
+        a fallback.
     """
 
     def __init__(  # noqa: PLR0913
@@ -127,8 +127,7 @@ class Guard(Closing):
         Args:
           policy: the policy.
           limits: limits of the F finger joints, each of which has a motor, then the six wrist
-          joints; by default those
-            of the policy's `metadata`.
+            joints; by default those of the policy's `metadata`.
           open_pose: (F,) rad, finger angles of `open`; by default those of the metadata.
           period: seconds between two steps.
           wait: seconds that a step waits for its answer, which may also arrive in a later step.
@@ -136,12 +135,12 @@ class Guard(Closing):
           hold: seconds without a fresh answer until the fallback.
           fallback: `freeze` or `open`.
           table: a, b, c, d in the world frame: the palm stays where a x + b y + c z >= d; (a, b, c)
-          of length 1. clock: clock in seconds, such as `time.monotonic`.
+            of length 1.
+          clock: clock in seconds, such as `time.monotonic`.
 
         Raises:
           CongraspError: limits and open pose do not match, the times are not 0 <= wait < period and
-          0 < stale <= hold,
-            or there is no such fallback.
+            0 < stale <= hold, or there is no such fallback.
           TransportError: the policy's metadata is needed, and there is no response.
         """
         if limits is None or open_pose is None:
@@ -176,15 +175,14 @@ class Guard(Closing):
 
         Args:
           request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand
-          must be, and those of
-            the fingers continue from the last command. The first episode's start from its `q`.
+            must be, and those of the fingers continue from the last command. The first episode's
+            start from its `q`.
           moved: True if the fingers were moved by other means since the last command: their targets
-          also start from
-            `q`.
+            also start from `q`.
 
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no
-          pose.
+            pose.
         """
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
@@ -217,8 +215,7 @@ class Guard(Closing):
 
         Args:
           state: see `Policy.act`; missing fields count as not measured. Missing joint velocities
-          are estimated from
-            successive positions, for the limits and for the policy.
+            are estimated from successive positions, for the limits and for the policy.
 
         Raises:
           RefusedError: there is no episode yet.

@@ -107,11 +107,12 @@ class JointLimits:
           wrist_speed: speed limit of the wrist, m/s.
           wrist_angular_speed: angular speed limit of the wrist, rad/s.
           reach: largest displacement of the wrist since the start of the episode, along each axis,
-          m. turn: largest rotation, likewise, rad.
+            m.
+          turn: largest rotation, likewise, rad.
           margin: distance of finger targets from the ends of their joints, rad; narrow joints stay
-          in their middle. grip: limit of the force of a straight finger at its tip, N; that of a
-          bent one is larger, as its lever is
-            shorter.
+            in their middle.
+          grip: limit of the force of a straight finger at its tip, N; that of a bent one is larger,
+            as its lever is shorter.
         """
         from congrasp.common.hands.motors import motor_limits
         from congrasp.common.task.config import ControlConfig
@@ -187,8 +188,7 @@ class Speeds:
         Args:
           most: (J,) largest plausible speed, rad/s or m/s.
           lasting: seconds for which a speed counts after the change of the position; measurements
-          may arrive at a lower
-            rate than steps.
+            may arrive at a lower rate than steps.
         """
         self._most, self._lasting = most, lasting
         self._position, self._when = np.full(len(most), np.nan), np.full(len(most), -math.inf)
@@ -245,7 +245,7 @@ class Limiter:
 
         Raises:
           CongraspError: the start is not a finite number for each joint, or the period not
-          positive.
+            positive.
         """
         first = as_numbers(start, len(limits.lower))
         if not np.isfinite(first).all() or not 0.0 < period < math.inf:
@@ -375,7 +375,8 @@ class Floor:
 
         Args:
           plane: (4,) a, b, c, d, world frame: points with a x + b y + c z >= d are above; (a, b, c)
-          of length 1. wrist: the base of the wrist joints, world frame.
+            of length 1.
+          wrist: the base of the wrist joints, world frame.
           palm: see `JointLimits`.
 
         Raises:

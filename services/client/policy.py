@@ -74,9 +74,9 @@ class Policy(Closing, Protocol):
 
         Args:
           request: with `surface`, `q`, `wrist` (the base from now on) and `object_pose`, the goal
-          arrays of its
-            constraints, and `avoid` if the affordance is among them. A policy with a camera takes
-            `cloud` instead of `surface` and `object_pose`, and constraints in the world frame.
+            arrays of its constraints, and `avoid` if the affordance is among them. A policy with a
+            camera takes `cloud` instead of `surface` and `object_pose`, and constraints in the
+            world frame.
 
         Raises:
           RefusedError: the request lacks one of them, or a value is no array of numbers.
@@ -88,17 +88,16 @@ class Policy(Closing, Protocol):
 
         Args:
           state: `q`, `u`, `object_position`, `object_quaternion`; optionally `table` (True by
-          default) and, from
-            sensors, `q_velocity`, `u_velocity`, `object_velocity`, `object_angular_velocity`,
-            `contact_force`, `contact_position`, `contact_found` and `wrist_load`, by the names and
-            shapes of `common.task.types.SceneState` without the batch axis. A policy with a camera
-            takes no pose of the object but, from a newer image, `cloud` (N, 3) in the world frame.
+            default) and, from sensors, `q_velocity`, `u_velocity`, `object_velocity`,
+            `object_angular_velocity`, `contact_force`, `contact_position`, `contact_found` and
+            `wrist_load`, by the names and shapes of `common.task.types.SceneState` without the
+            batch axis. A policy with a camera takes no pose of the object but, from a newer image,
+            `cloud` (N, 3) in the world frame.
 
         Raises:
           RefusedError: the request or the state is invalid. Its subclasses in `common.errors` are
-          errors that a program
-            can handle: an unknown constraint, a contradiction, an overloaded server, a deadline
-                missed there.
+            errors that a program can handle: an unknown constraint, a contradiction, an overloaded
+            server, a deadline missed there.
           TransportError: there is no response from the server.
         """
         ...
@@ -112,8 +111,7 @@ class Policy(Closing, Protocol):
 
         Args:
           states: see `act`; 1 to 64. A state may also have `time` in control steps, and `q_target`
-          and `u_target`,
-            from which its targets continue.
+            and `u_target`, from which its targets continue.
 
         Raises:
           TransportError: see `act`; if one state is invalid, none gets an answer.
@@ -276,8 +274,7 @@ class Packer:
           layout: `query` of the policy's metadata.
           episode: fields that stay the same.
           constraints: goal arrays of each constraint. Those of a constraint that the policy lacks
-          are not packed: the
-            policy refuses its name.
+            are not packed: the policy refuses its name.
 
         Raises:
           RefusedError: a field is unknown, absent, of the wrong shape or in another unit.
@@ -309,7 +306,7 @@ class Packer:
 
         Raises:
           RefusedError: there are too many states, or a field is unknown, absent, of the wrong shape
-          or in another unit.
+            or in another unit.
         """
         if len(states) > self._layout["states"]:
             raise RefusedError(

@@ -254,7 +254,7 @@ class Shards(NamedTuple):
 
         Raises:
           CongraspError: the folder holds a shard of another dataset than `about` describes, or a
-          damaged one.
+            damaged one.
         """
         found = {}
         for path in sorted((self.folder / "grasps").glob("*.parquet")):

@@ -227,7 +227,7 @@ class Experiment:
 
         Raises:
           CongraspError: no object allows the row's constraints, or the policy does not support
-          them.
+            them.
         """
         return plan_row(
             self.task, variation.bank(self), self.scaled, variation.constraint, self.episodes
@@ -288,7 +288,7 @@ class Experiment:
           variations: the rows. Those of one task in a sequence share a simulator.
           keep: keeps some episodes of each row; every step of all worlds is then in memory.
           stored: folder for the rows, without kept episodes; a run with the same arguments resumes
-          from it.
+            from it.
 
         Raises:
           CongraspError: no object allows a row's constraints, or the policy does not support them.
@@ -405,8 +405,7 @@ class Experiment:
           variation: the row.
           plan: its episodes.
           stressed: least number of episodes that continue after the hold with lift and pushes;
-          batches continue as a
-            whole.
+            batches continue as a whole.
         """
         if (objects := variation.objects(self.scaled)) is not running.objects:
             running.replace_objects(objects, self.field)

@@ -122,8 +122,7 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
 
     Raises:
       CongraspError: a policy cannot be read or has another method, a folder holds none, or two have
-      the same hand and
-        method.
+        the same hand and method.
     """
     found: list[Entrant] = []
     for text in texts:

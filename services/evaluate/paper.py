@@ -42,8 +42,7 @@ def paper_row(
     Args:
       source: one of `SOURCES`, or empty for none.
       hand: name of the hand; in the tables of captured constraints and of large-scale objects, the
-      human hand is
-        MANO's.
+        human hand is MANO's.
       method: method of `common.task.methods`.
       constraint: constraints joined by `+`.
       group: group of objects or pairs; only its first word is compared.

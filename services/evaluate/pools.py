@@ -264,9 +264,10 @@ def evaluate_pools(
 
     Args:
       experiment: policy and settings; `episodes` is the least total number, and every object has
-      the same number. pools: pools of objects.
+        the same number.
+      pools: pools of objects.
       kept: folder for results of pools, from which an evaluation with the same arguments resumes;
-      None stores none.
+        None stores none.
 
     Raises:
       CongraspError: the hand can approach none of the objects.

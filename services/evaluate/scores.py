@@ -159,7 +159,8 @@ def summarise(  # noqa: PLR0913
       objects: names of the pool's objects, including those without an episode.
       pool: number of requested objects, if the row covers only some of them; all by default.
       by_reference: uses references, such as captured sequences, as clusters of the intervals
-      instead of objects. group: group of objects, such as "small (below 8 cm)".
+        instead of objects.
+      group: group of objects, such as "small (below 8 cm)".
       method: method of `common.task.methods`.
       paper: table of the paper for comparison, see `services.evaluate.paper`.
     """

@@ -375,12 +375,13 @@ def evaluate_tables(
 
     Args:
       experiment: policy, evaluated as the method of its task, objects, engine and numbers. The
-      table `objects` has
-        as many episodes in total, on objects of its own.
+        table `objects` has as many episodes in total, on objects of its own.
       tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all
-      of these. pools: pools of the table `objects`, if it is wanted.
+        of these.
+      pools: pools of the table `objects`, if it is wanted.
       kept: folder for the results of rows and pools, to resume from; rows with kept episodes are
-      not stored. keep: keeps episodes for pictures.
+        not stored.
+      keep: keeps episodes for pictures.
 
     Raises:
       CongraspError: the policy's method has no row in these tables, or no object allows one.

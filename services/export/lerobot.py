@@ -65,8 +65,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
 
     Raises:
       CongraspError: the motions differ in robot or control step, or the control step is no whole
-      number of frames a
-        second.
+        number of frames a second.
     """
     first, fps = motions[0], _frame_rate(motions)
     tasks = list(dict.fromkeys(map(_task, motions)))

@@ -336,8 +336,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
 
     Raises:
       CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or
-      damaged, or a
-        quaternion is not normalised.
+        damaged, or a quaternion is not normalised.
     """
     remedy = "Run 'congrasp grasp' again."
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)
@@ -408,7 +407,7 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
 
     Raises:
       CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor
-      0.
+        0.
     """
     if not path.exists():
         raise CongraspError(
@@ -448,8 +447,7 @@ def export_motions(
 
     Raises:
       CongraspError: `path` exists already, has another suffix or cannot be written, a motion has
-      invalid poses, or the
-        format cannot hold what was given.
+        invalid poses, or the format cannot hold what was given.
     """
     if len(motions) > 1 and kind not in DATASETS:
         raise CongraspError(

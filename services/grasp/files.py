@@ -81,7 +81,8 @@ def save_grasp(
       found: the grasp.
       film: style of the MP4; None writes none.
       pictures: also writes the contact sheet, the portrait, the thumbnail and, with an arm, the
-      arm's picture. about: further entries of the result.
+        arm's picture.
+      about: further entries of the result.
       view: viewpoint of pictures and video; the one that shows most of the grasp by default.
 
     Raises:

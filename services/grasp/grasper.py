@@ -106,7 +106,7 @@ class Grasper:
           seed: seed of the attempts.
           arm: the arm that must be able to execute the motion.
           left: grasps with the left hand; the policy's right hand grasps the mirrored object
-          (`common.mirror`).
+            (`common.mirror`).
         """
         if attempts < 1:
             raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
@@ -160,7 +160,7 @@ class Grasper:
           ContradictionError: two of them exclude each other.
           NoReachError: without an arm, no planned approach leads to the grasp.
           CongraspError: the table obstructs all attempts, or the arm can execute none that holds
-          the object.
+            the object.
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
@@ -375,8 +375,8 @@ def grasp(
       seed: seed of the attempts.
       progress: called with the progress.
       **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose,
-      trajectory, fingers, …; each
-        is the text that the command line takes, or a sequence of its words or numbers.
+        trajectory, fingers, …; each is the text that the command line takes, or a sequence of its
+        words or numbers.
 
     Raises:
       CongraspError: the object cannot be imported, or a constraint cannot be read or met.

@@ -78,13 +78,12 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       hand: the hand.
       waypoints: K, of wrist trajectories.
       **texts: by the names of the constraints' options (`Constraint.options`); None or an empty
-      text omits the option.
-        Text is split at blanks and commas if an option takes several words; a number, and a
-        sequence or an array of words or numbers, equal such a text.
+        text omits the option. Text is split at blanks and commas if an option takes several words;
+        a number, and a sequence or an array of words or numbers, equal such a text.
 
     Raises:
       CongraspError: an option is unknown, cannot be read or does not fit the object; the message
-      names it.
+        names it.
     """
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):

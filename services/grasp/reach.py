@@ -136,11 +136,11 @@ def plan_reach(  # noqa: PLR0913
       heading: (3,) unit vector of the approach, world frame.
       first: the single pose (N = 1) in which the grasp begins.
       seconds: requested duration; extended where the wrist would exceed `SPEED`, `ACCELERATION` or
-      `TURNING`. dt: length of a control step, s.
+        `TURNING`.
+      dt: length of a control step, s.
       speed: speed of the wrist at the end, along the heading, m/s.
       side: azimuth of the arm's base as seen from the object, rad: the hand starts there, and
-      higher. None if there is
-        no arm.
+        higher. None if there is no arm.
 
     Raises:
       NoReachError: every curve that was tried touches the object or the table.

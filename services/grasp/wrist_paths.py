@@ -68,15 +68,14 @@ def read_wrist_path(
 
     Args:
       path: `.csv`, a line a frame: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position`
-      (T, 3) and
-        `quaternion` (T, 4), or a grasp motion; or `.bvh`.
+        (T, 3) and `quaternion` (T, 4), or a grasp motion; or `.bvh`.
       joint: name of the wrist joint in a BVH file.
       fingers: axis of the file's wrist frame along which the fingers point, such as +x.
       back: axis of that frame towards the back of the hand.
 
     Raises:
       CongraspError: the file cannot be read or has no such joint, or the axes are unknown or not
-      orthogonal.
+        orthogonal.
     """
     kind = path.suffix.lower()
     if not path.is_file():
@@ -196,9 +195,8 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven
-      finite numbers, a
-        header names no position or quaternion, or several, quaternions are not of length one, or
-        its time runs back.
+        finite numbers, a header names no position or quaternion, or several, quaternions are not of
+        length one, or its time runs back.
     """
     columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
     clock, numbers, stamps = list[int](), list[int](), list[list[float | None]]()

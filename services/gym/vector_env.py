@@ -58,8 +58,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
           objects: number of procedural objects, of the families of the hand's training.
           physics: engine, see `congrasp train --physics`.
           arrays: array type of observations, rewards and flags. JAX arrays stay on the device, and
-          other libraries can
-            import them through DLPack.
+            other libraries can import them through DLPack.
           autoreset: resets ended environments automatically; otherwise all wait for `reset`.
           **task: fields of `TaskConfig` other than those of the hand's training.
 

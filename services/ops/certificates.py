@@ -109,8 +109,7 @@ def issue(
 
     Args:
       folder: folder of the authority; the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and
-      `tls.key` is
-        created in it.
+        `tls.key` is created in it.
       role: one of `ROLES`.
       run: name of the run; by default the authority's.
       number: number of the certificate; by default the lowest without a folder that is not revoked.

@@ -284,7 +284,8 @@ class Recorder(Closing):
           name: prefix of the files' names.
           sinks: additional receivers of every entry.
           depth: messages buffered if they arrive faster than they are written; beyond it the oldest
-          are dropped. max_seconds: see `LogWriter`.
+            are dropped.
+          max_seconds: see `LogWriter`.
           warn: called with one line for each problem.
         """
         begin = file_name(name, "a recording")
@@ -507,7 +508,8 @@ def recorded(
       transport: an endpoint of the run.
       config: the run's configuration.
       run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights &
-      Biases to `wandb`. logs: folder of the recordings.
+        Biases to `wandb`.
+      logs: folder of the recordings.
       names: names of the writers.
 
     Raises:

@@ -162,7 +162,7 @@ def check_episode(episode: Message) -> None:
 
     Raises:
       CongraspError: the episode is invalid; the text names the array or the entry, and the violated
-      rule.
+        rule.
     """
     hand = known_hand(episode.meta.get("hand"))
     sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))

@@ -67,7 +67,8 @@ class Batcher(Generic[T, R]):
 
     Args:
       run: function of a batch and its queueing times in seconds; returns one result or exception
-      for each item. size: limit of the weight of a batch.
+        for each item.
+      size: limit of the weight of a batch.
       window: longest wait for further items, s.
       depth: limit of the queue; further items are refused with `OverloadedError`.
       share: limit of one peer's queued items; by default `depth`.

@@ -204,7 +204,7 @@ def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
 
     Args:
       policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand
-      (`human:left` for the left).
+        (`human:left` for the left).
 
     Raises:
       CongraspError: there is no such file or hand, or the file is damaged.

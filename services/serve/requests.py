@@ -69,8 +69,7 @@ class Layout:
 
     Attributes:
       shapes: shapes by field name: state, earlier control steps if the policy observes them, goal,
-      surface, and flags
-        of the requested constraints.
+        surface, and flags of the requested constraints.
       size: length S of the flat vector.
       digest: identifies the layout.
     """

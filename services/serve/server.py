@@ -71,7 +71,8 @@ class PolicyServer:
           run: name of the served run.
           source: source of policies.
           on_answer: called with the outcome of every query (answered, refused, overloaded, late),
-          and its duration. on_batch: called with the number of states of every batch.
+            and its duration.
+          on_batch: called with the number of states of every batch.
 
         Raises:
           CongraspError: there is no policy yet, or the name is not valid.

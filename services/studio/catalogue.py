@@ -140,7 +140,7 @@ class Uploads:
         Raises:
           BadRequest: `name` is no file name.
           CongraspError: the file is empty or cannot be read, or a hand could grasp the mesh in no
-          unit.
+            unit.
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
         if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:

@@ -394,7 +394,8 @@ def drawing(
       key: its key, for the file's name.
       kind: one of `DRAWN`.
       view: the page's camera: position and target (3,) in the world, m, and its vertical
-      field_of_view in degrees. frame: control step of the PNG.
+        field_of_view in degrees.
+      frame: control step of the PNG.
       progress: called with the completed share, from 0 to 1, of an MP4.
 
     Raises:

@@ -148,8 +148,10 @@ class PageServer:
 
         Args:
           routes: returns the routes of a browser, by the token in its cookie; an empty one without
-          a cookie. host: interface; on loopback, only requests to a loopback name or one of `names`
-          are answered. port: TCP port; 0 takes a free one (see `port`).
+            a cookie.
+          host: interface; on loopback, only requests to a loopback name or one of `names` are
+            answered.
+          port: TCP port; 0 takes a free one (see `port`).
           names: names under which a proxy offers the page.
 
         Raises:

@@ -77,7 +77,8 @@ class Studio:
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
       fields: goal arrays of the constraints that have been set, on or off; those with flags have
-      some from the start. canvas: the object's surface, with the painted avoid region.
+        some from the start.
+      canvas: the object's surface, with the painted avoid region.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):

@@ -64,7 +64,7 @@ def run_training(
 
     Raises:
       CongraspError: the arguments contradict each other, the configuration cannot run, or a process
-      failed permanently.
+        failed permanently.
     """
     imported()
     plan = launch.planned(config)

@@ -59,8 +59,9 @@ def learn(  # noqa: PLR0913
     Args:
       run_dir: see `run_learner`, also for `config`, `ranks`, `on_update` and `on_event`.
       wire: a listening transport for rollouts and status queries of others; None only with an actor
-      inside. inside: engine of an actor in this process, over the in-memory transport; None for no
-      actor. stop: ends training.
+        inside.
+      inside: engine of an actor in this process, over the in-memory transport; None for no actor.
+      stop: ends training.
       writers: metric writers of rank 0.
       watch: endpoint of the metrics.
       grace: deadline for the end of the actor inside, s.

@@ -73,7 +73,7 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
 
     Raises:
       CongraspError: the self-check failed, a stage failed, or the folder holds the training of
-      another hand.
+        another hand.
     """
     need_package("The report", "jinja2")
     _begin(request)

@@ -224,8 +224,7 @@ def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
     Args:
       name: one of `PRESETS`.
       hand: the name, file or text of a hand. A full task depends on the hand
-      (`services.train.presets`); in the others
-        only the hand changes.
+        (`services.train.presets`); in the others only the hand changes.
       **sizes: other numbers of `environments` and `rollout_steps`; 0 keeps that of the preset.
 
     Raises:

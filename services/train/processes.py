@@ -75,7 +75,7 @@ class Launch:
 
         Raises:
           CongraspError: the options contradict each other or this machine, or the learner may not
-          listen as requested.
+            listen as requested.
         """
         if self.actors is not None and self.actors < 0:
             raise CongraspError(
@@ -194,14 +194,14 @@ def train(
 
     Args:
       run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from
-      the latest. config: the run's configuration.
+        the latest.
+      config: the run's configuration.
       plan: its processes. Rank r listens on the ports after those of rank r - 1; without an
-      endpoint, on free ones of
-        the loopback interface.
+        endpoint, on free ones of the loopback interface.
       stop: drains everything within a few seconds when set.
       report: called with progress.
       notify: called with a message when a process is restarted, and with errors of the learner,
-      such as a full disk.
+        such as a full disk.
 
     Raises:
       CongraspError: a process failed permanently; the message has the last line of its log.

@@ -59,7 +59,8 @@ def cover(
       value: (V,) of the points, linear in between; a triangle with a NaN covers nothing.
       faces: (F, 3) the triangles.
       closed: (F,) bool, True for triangles that are drawn only if they face the viewer (closed
-      surfaces). top: (height, width) greatest value so far; changed in place.
+        surfaces).
+      top: (height, width) greatest value so far; changed in place.
       owner: (height, width) the triangle that has it; changed in place.
     """
     height, width = top.shape
@@ -140,7 +141,8 @@ def shade(  # noqa: PLR0913
       nearness: (V,) one over their depths.
       faces: (F, 3) the triangles.
       values: (V, 13) position, normal, linear colour, shares of key light and sky, strength of the
-      highlight, opacity. owner: (height, width) the triangle that a sample shows, or `NOTHING`.
+        highlight, opacity.
+      owner: (height, width) the triangle that a sample shows, or `NOTHING`.
       eye: (3,) position of the camera.
       key: (3,) unit direction towards the key light.
       alpha: opacity over the image so far.
@@ -212,7 +214,8 @@ def add_light(
       strength: (n,) light of the lamp without shadow.
       axes: (3, 3) rows: the lamp's right, up, and the direction towards it.
       origin: (3,) along these: of the first sample of the lamp's picture, and the bias added to a
-      point's height. sample: size of a sample, m.
+        point's height.
+      sample: size of a sample, m.
       top: (height, width) height of the body nearest to the lamp.
       total: (n,) light; changed in place.
     """

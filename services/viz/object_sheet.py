@@ -269,7 +269,7 @@ def import_sheet(
       obj: the imported object.
       before: the mesh of the file, in the file's unit; None omits its picture.
       avoid: (P,) bool, surface points of the avoid region; None omits the picture of the
-      affordance.
+        affordance.
 
     Returns:
       (H, W, 3) uint8.

@@ -24,8 +24,7 @@ def contact_sheet(
     Args:
       images: (height, width, 3) uint8, all of one size.
       labels: one for each picture; shrunk and cut until it fits, as is the title. Different ones
-      that would then look
-        equal get the picture's number.
+        that would then look equal get the picture's number.
       columns: pictures in a row.
       title: one line.
 

@@ -236,7 +236,7 @@ def cut(
       normals: (F, 3, 3) at the corners.
       side: longest side, m.
       most: approximate limit of the number of triangles; sides stay longer on a surface that needs
-      more.
+        more.
     """
     area = (
         np.linalg.norm(

@@ -51,7 +51,7 @@ def attacks(seconds: float = 5.0, turns: int = 3) -> int:
     Args:
       seconds: Length of each measurement.
       turns: Measurements alone, beside each attack on another server and on this one, in turn;
-      medians are printed.
+        medians are printed.
 
     Examples:
       python -m tests.benchmarks attacks

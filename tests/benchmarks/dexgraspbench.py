@@ -37,12 +37,10 @@ def dexgraspbench(
 
     Args:
       paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are
-      not held, or cannot
-        be exported, are left out.
+        not held, or cannot be exported, are left out.
       out: The folder to write.
       replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp
-      and from the
-        pregrasp; writes replay.json.
+        and from the pregrasp; writes replay.json.
 
     Examples:
       python -m tests.benchmarks dexgraspbench grasps

@@ -113,8 +113,7 @@ def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
 
     Raises:
       CongraspError: it is not a motion, its object is not held or has no volume, or the benchmark
-      does not have its
-        hand.
+        does not have its hand.
     """
     motion = pick_motion(file)
     if not motion.metrics.get("held", motion.success):

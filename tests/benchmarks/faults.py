@@ -225,9 +225,8 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
       actors: Actor processes.
       repeats: Faults of each kind.
       kinds: Kinds of faults: sigterm, ctrl-c, kill-learner, kill-actor, kill-all, freeze-learner,
-      freeze-actor,
-        full-disk (which needs the right to mount), damage-checkpoint, damage-accepted (rollouts),
-        damage-journal, damage-policy. All of them if none is named.
+        freeze-actor, full-disk (which needs the right to mount), damage-checkpoint, damage-accepted
+        (rollouts), damage-journal, damage-policy. All of them if none is named.
       seed: Seed of the moments, and of the bits that are flipped.
 
     Examples:

@@ -26,7 +26,8 @@ def screens(
 
     Args:
       run: Folder of a finished training (`make quickstart` leaves one); without it that picture
-      stays. out: Folder for the pictures.
+        stays.
+      out: Folder for the pictures.
       rest: Resting pose of the mug, counted from 0.
 
     Examples:

@@ -151,7 +151,8 @@ def shell(
 
     Args:
       profile: (height, outer radius, inner radius) in ascending order of heights, m; straight
-      between. sides: pieces around the axis; the outside of each has two facets, the inside one.
+        between.
+      sides: pieces around the axis; the outside of each has two facets, the inside one.
       part: part of the pieces.
       squash: factor on y.
     """
@@ -182,7 +183,8 @@ def vessel(
 
     Args:
       profile: (height, outer radius) in ascending order of heights from 0, m; the first step holds
-      the floor. wall: thickness, m.
+        the floor.
+      wall: thickness, m.
       sides: pieces around the axis.
       part: part of the pieces.
       squash: factor on y.
@@ -204,7 +206,8 @@ def extrude(
 
     Args:
       outline: (V, 2) corners, counterclockwise around the origin, from which all of the border is
-      visible, m. low: height of the bottom, m.
+        visible, m.
+      low: height of the bottom, m.
       high: height of the top, m.
       taper: factor on the outline at the top.
       part: part of the pieces.

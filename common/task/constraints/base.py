@@ -327,7 +327,8 @@ class Constraint:
         Args:
           hand: the hand.
           back_off: (B,) distance back from the aligned wrist, used where no constraint sets the
-          initial pose, m. goal: goal after the priority rules.
+            initial pose, m.
+          goal: goal after the priority rules.
           q: (B, F) initial finger angles.
         """
         return None
@@ -426,7 +427,8 @@ class Constraint:
 
         Args:
           overridden: names of the requested stronger constraints that override it or one of its
-          blocks. redirected: True if it changed the heading.
+            blocks.
+          redirected: True if it changed the heading.
         """
         return []
 

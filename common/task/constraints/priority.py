@@ -111,8 +111,8 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
       hand: the hand.
       surface: surface points of the objects.
       goal: requested goal arrays; those of absent constraints may hold any finite values. Its
-      active flags are ignored. asked: (B,) bool by the name of each optional constraint of the
-      goal.
+        active flags are ignored.
+      asked: (B,) bool by the name of each optional constraint of the goal.
     """
     found: dict[str, list[Array]] = {"redirected": [], "refused": []}
     for stronger, relation in _relations(asked):
@@ -156,7 +156,7 @@ def contradictions(
       avoid: (N,) bool, those of the avoid region.
       goal: requested goal arrays without batch axis.
       asked: names of the explicitly requested constraints, including the heading if it was
-      requested.
+        requested.
     """
     names = set(asked)
     flags = {name: np.ones(1, bool) for name in names}

@@ -70,7 +70,7 @@ def build_bank(
 
     Raises:
       CongraspError: an object is too wide or cannot be approached in any resting pose, or all
-      objects lie too flat.
+        objects lie too flat.
     """
     bank = kept_bank(
         hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed)
@@ -321,13 +321,12 @@ def headings_of(
       seed: seed of the headings.
       given: `HEADINGS` headings that replace sampled ones.
       scale: scale of the object; the lengths of the rules scale with it, so that a larger hand gets
-      the headings of the
-        smaller object.
+        the headings of the smaller object.
       hand: outline that must clear the table.
 
     Raises:
       CongraspError: the object is too wide (`TooWideError`), or cannot be approached in any of its
-      resting poses.
+        resting poses.
     """
     rng = np.random.default_rng(seed)
     opposed = task.headings != "center" and given is None
@@ -413,7 +412,8 @@ def _reachable(
       sets: headings for the whole surface, and for the graspable region.
       hand: outline that must clear the table.
       avoid: (P,) bool, avoid region of sampled headings; None for captured ones, or without a
-      graspable region. opposed: see `within_reach`.
+        graspable region.
+      opposed: see `within_reach`.
     """
     own = CENTER if task.headings == "center" else hand
     found = [

@@ -99,15 +99,13 @@ def sample_headings(  # noqa: PLR0913
       rng: random generator.
       use_affordance: restricts the headings to the graspable region.
       lenient: if fingers that close on the graspable region always meet the other one, as on a
-      small handle, accepts
-        candidates whose approach clears the avoid region.
+        small handle, accepts candidates whose approach clears the avoid region.
       count: number of headings H.
       inward: metres from the surface point to the heading position.
       max_width: largest local width, m.
       attempts: batches of candidates.
       along: (3,) unit, prescribed direction of all headings; surface points that face it are used.
-      None draws
-        directions.
+        None draws directions.
       at: (3,) prescribed position of all headings, m. None draws positions.
       opposed: requires opposing surfaces to press on; False applies only the paper's rules.
 
@@ -343,8 +341,7 @@ def within_reach(
       outline: outline of the hand.
       avoid: (P,) bool, avoid region, for headings of the graspable region; None for other headings.
       opposed: requires opposing surfaces at the position to which the table moved the heading, and
-      closed fingers
-        over the table; False applies the paper's rules alone.
+        closed fingers over the table; False applies the paper's rules alone.
     """
     width = local_width(headings, obj.points)
     bare = np.zeros(len(obj.points), bool) if avoid is None else avoid

@@ -262,7 +262,7 @@ def make_sets(
       objects: the objects.
       seed: seed of the constraints.
       bank: an existing bank of these objects, scaled for the hand, whose reference poses are used.
-      None builds one.
+        None builds one.
 
     Raises:
       CongraspError: see `build_bank`.
@@ -303,8 +303,7 @@ def set_of(
       seed: seed of the constraints.
       about: additional metadata of the file.
       pose_training: (M,) bool, references for training; by default the first 80 %, as references
-      are arranged
-        (`services.evaluate.references`).
+        are arranged (`services.evaluate.references`).
       heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
     """
     # The bank pads an object's resting poses to the most of any object by repetition.

@@ -125,7 +125,8 @@ def import_sets(
     Args:
       sequences: sequences of an importer.
       hand: hand of the constraints; a hand other than the human one follows the demonstrations by
-      its grasp axes. options: options for building.
+        its grasp axes.
+      options: options for building.
       source: name of the data set.
       progress: called with a description of the current step.
 

@@ -121,7 +121,7 @@ class Skeleton:
         Args:
           root: (T,) orientations of MANO's root.
           fingers: (T, 15) rotations of the finger joints relative to their parents, in MANO's
-          order.
+            order.
         """
         local = fingers.as_matrix().reshape(-1, 5, 3, 3, 3)
         bones = np.diff(self.fingers, axis=1)

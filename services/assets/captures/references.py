@@ -50,8 +50,7 @@ def check_reference(
 
     Args:
       hand: hand of the reference; for a hand other than the human one, which closes around the
-      object by itself, only
-        the width is checked.
+        object by itself, only the width is checked.
       demonstration: demonstration of the human hand.
       obj: the unscaled object.
       scale: factor on the object's lengths for the hand.

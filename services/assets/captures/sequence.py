@@ -131,7 +131,7 @@ def array_of(
       values: arrays by name.
       key: name of the array.
       shape: expected sizes; a letter matches any. As many numbers in another shape count if all
-      sizes are given.
+        sizes are given.
 
     Raises:
       Dropped: the array is missing, holds no numbers, or has another shape.

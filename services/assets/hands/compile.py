@@ -98,7 +98,8 @@ def confined(
 
     Args:
       function: called as function(folder, path, **options); writes arrays into the folder, and
-      returns what JSON takes. path: the description.
+        returns what JSON takes.
+      path: the description.
       options: further arguments, as JSON takes them.
 
     Yields:
@@ -106,7 +107,7 @@ def confined(
 
     Raises:
       CongraspError: of the function; or the file is missing, or takes more than `MEMORY` or
-      `SECONDS`.
+        `SECONDS`.
     """
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")

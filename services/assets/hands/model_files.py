@@ -107,12 +107,11 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     Args:
       path: URDF, whose meshes are searched as ROS does, or MJCF; its root element determines which.
       choices: name, body of the palm, last body of the thumb and object scale, which are otherwise
-      guessed; collision.
+        guessed; collision.
 
     Raises:
       CongraspError: the file cannot be read, is not a hand of hinges with at least two fingers, or
-      has sizes, ranges or
-        masses of another unit.
+        has sizes, ranges or masses of another unit.
     """
     notes: list[str] = []
     _, model = robot_spec(path, notes)

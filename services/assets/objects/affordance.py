@@ -133,8 +133,7 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     Args:
       obj: an imported object.
       path: the part, a closed mesh, a patch of the surface or points of it, in the frame and unit
-      of the file that the
-        object was imported from.
+        of the file that the object was imported from.
 
     Raises:
       CongraspError: the file cannot be read, or is empty.
@@ -176,11 +175,12 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     Args:
       obj: an imported object.
       path: its mesh with coloured vertices, in the frame and unit of the file that it was imported
-      from. colour: red, green and blue, 0 to 255.
+        from.
+      colour: red, green and blue, 0 to 255.
 
     Raises:
       CongraspError: the file has no coloured vertices, none of this colour, or shows another
-      object.
+        object.
     """
     mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)

@@ -220,13 +220,11 @@ def decompose(
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
       volume: volume that the approximated surface encloses if the mesh is closed
-      (`fidelity.enclosed`), m^3; one close
-        to that of the hull needs no decomposition.
+        (`fidelity.enclosed`), m^3; one close to that of the hull needs no decomposition.
       time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
       shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its
-      hollows; by default the
-        mesh's.
+        hollows; by default the mesh's.
 
     Raises:
       CongraspError: the machine is too busy for the child to reach its limit.
@@ -478,7 +476,7 @@ def merge(
       max_pieces: largest number of pieces.
       triangles: (F, 3, 3) corners of the surface that they approximate, m.
       volume: volume of the object, m^3; None for an open surface, whose pieces stay as thick as
-      they are.
+        they are.
     """
     merger = _Merger(pieces, triangles, volume)
     merger.reduce(max_pieces)

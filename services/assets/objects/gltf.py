@@ -75,7 +75,8 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
 
     Raises:
       CongraspError: it needs an extension that changes geometry, such as a compression; a predicate
-      without a subject. ValueError: its parts do not fit its size.
+        without a subject.
+      ValueError: its parts do not fit its size.
     """
     length = int.from_bytes(data[12:16], "little")
     if len(data) < 20 or length > len(data):

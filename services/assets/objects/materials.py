@@ -132,7 +132,8 @@ def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> W
 
     Args:
       bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which
-      enclose the material. materials: material of each body.
+        enclose the material.
+      materials: material of each body.
     """
     weights = [_weigh(body, material) for body, material in zip(bodies, materials, strict=True)]
     mass = sum(weight.mass for weight in weights)
@@ -228,7 +229,7 @@ def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObjec
       obj: an object of convex pieces, each of which is solid or `hollow`.
       mass: kg.
       material: see `materials_of`; determines the mass if `mass` is None. Without both the object
-      is unchanged.
+        is unchanged.
     """
     if mass is None and material:
         of_part = materials_of(material, obj.part_names)

@@ -226,7 +226,7 @@ def _content(path: pathlib.Path) -> tuple[str, bytes]:
 
     Raises:
       CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get
-      one.
+        one.
     """
     data = read_file(path, MAX_BYTES, CHECK)
     if not data:

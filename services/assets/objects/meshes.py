@@ -97,7 +97,7 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
 
     Raises:
       CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault
-      and the remedy.
+        and the remedy.
     """
     check_options(options)
     key = _key(source, options)
@@ -125,7 +125,7 @@ def import_sources(
 
     Raises:
       CongraspError: an option is invalid, or no import ends for much longer than the deadlines of
-      the decompositions.
+        the decompositions.
     """
     check_options(options)
     todo = collections.deque(range(len(sources)))

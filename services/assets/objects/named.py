@@ -131,8 +131,7 @@ def load_each(
       found: see `objects_at`.
       options: options of the import of meshes.
       on_error: called with each object that cannot be read or imported, and the error; the object
-      is skipped unless
-        this raises.
+        is skipped unless this raises.
       progress: called with the number of finished meshes.
     """
     sources = {i: one.source for i, one in enumerate(found) if one.source}
@@ -175,7 +174,7 @@ def located(text: str, folder: str = "objects") -> pathlib.Path:
 
     Raises:
       CongraspError: there is no such object, or both a path here and an object of the folder have
-      the name.
+        the name.
     """
     path, stored = pathlib.Path(text), pathlib.Path(folder) / f"{text}{store.SUFFIX}"
     is_name = path.name == text and stored.is_file()

@@ -108,7 +108,7 @@ def metres_per_unit(
 
     Raises:
       CongraspError: no hand can grasp an object of that size; the remedy is the unit that would
-      fit.
+        fit.
     """
     taken: str = "m" if unit in ("auto", "guess") else unit
     longest = max(sides) * scale

@@ -78,7 +78,7 @@ def make(
       seed: of poses, path and world.
       farthest: metres from which the wrist comes, along its approach.
       tail: metres by which the box is longer than its pinched end, away from the wrist along its -z
-      axis.
+        axis.
     """
     q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
