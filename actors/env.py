@@ -27,9 +27,11 @@ from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load
 from congrasp.common.task.features import features
+from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from congrasp.common.task.reward import fallen, reward_terms, terms
 from congrasp.common.task.sensing import Readings, Tracker
+from congrasp.common.task.settings import GRAVITY
 from congrasp.common.task.types import Action, Array, Features, Goal, SceneState, Surface
 
 
@@ -358,6 +360,7 @@ class GraspEnv:
         state = self._viewed(self._sense(state, physics_state, moved), moved, followed)
         scene = self.scene_of(state)
         tracked, up = track_success(task, state.success, scene, physics_state.diverged)
+        scene = scene._replace(load=self._object_load(state, settings))
         found = reward_terms(scene, settings.weights)
         found["drop"] = jnp.where(tracked.diverged, -settings.weights.drop, found["drop"])
         stacked = jnp.stack([found[name] for name in terms(task)], -1)
@@ -471,6 +474,14 @@ class GraspEnv:
         return self.scene_of(state)._replace(
             task=dataclasses.replace(self.task, observation="full")
         )
+
+    def _object_load(self, state: EnvState, settings: Settings) -> ObjectLoad | None:
+        """Weight and friction of the objects; None where the masses are not recorded."""
+        if settings.masses is None:
+            return None
+        start = state.reset_state
+        mass = settings.masses[start.object_index] * start.mass_scale
+        return ObjectLoad(weight=GRAVITY * mass, friction=start.friction)
 
     def critic_inputs(self, state: EnvState, masses: Array) -> Array:
         """Privileged inputs (B, P) of the critic; `masses` are those of `Settings`."""

@@ -101,7 +101,12 @@ def renew(
     objects = bank.pose_q.shape[0]
     fresh = Poses(grasps.q, grasps.position, grasps.quaternion)
     path, turns, valid = make_references(
-        hand, fresh, bank.rest[grasps.object_index], path_key, task.trajectory_points
+        hand,
+        fresh,
+        bank.rest[grasps.object_index],
+        path_key,
+        task.trajectory_points,
+        task.human_paths,
     )
     usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
     seen = bank.grasps.at[grasps.object_index, grasps.region].add(usable.astype(bank.grasps.dtype))
@@ -171,7 +176,9 @@ def with_kept_references(
     poses = Poses(*(jnp.asarray(message.arrays[name], jnp.float32) for name in _POSES))
     norm = jnp.linalg.norm(poses.quaternion, axis=-1, keepdims=True)
     poses = poses._replace(quaternion=poses.quaternion / norm)
-    columns = reference_columns(hand, poses, bank.rest, jax.random.key(0), task.trajectory_points)
+    columns = reference_columns(
+        hand, poses, bank.rest, jax.random.key(0), task.trajectory_points, task.human_paths
+    )
     return bank._replace(grasps=jnp.asarray(message.arrays["grasps"]), **columns)
 
 

@@ -53,13 +53,15 @@ them.
 
 
 def hand_text(hand: Hand) -> str:
-    """Returns the text of the hand's file; `wide_pose` and `solids` of links have no key if the
-    hand has none.
+    """Returns the text of the hand's file; `wide_pose`, `anatomical` and `solids` of links have no
+    key if the hand has none.
     """
     fields = dataclasses.asdict(hand)
     del fields["text"]
     if hand.wide_pose is None:
         del fields["wide_pose"]
+    if not hand.anatomical:
+        del fields["anatomical"]
     for link in fields["links"]:
         if not link["solids"]:
             del link["solids"]

@@ -193,6 +193,7 @@ def mano_hand(model: ManoModel) -> Hand:
             **_each(mcp_flexion=1.35, pip=1.2, dip=1.2),
         },
         wrist=HUMAN.wrist,
+        anatomical=True,
     )
 
 

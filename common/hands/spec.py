@@ -161,6 +161,9 @@ class Hand:
     """Joints that follow others and have no motor."""
     tendons: tuple[Motor, ...] = ()
     """Motors that pull several joints each; every other joint without a coupling has a motor."""
+    anatomical: bool = False
+    """True for a hand with human joints, whose postures can be compared with those of people
+    (`common.task.posture`)."""
     text: str = ""
     """The hand's file, for hands that are not part of the package."""
 

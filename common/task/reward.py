@@ -12,6 +12,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import FAR, square
+from congrasp.common.task.grip import resistance
+from congrasp.common.task.posture import finger_deviations
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, SceneState
 
@@ -81,6 +83,19 @@ def _force_excess(scene: Scene, earning: Earning) -> Array:
     return -jnp.sum(jnp.clip(total - earning.force_max, 0.0, 50.0), -1)
 
 
+def _grip(scene: Scene, earning: Earning) -> Array:
+    """Share of the wanted resistance to the object's weight; 0 where the weight is not recorded."""
+    if scene.load is None:
+        return jnp.zeros(scene.state.time.shape)
+    return resistance(scene.state, scene.load, earning.touching)
+
+
+def _posture(scene: Scene, earning: Earning) -> Array:
+    """Mean squared deviation of the fingers from natural postures."""
+    deviation = finger_deviations(scene.hand, scene.state.q, scene.features.touching)
+    return -jnp.mean(deviation**2, -1)
+
+
 def _object_position(scene: Scene, earning: Earning) -> Array:
     """Squared displacement of the object since the start."""
     return -jnp.minimum(
@@ -121,6 +136,27 @@ GRASP: tuple[Term, ...] = (
         "Penalty per newton above `force_max`, per link (ours: the paper only clamps, and hands "
         "then squeeze hard).",
         _force_excess,
+    ),
+    Term(
+        "force_per_weight",
+        0.0,
+        "Growth of `force_max` with the object's weight, N per N: what is heavy may be pressed "
+        "harder (ours).",
+        None,
+    ),
+    Term(
+        "grip",
+        0.0,
+        "For contacts that can resist twice the object's weight and twice its torque (ours, see "
+        "`common.task.grip`).",
+        _grip,
+    ),
+    Term(
+        "posture",
+        0.0,
+        "Per square radian of the fingers' deviation from natural postures (ours, see "
+        "`common.task.posture`).",
+        _posture,
     ),
     Term(
         "object_position",
@@ -170,7 +206,11 @@ def reward_terms(scene: Scene, weights: Any) -> dict[str, Array]:
     """Weighted terms (B,) by the names in `terms`; the reward is their sum. `weights` are
     `RewardWeights`.
     """
-    touching, force, most = scene.features.touching, scene.features.force, weights.force_max
+    touching = scene.features.touching
+    force = scene.features.force
+    most = weights.force_max
+    if scene.load is not None:
+        most = most + weights.force_per_weight * scene.load.weight[:, None]
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)
         most = constraint.force_max(scene, most)

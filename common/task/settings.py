@@ -199,6 +199,10 @@ class TaskSettings:
     """Gives an episode with a reference pose and a wrist trajectory the trajectory to that pose.
     Otherwise the two are drawn independently, as in the paper, and the trajectory may end
     elsewhere."""
+    human_paths: float = 0.0
+    """Share of the wrist trajectories that come as people reach, at up to 75 degrees to the heading
+    of their grasp and from 8 to 20 cm (`common.task.sampling.trajectories`); the others come as in
+    the paper. Evaluations have those of the paper."""
     disturbed_references: float = 0.0
     """Share of the episodes whose reference pose and wrist trajectory are disturbed like captured
     ones (`common.task.constraints.pose`)."""

@@ -55,6 +55,7 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
         mass_range=(1.0, 1.0),
         friction_range=(friction, friction),
         gain_range=(1.0, 1.0),
+        human_paths=0.0,
         sensing=SensingConfig(),
     )
 

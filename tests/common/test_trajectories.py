@@ -18,22 +18,21 @@ from congrasp.common.task.constraints.pose import (
     fingers_numbers,
     wrist_numbers,
 )
-from congrasp.common.task.sampling.build import (
-    AMPLITUDE,
-    CONE,
-    DISTANCE,
-    ROTATION,
-    make_trajectories,
-)
+from congrasp.common.task.sampling.trajectories import HUMAN, PAPER, make_trajectories
 from tests.scenes import quaternions
 
 HAND = get_hand("human")
 COUNT, WAYPOINTS = 64, 15
 
 
-def _make(position, quaternion):
+def _make(position, quaternion, style):
     path, turns = make_trajectories(
-        HAND, jnp.asarray(position), jnp.asarray(quaternion), jax.random.key(3), waypoints=WAYPOINTS
+        HAND,
+        jnp.asarray(position),
+        jnp.asarray(quaternion),
+        jax.random.key(3),
+        waypoints=WAYPOINTS,
+        style=style,
     )
     return np.asarray(path), np.asarray(turns)
 
@@ -46,26 +45,33 @@ def poses():
 
 @pytest.fixture(scope="module")
 def made(poses):
-    return _make(*poses)
+    return _make(*poses, PAPER)
 
 
-def test_they_come_from_afar_and_end_at_their_poses(poses, made):
-    (position, quaternion), (path, turns) = poses, made
-    assert path.shape == (COUNT, WAYPOINTS, 3) and turns.shape == (COUNT, WAYPOINTS, 4)
+@pytest.mark.parametrize("style", [PAPER, HUMAN])
+def test_trajectories_keep_the_ranges_of_their_style(poses, style):
+    position, quaternion = poses
+    path, turns = _make(position, quaternion, style)
+    assert path.shape == (COUNT, WAYPOINTS, 3)
+    assert turns.shape == (COUNT, WAYPOINTS, 4)
     # The controller has a quarter of a second to settle, five of its time constants of 0.05 s: e^-5
     # of 25 cm is 2 mm.
     np.testing.assert_allclose(path[:, -1], position, atol=2e-3)
     end = Rotation.from_quat(quaternion, scalar_first=True)
     final = Rotation.from_quat(turns[:, -1], scalar_first=True)
-    assert (end.inv() * final).magnitude().max() < np.exp(-5) * ROTATION + 1e-3
+    most_turned = style.rotation[1]
+    assert (end.inv() * final).magnitude().max() < np.exp(-5) * most_turned + 1e-3
 
     away = path[:, 0] - position
     distance = np.linalg.norm(away, axis=-1)
-    assert DISTANCE[0] - 1e-4 <= distance.min() and distance.max() <= DISTANCE[1] + 1e-4
+    nearest, farthest = style.distance
+    assert nearest - 1e-4 <= distance.min()
+    assert distance.max() <= farthest + 1e-4
     outward = -end.apply(grasp_frame(HAND).heading)
-    assert np.arccos(np.sum(away * outward, -1) / distance).max() <= CONE + 1e-3
+    tilt = np.arccos(np.sum(away * outward, -1) / distance)
+    assert 0.8 * style.tilt[1] < tilt.max() <= style.tilt[1] + 1e-3
     first = Rotation.from_quat(turns[:, 0], scalar_first=True)
-    assert (first * end.inv()).magnitude().max() <= ROTATION + 1e-3
+    assert (first * end.inv()).magnitude().max() <= most_turned + 1e-3
 
 
 def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
@@ -79,7 +85,9 @@ def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
     aside = np.linalg.norm(
         off - np.sum(off * chord[:, None], -1, keepdims=True) * chord[:, None], axis=-1
     ).max(-1)
-    assert aside.max() <= AMPLITUDE[1] and np.median(aside) > AMPLITUDE[0] / 2
+    least, most = PAPER.amplitude
+    assert aside.max() <= most
+    assert np.median(aside) > least / 2
     np.testing.assert_allclose(np.linalg.norm(turns, axis=-1), 1.0, atol=1e-5)
     assert (np.sum(turns[:, 1:] * turns[:, :-1], -1) > 0.9).all()  # neighbours in one hemisphere
 

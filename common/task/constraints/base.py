@@ -19,6 +19,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.sampling.bank import ConstraintBank, Draw
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
@@ -155,6 +156,8 @@ class Scene(NamedTuple):
     """Last control steps, if the policy observes them."""
     cloud: Surface | None = None
     """Cloud of the camera, world frame, if the policy has one."""
+    load: ObjectLoad | None = None
+    """Weight and friction of the objects, for the reward; None where they are not recorded."""
 
     def gate(self, block: str) -> Array:
         """(B,) 1 if a block is active, else 0."""

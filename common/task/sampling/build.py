@@ -38,6 +38,7 @@ from congrasp.common.task.sampling.headings import (
     sample_headings,
     within_reach,
 )
+from congrasp.common.task.sampling.trajectories import HUMAN, make_trajectories
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 
@@ -51,6 +52,8 @@ SOFT = 0.002
 """Depth of fingers in the table that is tolerated because contacts are soft, m."""
 _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
+_CANDIDATES = 4
+"""Human trajectories drawn for each pose, of which the one clearest of the table is taken."""
 
 
 def build_bank(
@@ -145,14 +148,21 @@ def _bank_of(
         np.stack([getattr(obj, name) for obj in objects]).astype(np.float32)
         for name in ("points", "normals")
     ]
-    key, waypoints = jax.random.key(seed), task.trajectory_points
-    references = make(hand, *surfaces, *chosen, columns["rest"], key, waypoints=waypoints)
+    references = make(
+        hand,
+        *surfaces,
+        *chosen,
+        columns["rest"],
+        jax.random.key(seed),
+        waypoints=task.trajectory_points,
+        human_paths=task.human_paths,
+    )
     own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)
     return jax.device_put(ConstraintBank(**columns, **references, **own))
 
 
-@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints", "human_paths"))
 def _references(  # noqa: PLR0913
     hand: Hand,
     points: Array,
@@ -164,16 +174,18 @@ def _references(  # noqa: PLR0913
     key: Array,
     *,
     waypoints: int,
+    human_paths: float,
 ) -> dict[str, Array]:
     """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings
     (N, V, M, 3).
     """
-    return reference_columns(
-        hand, _closed(hand, points, normals, position, direction, cross), rest, key, waypoints
-    )
+    poses = _closed(hand, points, normals, position, direction, cross)
+    return reference_columns(hand, poses, rest, key, waypoints, human_paths)
 
 
-def _no_references(hand: Hand, *arrays: Array, waypoints: int) -> dict[str, np.ndarray]:
+def _no_references(
+    hand: Hand, *arrays: Array, waypoints: int, human_paths: float
+) -> dict[str, np.ndarray]:
     """As many poses and trajectories as `_references` makes, none of them usable; same
     arguments.
     """
@@ -190,9 +202,14 @@ def _no_references(hand: Hand, *arrays: Array, waypoints: int) -> dict[str, np.n
     }
 
 
-@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints", "human_paths"))
 def reference_columns(
-    hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int
+    hand: Hand,
+    poses: Poses,
+    rest: Array,
+    key: Array,
+    waypoints: int,
+    human_paths: float = 0.0,
 ) -> dict[str, Array]:
     """Columns of the bank of poses (N, V, M, ...) and of trajectories to them, for resting poses
     (N, R, 7).
@@ -200,7 +217,7 @@ def reference_columns(
     shape = poses.q.shape[:-1]
     flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
     rest = jnp.repeat(rest, shape[1] * shape[2], axis=0)
-    path, turns, valid = make_references(hand, flat, rest, key, waypoints)
+    path, turns, valid = make_references(hand, flat, rest, key, waypoints, human_paths)
     return {
         "pose_q": poses.q,
         "pose_position": poses.position,
@@ -211,9 +228,14 @@ def reference_columns(
     }
 
 
-@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints", "human_paths"))
 def make_references(
-    hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int
+    hand: Hand,
+    poses: Poses,
+    rest: Array,
+    key: Array,
+    waypoints: int,
+    human_paths: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Generates a trajectory to each of M reference poses, and checks in which resting poses they
     are usable.
@@ -224,6 +246,7 @@ def make_references(
       rest: (M, R, 7) resting poses of the poses' objects.
       key: random key of the trajectories.
       waypoints: number K of waypoints.
+      human_paths: share of the trajectories in the style `trajectories.HUMAN`.
 
     Returns:
       Trajectories (M, K, 3) and (M, K, 4), and a mask (M, R) of usable resting poses.
@@ -231,8 +254,38 @@ def make_references(
     path, turns = make_trajectories(
         hand, poses.position, poses.quaternion, key, waypoints=waypoints
     )
+    if human_paths:
+        share_key, human_key = jax.random.split(jax.random.fold_in(key, 1))
+        chosen = jax.random.uniform(share_key, (len(path), 1, 1)) < human_paths
+        human_path, human_turns = _clearest_human_paths(hand, poses, rest, human_key, waypoints)
+        path = jnp.where(chosen, human_path, path)
+        turns = jnp.where(chosen, human_turns, turns)
     room = height_over_table(hand, poses.q, path, turns, rest) > -SOFT
     return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
+
+
+def _clearest_human_paths(
+    hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int
+) -> tuple[Array, Array]:
+    """Draws four trajectories in the style `HUMAN` to each of M poses and returns the one that
+    stays above the table in most resting poses.
+
+    Many directions at 75 degrees to a level heading begin below the table; people come from above.
+
+    Returns:
+      Trajectories (M, K, 3) and (M, K, 4).
+    """
+
+    def candidate(key: Array) -> tuple[Array, Array]:
+        return make_trajectories(
+            hand, poses.position, poses.quaternion, key, waypoints=waypoints, style=HUMAN
+        )
+
+    paths, turns = jax.lax.map(candidate, jax.random.split(key, _CANDIDATES))
+    clear = jax.vmap(lambda path: jnp.sum(above_table(path, rest), -1))(paths)
+    best = jnp.argmax(clear, 0)
+    rows = jnp.arange(len(best))
+    return paths[best, rows], turns[best, rows]
 
 
 def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
@@ -534,101 +587,3 @@ def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int
     digests = [store.digest(obj) for obj in objects]
     text = json.dumps([code, jax.__version__, device, hand.reference, settings, seed, digests])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-DISTANCE = (0.15, 0.25)
-CONE = np.deg2rad(15.0)
-AMPLITUDE = (0.01, 0.05)
-ROTATION = np.deg2rad(30.0)
-_REPLAY_DT = 0.0025
-_REPLAY_SECONDS = 0.5
-_SETTLE_SECONDS = 0.25
-
-
-@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
-def make_trajectories(
-    hand: Hand, position: Array, quaternion: Array, key: Array, *, waypoints: int
-) -> tuple[Array, Array]:
-    """Generates one trajectory for each reference pose, backwards from it (paper, section Hand
-    Morphology).
-
-    From the final pose the wrist moves out by 15-25 cm within 15 degrees of the heading, with a
-    lateral sinusoid of 1-5 cm and up to 30 degrees of rotation. The wrist's PD controller then
-    follows the path, and its motion is resampled to K waypoints.
-
-    Args:
-      hand: its heading axis and wrist gains are used.
-      position: (M, 3) final wrist positions in the object frame.
-      quaternion: (M, 4) final wrist orientations.
-      key: random key of the paths.
-      waypoints: number K of waypoints.
-
-    Returns:
-      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from the far end to the
-      pose.
-    """
-    count = position.shape[0]
-    uniform_key, normal_key = jax.random.split(key)
-    random = jax.random.uniform(uniform_key, (4, count, 1))
-    tilt, distance, amplitude, turn = (
-        low + (high - low) * share
-        for (low, high), share in zip(
-            ((0.0, CONE), DISTANCE, AMPLITUDE, (0.0, ROTATION)), random, strict=True
-        )
-    )
-    aside, sideways, axis = jax.random.normal(normal_key, (3, count, 3))
-    heading = rotations.rotate(
-        quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (count, 3))
-    )
-    outward = -(jnp.cos(tilt) * heading + jnp.sin(tilt) * _perpendicular(aside, heading))
-    lateral = _perpendicular(sideways, outward)
-    axis = axis / jnp.linalg.norm(axis, axis=-1, keepdims=True)
-
-    steps = int((_REPLAY_SECONDS + _SETTLE_SECONDS) / _REPLAY_DT)
-    # 0: far, 1: at the pose
-    s = jnp.clip(jnp.arange(steps) * _REPLAY_DT / _REPLAY_SECONDS, 0.0, 1.0)[:, None, None]
-    slides = (1 - s) * distance * outward + jnp.sin(jnp.pi * s) * amplitude * lateral
-    reached = _replay(hand, jnp.concatenate([slides, (1 - s) * turn * axis], -1))
-
-    moved = jnp.linalg.norm(jnp.diff(reached[..., :3], axis=0), axis=-1)
-    length = jnp.concatenate([jnp.zeros((1, count)), jnp.cumsum(moved, 0)])
-    wanted = jnp.linspace(0.0, 1.0, waypoints)[:, None] * length[-1]
-    when = jax.vmap(jnp.interp, (1, 1, None), 1)(wanted, length, jnp.arange(float(steps)))
-    before = jnp.clip(when.astype(jnp.int32), 0, steps - 2)
-    share = (when - before)[..., None]
-    columns = jnp.arange(count)
-    # (K, M, 6)
-    joints = (1 - share) * reached[before, columns] + share * reached[before + 1, columns]
-    joints = jnp.swapaxes(joints, 0, 1)
-    turns = rotations.from_rotation_vector(joints[..., 3:])
-    return (
-        position[:, None] + joints[..., :3],
-        rotations.multiply(turns, jnp.broadcast_to(quaternion[:, None], turns.shape)),
-    )
-
-
-def _replay(hand: Hand, target: Array) -> Array:
-    """Motion of the wrist's PD controller for targets (T, M, 6): each axis is a damped mass,
-    semi-implicit Euler.
-    """
-    gains = hand.wrist
-    mass, inertia = hand.wrist_inertia.tolist()
-    kp = jnp.array([gains.slide_kp] * 3 + [gains.hinge_kp] * 3)
-    kv = jnp.array([gains.slide_kv] * 3 + [gains.hinge_kv] * 3)
-    limit = jnp.array([gains.slide_limit] * 3 + [gains.hinge_limit] * 3)
-    weight = jnp.array([mass] * 3 + [inertia] * 3)
-
-    def step(state: tuple[Array, Array], goal: Array) -> tuple[tuple[Array, Array], Array]:
-        """Simulates one step of the wrist's servos."""
-        x, v = state
-        force = jnp.clip(kp * (goal - x), -limit, limit)
-        v = (v + _REPLAY_DT * force / weight) / (1 + _REPLAY_DT * kv / weight)
-        return (x + _REPLAY_DT * v, v), x
-
-    return jax.lax.scan(step, (target[0], jnp.zeros_like(target[0])), target)[1]
-
-
-def _perpendicular(vector: Array, axis: Array) -> Array:
-    """Normalised components of vectors (M, 3) orthogonal to unit axes (M, 3)."""
-    part = vector - jnp.sum(vector * axis, -1, keepdims=True) * axis
-    return part / jnp.linalg.norm(part, axis=-1, keepdims=True)
