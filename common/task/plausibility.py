@@ -23,6 +23,7 @@ from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.posture import unnatural
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
@@ -32,6 +33,7 @@ with meshes.
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
+    "posture_rad",
     *("finger_jerk", "link_force", "link_force_peak", "torque_share", "torque_share_peak"),
 )
 """Names of the `measures` of an episode."""
@@ -66,6 +68,8 @@ class Sample(NamedTuple):
     """(B, L) net contact force of the object on each link, N."""
     torque_share: Array
     """(B, M) torques of the fingers' motors as shares of their limits."""
+    posture: Array
+    """(B,) mean deviation of the fingers from natural postures, rad (`common.task.posture`)."""
     object_position: Array
     """(B, 3) position of the object, wrist frame, m."""
     object_quaternion: Array
@@ -105,6 +109,7 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
         finger_velocity=state.q_velocity,
         link_force=jnp.linalg.norm(features.force, axis=-1).astype(half),
         torque_share=torque_share(scene).astype(half),
+        posture=unnatural(hand, state.q, features.touching).astype(half),
         object_position=features.object_position,
         object_quaternion=features.object_quaternion,
     )
@@ -255,7 +260,8 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
         the episode's steps. `finger_jerk`: root mean square over joints and steps, rad/s^3.
         `link_force_peak` (N): that of the link with the highest force; `link_force`: the mean over
         touching links (0 if none touches). `torque_share` and `torque_share_peak`: mean and peak
-        over motors and steps.
+        over motors and steps. `posture_rad`: mean deviation from natural postures over the steps
+        in which the hand touches the object (0 if it never does).
     """
     wrist, fingers = (
         np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity)
@@ -277,7 +283,10 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
             f"{name}_mean": size.mean(0),
             f"{name}_p95": np.percentile(size, 95, axis=0),
         }
+    touching = (force > 0).any(-1)
+    posture = np.asarray(samples.posture, np.float32)
     return found | {
+        "posture_rad": (posture * touching).sum(0) / np.maximum(touching.sum(0), 1),
         "finger_jerk": np.sqrt((jerk**2).mean((0, 2))),
         "link_force": force.sum((0, 2)) / np.maximum((force > 0).sum((0, 2)), 1),
         "link_force_peak": force.max((0, 2)),

@@ -15,9 +15,15 @@ if TYPE_CHECKING:
     from congrasp.services.arm.planner import ArmMotion
 
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
-_SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
+_SCALES |= {
+    "moved_at_removal": 0.01,
+    "force_link_max": 10.0,
+    "slip": 0.02,
+    "posture_rad": 0.1,
+}
 """Scales that make costs of grasps that hold comparable: errors, displacement of the object before
-table removal (m), force of the strongest link (N), and displacement after removal (m)."""
+table removal (m), force of the strongest link (N), displacement after removal (m), and deviation
+from natural postures (rad)."""
 _FIRM = ("clean", *SURVIVAL)
 """Metrics that add a cost of 1 where they are zero."""
 
@@ -118,7 +124,7 @@ def costs(
     values = {**outcome.metrics, "slip": np.linalg.norm(way, axis=-1)}
     cost = sum(
         np.minimum(values[name] / _SCALES[name], 10.0)
-        for name in [*_errors_of(constraints), "slip"]
+        for name in [*_errors_of(constraints), "slip", "posture_rad"]
     )
     cost += sum(values[name] == 0 for name in _FIRM)
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
