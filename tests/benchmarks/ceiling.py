@@ -129,6 +129,8 @@ class Ceiling:
                     write("exam")
                 if findings.lost:
                     conditions = joined(findings.conditions)
+                    _repeat(simulator, conditions, findings)
+                    write("repeat")
                     self._add_noise(simulator, conditions, findings, track)
                     write("noise")
                     for iteration in self._search(simulator, conditions, findings, track):
@@ -222,6 +224,7 @@ class Ceiling:
                 "elites": _ELITES,
                 "std": _FIRST_STD,
             },
+            "repeat_held": sum(one.repeat_held for one in findings.lost),
             "total": findings.total().to_json(),
             "rows": rows,
             "by_object": objects,
@@ -239,6 +242,8 @@ class Ceiling:
                 f"{one.noise_held} of {one.noise_attempts}, search {one.search_held} of "
                 f"{one.search_attempts}"
             )
+        repeated = sum(one.repeat_held for one in findings.lost)
+        print(f"Held when repeated unchanged: {repeated} of {len(findings.lost)} lost episodes.")
         losing = [one for one in by_object(findings.episodes, findings.lost) if one.lost]
         title = f"{entrant.file.name}, version {entrant.policy.version}, {engine_title(engine)}"
         console.print(table(f"{title}: objects with a loss", losing).terminal())
@@ -267,6 +272,13 @@ def _examine(
             findings.lost.append(one)
         findings.conditions.append(rows_of(begun, lost))
         done += count
+
+
+def _repeat(simulator: Simulator, conditions: InitialConditions, findings: Findings) -> None:
+    """Repeats the lost episodes unchanged, and notes those in which the object is now held."""
+    outcomes = simulator.run(conditions, simulator.unmodified(len(findings.lost)))
+    for one, held in zip(findings.lost, outcomes.held, strict=True):
+        one.repeat_held = bool(held)
 
 
 ceiling = Ceiling

@@ -24,6 +24,9 @@ class Lost:
     """Index of the episode in its row."""
     success: bool
     """True if the object fell only after the paper's 25 control steps without the table."""
+    repeat_held: bool = False
+    """True if the policy holds the object when the episode is repeated unchanged in another
+    environment: the condition is marginal, and its loss is not a property of it alone."""
     noise_attempts: int = 0
     noise_held: int = 0
     """Attempts with exploration noise, and those that held the object for two seconds."""
