@@ -45,6 +45,7 @@ lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/python .ci/plain_code.py
+	$(VENV)/bin/python .ci/large_files.py
 	$(VENV)/bin/mypy
 
 docs: install

@@ -59,7 +59,8 @@ def create_run(
       run_dir: path of the directory.
       config: the run.
       initial: initial policy instead of random weights: its networks and normalisers. Inputs of the
-        state and of the critic that it lacks get zero weight.
+        state and of the critic that it lacks get zero weight. A policy without a critic gets a new
+        one.
 
     Raises:
       CongraspError: the directory already has a run, or remains of one; or the initial policy does
@@ -77,9 +78,30 @@ def create_run(
     if initial is not None:
         spec = bundles.policy_spec(config.task, config.network)
         begun = bundles.with_inputs_of(spec, config.task, initial)
+        if not begun.has_critic:
+            begun = bundles.with_new_critic(begun, config.seed)
         bundles.save(begun, run_dir / INITIAL_FILE)
     write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
     (run_dir / LOGS).mkdir(exist_ok=True)
+
+
+def initial_notes(initial: PolicyBundle, config: RunConfig, file: pathlib.Path) -> Iterator[str]:
+    """Yields a line on each part of a run's networks that the initial policy does not determine.
+
+    Args:
+      initial: the initial policy of `create_run`.
+      config: the run.
+      file: file of the policy, for the lines.
+    """
+    spec = bundles.policy_spec(config.task, config.network)
+    if not initial.has_critic:
+        yield f"{file} has no critic; a new one starts with random weights."
+    same_critic = not initial.has_critic or initial.spec.privileged == spec.privileged
+    if initial.spec.layout != spec.layout or not same_critic:
+        yield (
+            f"{file} has other inputs than this run's policy or critic; the new ones start at "
+            f"zero weight."
+        )
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:

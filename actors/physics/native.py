@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged, physics_state
@@ -18,6 +17,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import memory
+from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 
 _ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
@@ -76,9 +76,6 @@ class NativePhysics:
           objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        # MuJoCo would write every warning to a file in the working directory; `diverged` detects
-        # their causes.
-        mujoco.set_mju_user_warning(lambda text: None)
         self._hand, self._task, self._objects = hand, task, objects
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(

@@ -1,8 +1,8 @@
 """Policy bundle: weights, critic and normalisers of one version, as one immutable unit.
 
 The learner publishes bundles, actors and the policy server act with them, and the package ships
-some. Acting normalises with the bundle's statistics, so that a log probability belongs to exactly
-one bundle.
+some, without their critics. Acting normalises with the bundle's statistics, so that a log
+probability belongs to exactly one bundle.
 """
 
 import dataclasses
@@ -37,6 +37,7 @@ from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 FORMAT = 2
 _SCHEMA = 1
+_CRITIC = "critic"
 _MOST_COUNT = 1 << 53
 """Limit of versions and environment steps, which JSON keeps exactly."""
 _LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
@@ -138,11 +139,11 @@ class PolicyBundle:
     task: TaskConfig
     """Task of the training."""
     params: Params
-    """Parameters of actor and critic (`common.policy.network`)."""
+    """Parameters of actor and critic (`common.policy.network`); the critic may be absent."""
     observation: Statistics
     """Statistics of the observations."""
     value: Statistics
-    """Statistics of the returns."""
+    """Statistics of the returns; empty without a critic."""
     version: int
     """Increases with every update of a run, also across restarts of its learner."""
     run_id: str
@@ -154,6 +155,27 @@ class PolicyBundle:
     privileged: Statistics | None = None
     """Statistics of the critic's privileged inputs; None without inputs or samples."""
 
+    @property
+    def has_critic(self) -> bool:
+        """False for a policy that can act, but has only half of what training needs."""
+        return _CRITIC in self.params
+
+    @functools.cached_property
+    def actor_sha256(self) -> str:
+        """SHA-256 of all that determines the actions, in hex digits: it survives `without_critic`.
+
+        It covers the hand, the schema, and name, type, shape and bytes of each array of the actor
+        and of the observations' statistics.
+        """
+        tree = {"actor": self.params["actor"], "observation": self.observation._asdict()}
+        arrays = flax.traverse_util.flatten_dict(tree, sep="/")
+        digest = hashlib.sha256(json.dumps([self.spec.hand, self.spec.schema]).encode())
+        for name in sorted(arrays):
+            array = np.asarray(arrays[name])
+            digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()
+
     @functools.cached_property
     def inference_parameters(self) -> InferenceParameters:
         """Actor and frozen normalisation, on the default device."""
@@ -162,15 +184,12 @@ class PolicyBundle:
 
     def to_message(self) -> Message:
         """Returns the bundle as arrays and metadata; arrays are shared, not copied."""
-        tree = {
-            **self.params,
-            "observation": self.observation._asdict(),
-            "value": self.value._asdict(),
-        }
-        if self.spec.privileged:
-            tree["privileged"] = (
-                self.privileged or normalizer.empty((self.spec.privileged_size,))
-            )._asdict()
+        tree = {**self.params, "observation": self.observation._asdict()}
+        if self.has_critic:
+            tree["value"] = self.value._asdict()
+        if self.has_critic and self.spec.privileged:
+            privileged = self.privileged or normalizer.empty((self.spec.privileged_size,))
+            tree["privileged"] = privileged._asdict()
         meta = {
             "format": FORMAT,
             "version": self.version,
@@ -204,29 +223,14 @@ class PolicyBundle:
                 f"The policy {source} has format {meta.get('format')}, not {FORMAT}.", _REMEDY
             )
         try:
-            spec = PolicySpec(
-                hand=check_reference(meta["hand"]),
-                layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
-                action_size=int(meta["action_size"]),
-                network=_dataclass(NetworkConfig, meta["network"]),
-                privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
-            )
+            spec = _spec(meta)
             task = _dataclass(TaskConfig, meta["task"])
-            version, run_id, transitions = (
-                int(meta["version"]),
-                str(meta["run_id"]),
-                int(meta["transitions"]),
-            )
-            for name, number in (("version", version), ("transitions", transitions)):
-                if not 0 <= number <= _MOST_COUNT:
-                    raise ValueError(f"its {name} is {number:.4g}")
-            inputs = (*spec.layout, *spec.privileged)
-            for fault in (
-                *network_faults(spec.network, inputs, spec.action_size),
-                *task_faults(task),
-            ):
-                raise ValueError(fault)
-            shapes = _shapes(spec)
+            version = _count(meta, "version")
+            transitions = _count(meta, "transitions")
+            run_id = str(meta["run_id"])
+            _check_ranges(spec, task)
+            has_critic = any(name.startswith(f"{_CRITIC}/") for name in message.arrays)
+            shapes = _shapes(spec, has_critic)
         except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
             why = str(error).rstrip(".")[:200]
             raise CongraspError(
@@ -238,8 +242,10 @@ class PolicyBundle:
             )
         _check_arrays(message.arrays, shapes, source)
         tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
-        names = ("observation", "value", *(["privileged"] if spec.privileged else []))
-        statistics = {name: Statistics(**tree.pop(name)) for name in names}
+        statistics = {"value": normalizer.empty()}
+        for name in ("observation", "value", "privileged"):
+            if name in tree:
+                statistics[name] = Statistics(**tree.pop(name))
         return PolicyBundle(
             spec=spec,
             task=task,
@@ -249,6 +255,37 @@ class PolicyBundle:
             transitions=transitions,
             **statistics,
         )
+
+
+def without_critic(bundle: PolicyBundle) -> PolicyBundle:
+    """Returns the bundle without its critic and the statistics that only the critic uses.
+
+    It acts as before, since actor and statistics of the observations are the same arrays.
+    """
+    return dataclasses.replace(
+        bundle,
+        params={"actor": bundle.params["actor"]},
+        value=normalizer.empty(),
+        privileged=None,
+    )
+
+
+def with_new_critic(bundle: PolicyBundle, seed: int) -> PolicyBundle:
+    """Returns the bundle with a critic of random weights and empty statistics, as at the start of a
+    training.
+
+    Args:
+      bundle: a policy, with or without a critic.
+      seed: seed of the weights.
+    """
+    spec = bundle.spec
+    random = network.init(seed, spec.layout, spec.action_size, spec.network, spec.privileged_size)
+    return dataclasses.replace(
+        bundle,
+        params={**bundle.params, _CRITIC: random[_CRITIC]},
+        value=normalizer.empty(),
+        privileged=None,
+    )
 
 
 def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> PolicyBundle:
@@ -365,23 +402,52 @@ def acting(layout: Layout, *, mean: bool) -> Any:
     return functools.partial(_act_by_mean if mean else sample_action, layout)
 
 
+def _spec(meta: Mapping[str, Any]) -> PolicySpec:
+    """Returns the spec in a bundle's metadata."""
+    return PolicySpec(
+        hand=check_reference(meta["hand"]),
+        layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
+        action_size=int(meta["action_size"]),
+        network=_dataclass(NetworkConfig, meta["network"]),
+        privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
+    )
+
+
+def _count(meta: Mapping[str, Any], name: str) -> int:
+    """Returns a counter in a bundle's metadata; raises a ValueError outside its range."""
+    number = int(meta[name])
+    if not 0 <= number <= _MOST_COUNT:
+        raise ValueError(f"its {name} is {number:.4g}")
+    return number
+
+
+def _check_ranges(spec: PolicySpec, task: TaskConfig) -> None:
+    """Raises a ValueError that names the first setting out of its range."""
+    inputs = (*spec.layout, *spec.privileged)
+    for fault in network_faults(spec.network, inputs, spec.action_size):
+        raise ValueError(fault)
+    for fault in task_faults(task):
+        raise ValueError(fault)
+
+
 def _dataclass(cls: type, fields: Any) -> Any:
     """Builds a frozen dataclass from JSON values; unknown keys and wrong types are errors."""
     return dacite.from_dict(cls, fields, dacite.Config(strict=True, cast=[tuple, float]))
 
 
 @functools.lru_cache(maxsize=8)
-def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
+def _shapes(spec: PolicySpec, has_critic: bool) -> dict[str, tuple[int, ...]]:
     """Shapes of a bundle's arrays by name."""
-    params = network.shapes(spec.layout, spec.action_size, spec.network, spec.privileged_size)
+    tree = network.shapes(spec.layout, spec.action_size, spec.network, spec.privileged_size)
     size = sum(width for _, width in spec.layout)
-    statistics = {
-        "observation": normalizer.empty((size,))._asdict(),
-        "value": normalizer.empty()._asdict(),
-    }
-    if spec.privileged:
-        statistics["privileged"] = normalizer.empty((spec.privileged_size,))._asdict()
-    flat = flax.traverse_util.flatten_dict({**params, **statistics}, sep="/")
+    tree["observation"] = normalizer.empty((size,))._asdict()
+    if has_critic:
+        tree["value"] = normalizer.empty()._asdict()
+    else:
+        del tree[_CRITIC]
+    if has_critic and spec.privileged:
+        tree["privileged"] = normalizer.empty((spec.privileged_size,))._asdict()
+    flat = flax.traverse_util.flatten_dict(tree, sep="/")
     return {name: tuple(leaf.shape) for name, leaf in flat.items()}
 
 

@@ -255,7 +255,7 @@ def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Pa
     change yet.
 
     Args:
-      params: parameters of actor and critic.
+      params: parameters of actor and critic, if there is one.
       state: for each input of the new state its index in the old one, all of which must occur, or
         -1 if it is new.
       privileged: the same for the critic's privileged inputs, of which some may be dropped.
@@ -264,7 +264,10 @@ def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Pa
     kept = np.concatenate([state, np.arange(np.count_nonzero(state >= 0), before)])
     rows = np.concatenate([kept, np.where(privileged < 0, -1, before + privileged)])
     actor = {**params["actor"], "network": _with_rows(params["actor"]["network"], kept)}
-    return {**params, "actor": actor, "critic": _with_rows(params["critic"], rows)}
+    widened = {**params, "actor": actor}
+    if "critic" in params:
+        widened["critic"] = _with_rows(params["critic"], rows)
+    return widened
 
 
 def _with_rows(layers: Params, rows: np.ndarray) -> Params:

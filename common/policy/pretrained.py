@@ -26,6 +26,13 @@ def pretrained_file(hand: str) -> pathlib.Path | None:
     )
 
 
+def packaged_file(name: str) -> pathlib.Path:
+    """Path of the package's policy of this name, such as `allegro-student`, whether or not it
+    exists.
+    """
+    return _FOLDER / f"{name}{SUFFIX}"
+
+
 def own_policy_file(name: str) -> pathlib.Path:
     """Path of the user's policy for the hand of this name, whether or not it exists."""
     return hands_folder() / f"{name}{SUFFIX}"

@@ -37,7 +37,7 @@ class Options:
     """Listen beyond loopback without certificates."""
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors`
-    of a run.
+    of a run, or a policy of the package, whose critic starts again.
     """
     teacher: str | None = None
     """A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks
@@ -69,12 +69,23 @@ class Options:
     def prepare(self, config: RunConfig) -> None:
         """Creates the directory of the run, or stores the configuration with which it continues."""
         from congrasp.common.policy import bundle as bundles
-        from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run
+        from congrasp.learner.run_directory import (
+            CONFIG_FILE,
+            continue_run,
+            create_run,
+            initial_notes,
+        )
 
         if self.resume or (self.or_resume and (self.run_dir / CONFIG_FILE).exists()):
             continue_run(self.run_dir, config)
-        else:
-            create_run(self.run_dir, config, bundles.load(self.initial) if self.initial else None)
+            return
+        if self.initial is None:
+            create_run(self.run_dir, config)
+            return
+        initial = bundles.load(self.initial)
+        create_run(self.run_dir, config, initial)
+        for note in initial_notes(initial, config, self.initial):
+            log("info", note)
 
 
 def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008

@@ -50,7 +50,7 @@ def train(  # noqa: PLR0913
         default the preset's.
       run_dir: Folder of the run; runs/NAME-DATE by default.
       initial: A policy to begin with instead of random weights, of the same networks:
-        `policy.safetensors` of a run.
+        `policy.safetensors` of a run, or a policy of the package, whose critic starts again.
       teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for
         robots, which sees the joints, the wrist and a tracker's object poses, no forces and no
         velocities (docs/students.md), or with `--method camera` a partial point cloud

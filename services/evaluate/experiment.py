@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
-import mujoco
 import numpy as np
 
 import congrasp.actors
@@ -28,6 +27,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns

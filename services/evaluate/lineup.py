@@ -208,6 +208,7 @@ def facts(one: Entrant) -> dict[str, Any]:
         "method": one.method,
         "file": one.file.name,
         "sha256": hashlib.sha256(one.file.read_bytes()).hexdigest(),
+        "actor_sha256": one.policy.actor_sha256,
         "version": one.policy.version,
         "transitions": one.policy.transitions,
     }

@@ -29,6 +29,7 @@ from congrasp.learner.run_directory import (
     continue_run,
     create_run,
     has_checkpoints,
+    initial_notes,
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
@@ -124,16 +125,10 @@ def _prepare(
     _check(config)
     policy = None if initial is None else bundles.load(initial)
     create_run(run_dir, config, policy)
-    spec = policy_spec(config.task, config.network)
-    if policy is not None and (policy.spec.layout, policy.spec.privileged) != (
-        spec.layout,
-        spec.privileged,
-    ):
-        console.print(
-            f"{initial} has other inputs than this run's policy or critic; the new ones start at "
-            f"zero weight.",
-            markup=False,
-        )
+    if policy is None or initial is None:
+        return
+    for note in initial_notes(policy, config, initial):
+        console.print(note, markup=False)
 
 
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 
 import pytest
 
@@ -9,7 +10,9 @@ from congrasp.common.config import CurriculumConfig, run_config_from_json, to_js
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import RewardWeights
 from congrasp.services.train.presets import PRESETS, get_preset
-from tests.conftest import ROOT
+
+CONFIGS = pathlib.Path(__file__).with_name("configs")
+"""Configurations as earlier versions wrote them."""
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -17,9 +20,7 @@ def test_configurations_survive_the_wire(name):
     assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
 
 
-@pytest.mark.parametrize(
-    "file", sorted(ROOT.glob("checkpoints/*/config.json")), ids=lambda file: file.parent.name
-)
+@pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.json")), ids=lambda file: file.stem)
 def test_runs_of_earlier_versions_keep_their_batch_and_staleness(file):
     written = json.loads(file.read_text())
     earlier = {**written, **written["ppo"]}  # where they were until they belonged to the run

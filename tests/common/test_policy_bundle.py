@@ -59,6 +59,62 @@ def test_file_keeps_everything_exactly(bundle, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["policy.safetensors"]
 
 
+def test_policy_without_critic_acts_as_before(bundle, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    bundles.save(bundles.without_critic(bundle), path)
+    names = set(safetensors.numpy.load_file(path))
+    assert {name.split("/")[0] for name in names} == {"actor", "observation"}
+    loaded = bundles.load(path)
+    assert bundle.has_critic and not loaded.has_critic
+    assert loaded.actor_sha256 == bundle.actor_sha256
+    assert (loaded.spec, loaded.task, loaded.version) == (bundle.spec, bundle.task, 12)
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        loaded.inference_parameters,
+        jax.device_get(bundle.inference_parameters),
+    )
+
+
+def test_policy_with_a_part_of_a_critic_is_refused(bundle):
+    less = bundles.without_critic(bundle).to_message()
+    for name in ("critic/output/bias", "value/count"):
+        part = Message({**less.arrays, name: np.zeros(1, np.float32)}, less.meta)
+        with pytest.raises(CongraspError, match=r"p\.safetensors"):
+            PolicyBundle.from_message(part, "p.safetensors")
+
+
+def test_new_critic_is_that_of_an_untrained_policy(bundle):
+    begun = bundles.with_new_critic(bundles.without_critic(bundle), 5)
+    jax.tree.map(np.testing.assert_array_equal, begun.params, bundle.params)
+    assert begun.value.count == 0 and begun.actor_sha256 == bundle.actor_sha256
+
+
+def _actor_bias(bundle: PolicyBundle) -> PolicyBundle:
+    params = jax.tree.map(np.array, bundle.params)
+    params["actor"]["network"]["output"]["bias"][0] += 1e-6
+    return dataclasses.replace(bundle, params=params)
+
+
+def _mean(bundle: PolicyBundle) -> PolicyBundle:
+    observation = bundle.observation
+    return dataclasses.replace(bundle, observation=observation._replace(mean=observation.mean + 1))
+
+
+def _hand(bundle: PolicyBundle) -> PolicyBundle:
+    return dataclasses.replace(bundle, spec=dataclasses.replace(bundle.spec, hand="paw"))
+
+
+@pytest.mark.parametrize("change", [_actor_bias, _mean, _hand])
+def test_actor_hash_changes_with_the_actor(bundle, change):
+    assert change(bundle).actor_sha256 != bundle.actor_sha256
+
+
+def test_actor_hash_ignores_critic_and_version(bundle):
+    params = {**bundle.params, "critic": jax.tree.map(np.zeros_like, bundle.params["critic"])}
+    other = dataclasses.replace(bundle, params=params, version=13)
+    assert other.actor_sha256 == bundle.actor_sha256
+
+
 def test_file_is_read_by_other_programs(bundle, tmp_path):
     bundles.save(bundle, tmp_path / "policy.safetensors")
     arrays = safetensors.numpy.load_file(tmp_path / "policy.safetensors")

@@ -12,6 +12,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import pretrained as module
+from congrasp.common.policy import ship
 from congrasp.common.policy.pretrained import (
     hands_with_policy,
     named_policy,
@@ -88,6 +89,22 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
     }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand
+
+
+@pytest.mark.parametrize("file", sorted(module._FOLDER.glob("*.safetensors")), ids=lambda f: f.stem)
+def test_shipped_policy_has_no_critic(file):
+    assert not bundles.load(file).has_critic
+
+
+def test_shipping_leaves_out_the_critic(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(module, "_FOLDER", tmp_path)
+    task = TaskConfig(constraints=("heading",))
+    trained = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4)))
+    bundles.save(trained, tmp_path / "run.safetensors")
+    ship.main([str(tmp_path / "run.safetensors"), "mine"])
+    shipped = bundles.load(tmp_path / "mine.safetensors")
+    assert not shipped.has_critic and shipped.actor_sha256 == trained.actor_sha256
+    assert trained.actor_sha256 in capsys.readouterr().out
 
 
 def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
-    *(ROOT / folder / "README.md" for folder in ("deploy", "checkpoints")),
+    ROOT / "deploy" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 FREE = ("docs/notes/", "docs/reference/", "CHANGELOG.md")
@@ -29,7 +29,7 @@ BANNED = re.compile(
 )
 """Words that the project's prose does not use; each has a plainer one in CONTRIBUTING.md."""
 
-FOLDERS = "common|actors|learner|services|congrasp|docs|tests|deploy|examples|checkpoints"
+FOLDERS = "common|actors|learner|services|congrasp|docs|tests|deploy|examples"
 PATH = re.compile(rf"(?<![\w/.~-])(?:\.\./)*((?:{FOLDERS})/[\w./-]*[\w/])")
 MODULE = re.compile(r"(?<![\w./-])((?:congrasp|tests)(?:\.\w+)+)")
 MADE = ("docs/results/NAME.json", "congrasp/Grasp-v0", "learner/0/")

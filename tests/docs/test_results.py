@@ -7,6 +7,7 @@ import json
 import pytest
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import pretrained_file, pretrained_hands
 from congrasp.services.evaluate.results import KINDS, ROOT, filled, pages, read_results, recorded
 
@@ -32,9 +33,9 @@ def test_results_are_of_the_policies_that_ship(name):
     """A new policy needs new figures: run the command in the file again."""
     for policy in RESULTS[name].about["policies"]:
         path = pretrained_file(policy["hand"]).with_name(policy["file"])
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == policy["sha256"], RESULTS[
-            name
-        ].about["command"]
+        command = RESULTS[name].about["command"]
+        assert bundles.load(path).actor_sha256 == policy["actor_sha256"], command
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == policy["sha256"], command
 
 
 @pytest.mark.parametrize("name", RESULTS)

@@ -18,7 +18,7 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.process import run_learner
-from congrasp.learner.run_directory import create_run, open_run
+from congrasp.learner.run_directory import create_run, initial_notes, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -260,6 +260,23 @@ def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
         create_run(tmp_path / "three", CONFIG, other)
     assert not (tmp_path / "three").exists()
+
+
+def test_training_of_a_policy_without_critic_begins_one(tmp_path, hub):
+    create_run(tmp_path / "one", CONFIG)
+    stopped = threading.Event()
+    stopped.set()
+    trained = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
+    initial = bundles.without_critic(trained)
+    (note,) = initial_notes(initial, CONFIG, tmp_path / "mine.safetensors")
+    assert "mine.safetensors" in note and "critic" in note
+    assert not list(initial_notes(trained, CONFIG, tmp_path / "mine.safetensors"))
+    create_run(tmp_path / "two", CONFIG, initial)
+    begun = learn(tmp_path / "two", hub, CONFIG, stopped)
+    assert begun.actor_sha256 == trained.actor_sha256
+    fresh = bundles.with_new_critic(initial, CONFIG.seed).params["critic"]
+    jax.tree.map(np.testing.assert_array_equal, begun.params["critic"], fresh)
+    assert bundles.load(tmp_path / "two" / "policy.safetensors").has_critic
 
 
 def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):

@@ -14,11 +14,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.confined import call_confined
 from congrasp.services.assets.objects.mesh_files import SUFFIXES, load_geometry
 
@@ -146,7 +146,6 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, muj
     Raises:
       CongraspError: it cannot be read, or has more parts than `LIMITS`.
     """
-    mujoco.set_mju_user_warning(lambda text: None)  # otherwise they go to MUJOCO_LOG.TXT
     try:
         with contextlib.chdir(path.parent):  # an attached model's files are searched from there
             spec = _spec(pathlib.Path.cwd() / path.name, notes)

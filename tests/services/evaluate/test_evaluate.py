@@ -118,6 +118,7 @@ def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeyp
         read["physics"] == "native"
         and "grasps of the reference policy of the human hand" in printed
     )
+    assert read["policy"]["actor_sha256"] == bundles.load(policy).actor_sha256
     assert read["policy"]["sha256"] == hashlib.sha256(policy.read_bytes()).hexdigest()
     assert (
         read["version"] == importlib.metadata.version("congrasp")
