@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged, physics_state
@@ -17,6 +16,7 @@ from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addres
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.common.runtime.parallel import memory
 from congrasp.common.task.config import TaskConfig
 

@@ -5,13 +5,13 @@ sensors.
 import dataclasses
 import functools
 
-import mujoco
 import numpy as np
 
 from congrasp.common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import CONTACT, ContactSettings, add_object
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK
 

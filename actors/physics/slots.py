@@ -10,7 +10,6 @@ contact can reach.
 import dataclasses
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 
 from congrasp.actors.physics.scene import (
@@ -24,6 +23,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import GEOM_TYPES, add_object
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.common.task.config import TaskConfig
 
 _UNUSED = 0.0004

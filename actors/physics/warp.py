@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp
@@ -56,6 +55,7 @@ from congrasp.actors.physics.warp_kernels import (
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig

@@ -3,13 +3,13 @@
 import functools
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from congrasp.common.hands.spec import CONTACT_TIME, Capsule, Hand, Link, Solid, link_origin
 from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import GEOM_TYPES
 from congrasp.common.objects.spec import Piece
+from congrasp.common.runtime.mujoco import mujoco
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: geoms that collide with it have this bit in their conaffinity."""

@@ -2,10 +2,10 @@
 
 import dataclasses
 
-import mujoco
 import numpy as np
 
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 
 
 @dataclasses.dataclass(frozen=True)

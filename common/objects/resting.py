@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import CONTACT, add_object
 from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.runtime.mujoco import mujoco
 
 MAX_POSES = 8
 _SAME_NORMAL = np.cos(np.radians(15))  # tolerance at which two directions count as one

@@ -7,12 +7,12 @@ Of a union of pieces: labelled points on its outer surface, and mass properties.
 import functools
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
+from congrasp.common.runtime.mujoco import mujoco
 
 _SEGMENTS = 24
 DENSE = 8192

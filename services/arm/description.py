@@ -6,12 +6,12 @@ import pathlib
 import xml.etree.ElementTree as ET
 from typing import Any
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.inputs import numbers_in, read_npz
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.hands.compile import confined, robot_spec, robot_text
 
 SPEED = 3.14

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 from typing import Any
 
-import mujoco
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -13,6 +12,7 @@ from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import numbers_in
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm
 from congrasp.services.arm.robot import (

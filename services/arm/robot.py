@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Collection
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
@@ -13,6 +12,7 @@ from congrasp.common.hands.mjcf import WRIST_JOINTS, add_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import add_object
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.arm.description import Arm
 from congrasp.services.assets.hands.links import geom_mesh
 from congrasp.services.record.episode import UNLIMITED, MovedArm

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 from mujoco import rollout
 from rich.console import Console
@@ -24,6 +23,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset

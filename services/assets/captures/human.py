@@ -11,7 +11,6 @@ import functools
 import pathlib
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -21,6 +20,7 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
 from congrasp.common.hands.mjcf import posed
 from congrasp.common.hands.spec import link_origin
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.captures.sequence import FINGERS
 from congrasp.services.assets.objects.mesh_files import load_geometry
 

@@ -6,10 +6,10 @@ the file shows the hand, which is zero here.
 
 import dataclasses
 
-import mujoco
 import numpy as np
 
 from congrasp.common.hands.spec import Coupling, Joint, Motor
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.hands.compile import listed
 
 FINGERTIP_FORCE = 15.0

@@ -14,11 +14,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.confined import call_confined
 from congrasp.services.assets.objects.mesh_files import SUFFIXES, load_geometry
 

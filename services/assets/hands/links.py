@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any, Literal
 
-import mujoco
 import numpy as np
 import trimesh
 
@@ -20,6 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
 from congrasp.common.io.inputs import distinct_names
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.hands.compile import LEAST, listed
 
 _CALLED = ("palm", "hand")

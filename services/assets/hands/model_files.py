@@ -9,7 +9,6 @@ import dataclasses
 import pathlib
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from congrasp.common.errors import CongraspError
@@ -19,6 +18,7 @@ from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save
 from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.common.io.inputs import distinct_names
+from congrasp.common.runtime.mujoco import mujoco
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import LEAST, confined, listed, robot_spec
 from congrasp.services.assets.hands.links import (

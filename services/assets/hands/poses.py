@@ -10,7 +10,6 @@ import dataclasses
 import re
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -18,6 +17,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand, chain_of, link_origin
+from congrasp.common.runtime.mujoco import mujoco
 
 # Share of the range from zero to a joint's end at which it is closed, where thumb and fingers can
 # meet
