@@ -136,7 +136,7 @@ def grasp(policy_file: str) -> str:
     import congrasp
 
     motion = congrasp.grasp("box:1", policy=policy_file, heading="above", attempts=2).motion
-    return digest(motion.q, motion.object_position)
+    return digest(motion.joint_position, motion.object_position)
 
 
 def evaluate(policy_file: str) -> str:
