@@ -5,6 +5,7 @@
 The digests are of exact results; the last line says which settings of the process have changed.
 """
 
+import concurrent.futures
 import hashlib
 import os
 import sys
@@ -118,6 +119,12 @@ def act(policy_file: str) -> str:
     return digest(*[array for answer in answers for array in answer[:3]])
 
 
+def act_in_thread(policy_file: str) -> str:
+    """The actions of `act` in another thread."""
+    with concurrent.futures.ThreadPoolExecutor(1) as threads:
+        return threads.submit(act, policy_file).result()
+
+
 def step(policy_file: str) -> str:
     """An episode of the environment."""
     import congrasp
@@ -152,7 +159,13 @@ def evaluate(policy_file: str) -> str:
     return digest(*[result.sample.values[name] for name in sorted(result.sample.values)])
 
 
-ENTRIES = {"act": act, "step": step, "grasp": grasp, "evaluate": evaluate}
+ENTRIES = {
+    "act": act,
+    "act_in_thread": act_in_thread,
+    "step": step,
+    "grasp": grasp,
+    "evaluate": evaluate,
+}
 
 
 def settings_of_process() -> dict[str, Any]:

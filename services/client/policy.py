@@ -175,6 +175,7 @@ class EpisodePolicy(Policy):
         """
         raise NotImplementedError
 
+    @library_settings()
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`."""
         forks.require_same_process(self._opened, "policy")
