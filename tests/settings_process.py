@@ -1,20 +1,23 @@
 """Computes with every entry of the library under a setting of its process, and prints digests.
 
-    python -m tests.settings_process SETTING POLICY
+    python -m tests.settings_process POLICY SETTING...
 
 The digests are of exact results; the last line says which settings of the process have changed.
 """
 
 import concurrent.futures
+import contextlib
 import hashlib
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
+VARIABLES = tuple(os.environ)
 SHORT = {
     "objects": 2,
     "physics": "native",
@@ -30,8 +33,6 @@ def with_jax(**values: Any) -> Callable[[], None]:
     """Returns a function that changes JAX's configuration."""
 
     def change() -> None:
-        import jax
-
         for name, value in values.items():
             jax.config.update(f"jax_{name}", value)
 
@@ -154,7 +155,9 @@ def evaluate(policy_file: str) -> str:
 
     policy = bundle.load(policy_file)
     objects = procedural.generate_many(1, 0, ("box",))
-    experiment = Experiment(policy, objects, episodes=2, batch=2, hold=policy.task.hold_steps)
+    experiment = Experiment(
+        policy, objects, episodes=2, batch=2, hold=policy.task.hold_steps, measured=False
+    )
     (result,) = experiment.run([Variation("heading")])
     return digest(*[result.sample.values[name] for name in sorted(result.sample.values)])
 
@@ -170,27 +173,41 @@ ENTRIES = {
 
 def settings_of_process() -> dict[str, Any]:
     """Settings that belong to the caller."""
-    import jax
-
     return {
         "numpy": np.geterr(),
         "print": np.get_printoptions(),
         "warnings": [*warnings.filters],
-        "environment": dict(os.environ),
+        "environment": {name: os.environ.get(name) for name in VARIABLES},
         "jax": {name: getattr(jax.config, name, None) for name in jax.config.values},
     }
 
 
-def main(setting: str, policy_file: str) -> None:
-    """Prints a line for each entry, and one of the settings that have changed."""
-    import jax  # noqa: F401
+@contextlib.contextmanager
+def restored() -> Iterator[None]:
+    """Context at whose end all settings are those of its beginning."""
+    before = settings_of_process()["jax"]
+    with warnings.catch_warnings(), np.errstate(), np.printoptions():
+        yield
+    for name, value in before.items():
+        if getattr(jax.config, name, None) != value:
+            jax.config.update(name, value)
 
+
+def compute(setting: str, policy_file: str) -> None:
+    """Prints a line for each entry under a setting, and one of the settings that have changed."""
     SETTINGS[setting]()
     before = settings_of_process()
     for name, entry in ENTRIES.items():
         print(name, entry(policy_file), flush=True)
     after = settings_of_process()
     print("changed", [name for name in before if before[name] != after[name]])
+
+
+def main(policy_file: str, *settings: str) -> None:
+    """Computes under one setting after the other."""
+    for setting in settings:
+        with restored():
+            compute(setting, policy_file)
 
 
 if __name__ == "__main__":

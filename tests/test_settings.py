@@ -1,6 +1,7 @@
 """Settings of the caller's process: results are those without them, and the settings remain."""
 
 import functools
+import pathlib
 
 import pytest
 
@@ -17,34 +18,38 @@ ENVIRONMENT = {
 """Variables left over from other programs."""
 
 
-def results(setting: str, policy: str, environment: dict[str, str] | None = None) -> list[str]:
-    """Lines of a process with this setting."""
-    done = python("-m", "tests.settings_process", setting, policy, env=environment, timeout=400)
+def results(
+    policy: pathlib.Path, *settings: str, environment: dict[str, str] | None = None
+) -> list[str]:
+    """Lines of a process that computes under one setting after the other."""
+    command = ("-m", "tests.settings_process", policy, *settings)
+    done = python(*command, env=environment, timeout=400)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
-@functools.cache
-def plain_results(policy: str) -> list[str]:
-    """Lines of a process without settings."""
-    lines = results("plain", policy)
-    assert [line.split()[0] for line in lines] == [*ENTRIES, "changed"]
+def test_entries_ignore_all_settings_at_once(paper_policy):
+    """The results without them are those of the same process, whose programs are compiled once."""
+    lines = results(paper_policy, "everything", "plain", environment=ENVIRONMENT)
+    count = len(ENTRIES) + 1
+    assert [line.split()[0] for line in lines] == 2 * [*ENTRIES, "changed"]
+    assert lines[:count] == lines[count:]
     assert lines[-1] == "changed []"
-    return lines
 
 
-@pytest.mark.parametrize(
-    "setting",
-    [
-        pytest.param(name, marks=[] if name == "everything" else pytest.mark.slow)
-        for name in SETTINGS
-        if name != "plain"
-    ],
-)
-def test_entries_ignore_settings_of_the_caller(setting, paper_policy):
-    assert results(setting, str(paper_policy)) == plain_results(str(paper_policy))
+@functools.cache
+def plain_results(policy: pathlib.Path) -> list[str]:
+    """Lines of a process without settings."""
+    return results(policy, "plain")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", [name for name in SETTINGS if name != "plain"])
+def test_entries_ignore_a_setting(setting, paper_policy):
+    assert results(paper_policy, setting) == plain_results(paper_policy)
+
+
+@pytest.mark.slow
 def test_entries_ignore_variables_of_the_environment(paper_policy):
-    lines = results("plain", str(paper_policy), ENVIRONMENT)
-    assert lines == plain_results(str(paper_policy))
+    lines = results(paper_policy, "plain", environment=ENVIRONMENT)
+    assert lines == plain_results(paper_policy)
