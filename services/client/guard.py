@@ -184,6 +184,7 @@ class Guard(Closing):
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no
             pose.
+          ForkError: the guard was opened before this process was forked.
         """
         self._asker.require_same_process()
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
@@ -221,6 +222,7 @@ class Guard(Closing):
 
         Raises:
           RefusedError: there is no episode yet.
+          ForkError: the guard was opened before this process was forked.
         """
         self._asker.require_same_process()
         if self._limiter is None:
