@@ -203,8 +203,11 @@ class EpisodePolicy(Policy):
         known = {**self._fields, **state}
         reading = {name: _numbers(name, known[name]) for name in _READ if name in known}
         self._past = [reading, *self._past[: _LONGEST - 1]]
-        self._fields.update(rest, q_target=answer.q_target, u_target=answer.u_target)
-        self._time, self._rested = self._time + 1, rested
+        # Copies, since the caller may change the answer
+        targets = {"q_target": answer.q_target.copy(), "u_target": answer.u_target.copy()}
+        self._fields.update(rest, **targets)
+        self._time += 1
+        self._rested = rested
         return answer
 
     @library_settings()
