@@ -14,6 +14,8 @@ Names are imported on first use: the client and its errors need only numpy and z
 """
 
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -103,8 +105,10 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'congrasp' has no attribute '{name}'")
     errors = importlib.import_module("congrasp.common.errors")
+    tolerance = importlib.import_module("congrasp.common.runtime.tolerance")
     try:
-        module = importlib.import_module(_MODULES.get(name, errors.__name__))
+        with tolerance.tolerated_warnings():
+            module = importlib.import_module(_MODULES.get(name, errors.__name__))
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package == "congrasp":
@@ -116,3 +120,12 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return list(__all__)
+
+
+def _before_fork() -> None:
+    """Lets the fork know that the caller has started JAX, whose threads it will lack."""
+    if "jax" in sys.modules:
+        importlib.import_module("congrasp.common.runtime.forks").detect_jax()
+
+
+os.register_at_fork(before=_before_fork)

@@ -15,6 +15,7 @@ import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.types import Array
 
 T = TypeVar("T")
@@ -152,7 +153,7 @@ def untraced(function: Callable[..., T], *arguments: Any) -> T:
     with concurrent.futures.ThreadPoolExecutor(
         1
     ) as thread:  # in another thread nothing is being traced
-        return thread.submit(function, *arguments).result()
+        return thread.submit(library_settings()(function), *arguments).result()
 
 
 @functools.cache

@@ -5,7 +5,6 @@ need, and refuses all others. It has limited memory, processor time and output, 
 file.
 """
 
-import os
 import pathlib
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file, read_npz
+from congrasp.common.runtime.environment import child_environment
 
 MAX_BYTES = 512 << 20
 """Limit in bytes of the pickles read by one process, and of their arrays."""
@@ -111,7 +111,7 @@ def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> N
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env=child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"),
             check=False,
         )
     except subprocess.TimeoutExpired:

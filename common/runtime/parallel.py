@@ -20,6 +20,8 @@ from typing import Any, TypeVar
 
 import psutil
 
+from congrasp.common.runtime.environment import child_environment
+
 Result = TypeVar("Result")
 _WORTH_IT = 64  # calls; below this, starting processes takes longer than it saves
 _MOST_WORKERS = 16
@@ -162,13 +164,14 @@ class _Helper:
                 process = subprocess.Popen(
                     [
                         multiprocessing.spawn.get_executable(),
+                        "-P",
                         "-c",
                         f"import sys; sys.path[:] = {paths}; from {__name__} import serve; "
                         f"serve({number})",
                     ],
                     stdin=subprocess.DEVNULL,
                     pass_fds=[number],
-                    env={**_ONE_THREAD, **os.environ, "JAX_PLATFORMS": "cpu"},
+                    env={**_ONE_THREAD, **child_environment(JAX_PLATFORMS="cpu")},
                 )
             self._running = process, here
         return self._running[1]

@@ -16,6 +16,7 @@ from concurrent.futures import Future
 from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
+from congrasp.common.runtime import forks
 from congrasp.common.transport.base import (
     Admission,
     Answerer,
@@ -54,6 +55,7 @@ class MemoryHub:
     """State shared by the endpoints of one process."""
 
     def __init__(self) -> None:
+        self.opened = forks.generation()
         self.lock = threading.Lock()
         self.servers: list[_Server] = []
         self.subscriptions: list[tuple[str, Subscription]] = []
@@ -170,7 +172,7 @@ class MemoryTransport(Transport):
         Waits for its threads: one that releases a device array while the interpreter shuts down
         kills the process.
         """
-        if self._closed:
+        if self._closed or self._hub.opened != forks.generation():
             return
         self._closed = True
         self._on_close()
@@ -192,7 +194,10 @@ class MemoryTransport(Transport):
         join(self._threads, time.monotonic() + _GRACE)
 
     def _check_open(self) -> None:
-        """Raises a `TransportError` if the endpoint is closed."""
+        """Raises a `TransportError` if the endpoint is closed, and a ForkError in a fork, which
+        lacks the threads of the hub's endpoints.
+        """
+        forks.require_same_process(self._hub.opened, "connection")
         if self._closed:
             raise TransportError("The transport is closed.")
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.forks import require_not_inherited
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import FLOWS, Flow
 from congrasp.common.transport.memory import connect_in_memory, listen_in_memory
@@ -161,6 +162,7 @@ def _open_memory(endpoint: Endpoint) -> Transport:
 
 
 def _open_zenoh(endpoint: Endpoint) -> Transport:
+    require_not_inherited("Zenoh")
     from congrasp.common.transport.zenoh_transport import ZenohTransport
 
     credentials = find_credentials(endpoint.certs, endpoint.role, endpoint.run)

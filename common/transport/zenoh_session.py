@@ -19,12 +19,14 @@ import resource
 import struct
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
 
 from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.runtime import forks
 from congrasp.common.transport.base import Subscription, join
 from congrasp.common.transport.keys import FLOWS, Flow
 from congrasp.common.transport.security import Credentials, limits, refusal
@@ -158,7 +160,7 @@ def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
     use.
     """
     try:
-        return zenoh.open(config)
+        return _open(config)
     except zenoh.ZError as error:
         where = ", ".join(endpoints)
         if "in use" in str(error):
@@ -187,7 +189,7 @@ def connect(
     """
     while True:
         try:
-            session = zenoh.open(config)
+            session = _open(config)
             break
         except zenoh.ZError as error:
             refusals = [refusal(one, credentials) for one in endpoints]
@@ -213,6 +215,12 @@ def connect(
     return session
 
 
+def _open(config: zenoh.Config) -> zenoh.Session:
+    """Opens a session, and with the first one Zenoh's threads."""
+    forks.note_started("Zenoh")
+    return zenoh.open(config)
+
+
 def first_line(error: Exception) -> str:
     """First line of a Zenoh error, without positions in its source."""
     return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
@@ -231,6 +239,9 @@ class _Declaration:
         self.entity: Any = None
 
 
+_all_sessions: "weakref.WeakSet[Sessions]" = weakref.WeakSet()
+
+
 class Sessions:
     """Sessions of a transport, their declarations, and the threads inside them.
 
@@ -243,6 +254,7 @@ class Sessions:
     """
 
     def __init__(self) -> None:
+        self._opened = forks.generation()
         self._open: dict[Flow, zenoh.Session] = {}
         self._openers: dict[Flow, Callable[[], zenoh.Session]] = {}
         self._declarations: list[_Declaration] = []
@@ -252,6 +264,7 @@ class Sessions:
         self._reopening = threading.RLock()
         self.closed = threading.Event()
         self.failure: CongraspError | None = None
+        _all_sessions.add(self)
 
     def open(self, name: Flow, opener: Callable[[], zenoh.Session]) -> None:
         """Opens a flow's session."""
@@ -262,6 +275,7 @@ class Sessions:
         """Returns a flow's session; None if there is none, or while it is closed or being
         reopened.
         """
+        self._require_same_process()
         return self._open.get(name)
 
     def declare(
@@ -273,6 +287,7 @@ class Sessions:
         Returns:
           A function that undeclares it.
         """
+        self._require_same_process()
         declaration = _Declaration(name, declare, works)
         with self._reopening:
             self._start_all(declaration)
@@ -322,6 +337,7 @@ class Sessions:
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
         """Context of a call into Zenoh by a thread of the caller."""
+        self._require_same_process()
         with self._changed:
             self._inside += 1
         try:
@@ -332,7 +348,11 @@ class Sessions:
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Closes the sessions, and waits briefly for the threads."""
+        """Closes the sessions, and waits briefly for the threads; a fork leaves them to the process
+        that opened them.
+        """
+        if self._opened != forks.generation():
+            return
         self.closed.set()
         deadline = time.monotonic() + _CLOSE
         if self._reopening.acquire(timeout=_CLOSE):
@@ -372,6 +392,18 @@ class Sessions:
             for link in session.info.links()
         }
 
+    def abandon(self) -> None:
+        """Keeps all of Zenoh's objects alive to the end of a fork: the destructor of a session
+        waits for threads that do not run there.
+        """
+        entities = [declaration.entity for declaration in self._declarations]
+        for entity in (*self._open.values(), *entities):
+            forks.keep_to_the_end(entity)
+
+    def _require_same_process(self) -> None:
+        """Raises a ForkError in a fork of the process that opened the sessions."""
+        forks.require_same_process(self._opened, "connection")
+
     def _start_all(self, declaration: _Declaration) -> None:
         """Declares in the current session, and starts the threads; raises a TransportError if there
         is no session.
@@ -384,6 +416,15 @@ class Sessions:
         declaration.entity = declaration.declare(session)
         for work in declaration.works:
             self.start(work, declaration.entity.handler)
+
+
+def _abandon_all() -> None:
+    """Abandons all sessions; runs in forks."""
+    for sessions in list(_all_sessions):
+        sessions.abandon()
+
+
+os.register_at_fork(after_in_child=_abandon_all)
 
 
 def follow_revocations(

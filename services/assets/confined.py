@@ -20,12 +20,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import congrasp
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.environment import child_environment
 
 _ANSWER = "answer.json"
 _MODULE = "congrasp.services.assets.confined"
-_ROOT = pathlib.Path(congrasp.__file__).parents[1]
 
 
 def call_confined(
@@ -54,16 +53,10 @@ def call_confined(
       TimeoutError: it did not end within `patience`.
       ChildProcessError: it ended without an answer; the text is a reason in the past tense.
     """
-    search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-    own = {
-        "PYTHONPATH": search,
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "JAX_PLATFORMS": "cpu",
-    }
+    env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
     command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
-    given, env = json.dumps(options).encode(), {**os.environ, **own}
+    given = json.dumps(options).encode()
     try:
         child = subprocess.run(
             command,

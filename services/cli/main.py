@@ -22,6 +22,8 @@ from typing import Any, TextIO
 import congrasp
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder, can_cache, check_output
+from congrasp.common.runtime.environment import child_environment, own_environment
+from congrasp.services.cli.terminal import ensure_width
 from congrasp.services.ops.lifetime import SIGNALS, follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
 
@@ -73,6 +75,8 @@ _WRITTEN = ("--out", "--json", "--png", "--video", "--pictures", "--references")
 """Options for files and folders that a command writes, or creates if they are absent."""
 _OUTPUTS = ("out", "json", "png", "pictures", "video")
 """Parameters of commands with a file or a folder that they write."""
+_QUIET_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+"""Categories that Python itself ignores."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
@@ -100,6 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> None:  # noqa: C901
             stream.reconfigure(errors="backslashreplace")
         elif stream is None:  # the shell closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    if alone:
+        _own_interpreter()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()
     debug = "--debug" in arguments
@@ -136,6 +142,20 @@ def main(arguments: Sequence[str] | None = None) -> None:  # noqa: C901
         _last_words(sys.stderr)
         os._exit(code)
     sys.exit(code)
+
+
+def _own_interpreter() -> None:
+    """Undoes the interpreter's options that change what a command does: removed docstrings, which
+    are the help, and filters that turn warnings into errors.
+    """
+    if sys.flags.optimize > 1:
+        command = [sys.executable, "-m", "congrasp", *sys.argv[1:]]
+        os.execve(sys.executable, command, child_environment())
+    if sys.warnoptions:
+        sys.warnoptions.clear()
+        warnings.resetwarnings()
+        for category in _QUIET_WARNINGS:
+            warnings.simplefilter("ignore", category)
 
 
 def _said_of(error: OSError) -> str:
@@ -320,11 +340,11 @@ def usage() -> str:
 
 
 def _prepare_environment() -> None:
-    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would
-    start processes).
-
-    Variables set by the user are kept.
+    """Removes settings of other programs from the environment, and configures caches of compiled
+    programs and compiler output, unless the user has.
     """
+    own_environment()
+    ensure_width()
     folder = cache_folder("jax")
     if not can_cache(folder.parent, "XDG_CACHE_HOME"):
         warnings.filterwarnings("ignore", "Error writing persistent compilation cache")
@@ -334,7 +354,6 @@ def _prepare_environment() -> None:
     # XLA's cache of GPU tuning would make the folder's path a part of every key: programs could not
     # move to another.
     os.environ.setdefault("JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES", "none")
-    os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 

@@ -49,7 +49,8 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
         if rest and rest[0] in commands:
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
-        with _epilog([examples(command)[0] for command in commands.values()]):
+        first = [line for command in commands.values() for line in examples(command)[:1]]
+        with _epilog(first):
             return tyro.extras.subcommand_cli_from_dict(
                 deferred, prog=prog, description=description, args=rest
             )
@@ -76,7 +77,7 @@ def _epilog(lines: Sequence[str]) -> Iterator[None]:
     try:
         yield
     except SystemExit as end:
-        if not end.code:
+        if not end.code and lines:
             print("\n".join(("Examples:", *(f"  {line}" for line in lines))))
         raise
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime import forks
 from congrasp.common.transport.base import Closing
 from congrasp.services.client.limits import Floor, JointLimits, Limiter, Speeds, as_numbers
 from congrasp.services.client.policy import Answer, Policy, State
@@ -183,7 +184,9 @@ class Guard(Closing):
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no
             pose.
+          ForkError: the guard was opened before this process was forked.
         """
+        self._asker.require_same_process()
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
             start[: self._fingers] = self._limiter.target[: self._fingers]
@@ -219,7 +222,9 @@ class Guard(Closing):
 
         Raises:
           RefusedError: there is no episode yet.
+          ForkError: the guard was opened before this process was forked.
         """
+        self._asker.require_same_process()
         if self._limiter is None:
             raise RefusedError("There is no episode yet.", "Begin one with reset.")
         now = self._clock()
@@ -330,6 +335,7 @@ class _Asker:
 
     def __init__(self, policy: Policy):
         self._policy = policy
+        self._opened = forks.generation()
         self._changed = threading.Condition()
         self._request: GraspRequest | None = None
         self._question: tuple[State, float] | None = None
@@ -337,6 +343,10 @@ class _Asker:
         self._episode, self._busy, self._closed = 0, False, False
         self._thread = threading.Thread(target=self._work, daemon=True, name="guard")
         self._thread.start()
+
+    def require_same_process(self) -> None:
+        """Raises a ForkError in a fork of this process, where the thread does not run."""
+        forks.require_same_process(self._opened, "guard")
 
     def begin(self, request: GraspRequest) -> None:
         """Begins an episode."""
@@ -368,7 +378,11 @@ class _Asker:
             return outcome
 
     def close(self) -> None:
-        """Ends the thread, unless a query blocks it, and closes the policy."""
+        """Ends the thread, unless a query blocks it, and closes the policy; a fork leaves both to
+        the process that opened them.
+        """
+        if self._opened != forks.generation():
+            return
         with self._changed:
             self._closed = True
             self._changed.notify_all()

@@ -16,6 +16,8 @@ import numpy as np
 from congrasp.common import mirror
 from congrasp.common.errors import LayoutError, RefusedError
 from congrasp.common.request import GraspRequest, Pose
+from congrasp.common.runtime import forks
+from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.transport.base import Closing
 from congrasp.common.wire.codec import Message
@@ -145,6 +147,7 @@ class EpisodePolicy(Policy):
     """
 
     def __init__(self) -> None:
+        self._opened = forks.generation()
         self._request: GraspRequest | None = None
         self._fields: dict[str, np.ndarray] = {}  # of all queries of the episode
         self._layout: Mapping[str, Any] | None = None
@@ -172,29 +175,45 @@ class EpisodePolicy(Policy):
         """
         raise NotImplementedError
 
+    @library_settings()
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`."""
+        forks.require_same_process(self._opened, "policy")
         return self._described()
 
+    @library_settings()
     def reset(self, request: GraspRequest) -> None:
         """See `Policy.reset`."""
-        self._fields, self._request, self._packer = _episode_fields(request), request, None
-        self._time, self._rested, self._past = 0, np.asarray(1), []
+        forks.require_same_process(self._opened, "policy")
+        self._fields = _episode_fields(request)
+        self._request = request
+        self._packer = None
+        self._time = 0
+        self._rested = np.asarray(1)
+        self._past = []
 
+    @library_settings()
     def act(self, state: State) -> Answer:
         """See `Policy.act`."""
-        began, packer = time.perf_counter(), self._packing()
+        forks.require_same_process(self._opened, "policy")
+        began = time.perf_counter()
+        packer = self._packing()
         rest, rested = self._resting(state, packer.settle)
         (answer,) = self._ask(began, [{**rest, **state}])
         known = {**self._fields, **state}
         reading = {name: _numbers(name, known[name]) for name in _READ if name in known}
         self._past = [reading, *self._past[: _LONGEST - 1]]
-        self._fields.update(rest, q_target=answer.q_target, u_target=answer.u_target)
-        self._time, self._rested = self._time + 1, rested
+        # Copies, since the caller may change the answer
+        targets = {"q_target": answer.q_target.copy(), "u_target": answer.u_target.copy()}
+        self._fields.update(rest, **targets)
+        self._time += 1
+        self._rested = rested
         return answer
 
+    @library_settings()
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """See `Policy.act_each`."""
+        forks.require_same_process(self._opened, "policy")
         if not states:
             raise RefusedError("There is no state to act in.", "Give one or more.")
         return self._ask(time.perf_counter(), states)
@@ -239,7 +258,8 @@ class EpisodePolicy(Policy):
             reply = self._query(self._packed(states))
         version, server_ms = int(reply.meta["version"]), float(reply.meta["total_ms"])
         spent, fingers = 1e3 * (time.perf_counter() - began), len(self._fields["q_initial"])
-        parts = np.split(reply.arrays[PACKED], [-fingers - 6, -6], 1)
+        vectors = np.array(reply.arrays[PACKED])  # a copy, which the caller may change
+        parts = np.split(vectors, [-fingers - 6, -6], 1)
         return [
             Answer(q_target, u_target, action, version, tuple(active), spent, server_ms)
             for action, q_target, u_target, active in zip(*parts, reply.meta["active"], strict=True)

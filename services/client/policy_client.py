@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 from congrasp.common.errors import RefusedError, TransportError
+from congrasp.common.runtime import forks
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
@@ -53,6 +54,7 @@ class PolicyClient(EpisodePolicy):
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
+        forks.require_same_process(self._opened, "policy")
         deadline = time.monotonic() + self._wait
         while True:
             try:

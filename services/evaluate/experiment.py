@@ -27,6 +27,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -222,6 +223,7 @@ class Experiment:
         made = self.references if from_references(constraint) else None
         return made.bank if made else self.bank
 
+    @compiling_entry
     def plan(self, variation: Variation) -> RowPlan:
         """Plans the episodes of a row; see `services.evaluate.plan.plan_row`.
 
@@ -233,6 +235,7 @@ class Experiment:
             self.task, variation.bank(self), self.scaled, variation.constraint, self.episodes
         )
 
+    @compiling_entry
     def allowed(
         self, variations: Iterable[Variation]
     ) -> tuple[list[Variation], list[CongraspError]]:
@@ -275,6 +278,7 @@ class Experiment:
         """
         return content_hash(repr((*self._identity, *about)).encode())
 
+    @compiling_entry
     def run(
         self,
         variations: Sequence[Variation],

@@ -29,6 +29,7 @@ from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool,
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import headings_of
 from congrasp.common.wire.codec import Message
@@ -187,12 +188,13 @@ def _prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> It
 @contextlib.contextmanager
 def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
     """Yields the same items, each computed in a thread while the previous one is in use."""
+    following = library_settings()(next)
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
         def taken() -> Iterator[_Item]:
-            coming = background.submit(next, items, None)
+            coming = background.submit(following, items, None)
             while (item := coming.result()) is not None:
-                coming = background.submit(next, items, None)
+                coming = background.submit(following, items, None)
                 yield item
 
         yield taken()

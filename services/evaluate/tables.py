@@ -20,6 +20,7 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import coupled
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.methods import takes
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -363,6 +364,7 @@ class Found(NamedTuple):
         return [result for result in self.results if type(result.variation) is kind]
 
 
+@compiling_entry
 def evaluate_tables(
     experiment: Experiment,
     tables: Sequence[str],

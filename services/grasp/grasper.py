@@ -24,6 +24,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
@@ -83,6 +84,7 @@ class _Round(NamedTuple):
 class Grasper:
     """Grasps one object after another with a policy; all of them share the compiled programs."""
 
+    @compiling_entry
     def __init__(  # noqa: PLR0913
         self,
         policy: PolicyBundle,
@@ -142,6 +144,7 @@ class Grasper:
             arm,
         )
 
+    @compiling_entry
     def grasp(
         self,
         obj: GraspObject,
@@ -314,6 +317,7 @@ class Grasper:
         return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
 
 
+@compiling_entry
 def open_grasper(
     policy: pathlib.Path | None,
     hand: str,
@@ -346,6 +350,7 @@ def open_grasper(
     return Grasper(bundle, attempts=attempts, phases=phases, seed=seed, arm=planner, left=left)
 
 
+@compiling_entry
 def grasp(
     mesh: str | os.PathLike[str] | GraspObject,
     *,

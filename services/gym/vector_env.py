@@ -8,7 +8,6 @@ import jax
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from congrasp.actors import initial
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Rollout
 from congrasp.actors.training_set import training_set
@@ -16,28 +15,40 @@ from congrasp.actors.worker import RolloutWorker
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.entry import compiling_entry, entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.observation import layout
 from congrasp.services.gym import ID
+from congrasp.services.gym.seeds import EpisodeStreams, Seed
 from congrasp.services.train.presets import FULL, get_preset
 
 ACTION = 3.0
 """Bound of the action space, in units of action: five initial standard deviations of the recipe's
 policy.
 """
+METRICS = "metrics"
+"""Key of the metrics of ended episodes; `episode` belongs to Gymnasium's wrappers."""
+_RESET_MASK = "reset_mask"
+_PREFIX = "episode/"
 
 
 class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """Vector environment of hands that grasp objects under sampled constraints (`actors.env`).
 
     An episode ends with its time limit while the object is held (truncated), or when it is not held
-    (terminated). Ended environments are reset in the same step: `infos["final_obs"]` (num_envs, D)
-    holds their last observations, and `infos["episode"]` the metrics of ended episodes by name
-    (num_envs,), where `infos["_final_obs"]` is true.
+    (terminated). `infos["metrics"]` then holds the metrics of ended episodes by name (num_envs,),
+    where `infos["_metrics"]` is true.
+
+    The start of the next episode depends on the autoreset mode, as in Gymnasium:
+      SAME_STEP: in the same step. `infos["final_obs"]` (num_envs, D) holds the last observations
+        where `infos["_final_obs"]` is true, and `infos["final_info"]` the metrics again.
+      NEXT_STEP: in the next step, which ignores the action and has reward 0.
+      DISABLED: with a call of `reset`, by `options={"reset_mask": ended}` for some environments.
     """
 
+    @compiling_entry
     def __init__(
         self,
         num_envs: int = 64,
@@ -46,7 +57,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         objects: int = 64,
         physics: PhysicsName = "auto",
         arrays: Literal["numpy", "jax"] = "numpy",
-        autoreset: bool = True,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **task: Any,
     ):
         """Creates objects, their constraints and the engine; the first calls of `reset` and `step`
@@ -57,125 +68,249 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
           hand: name or file of the hand.
           objects: number of procedural objects, of the families of the hand's training.
           physics: engine, see `congrasp train --physics`.
-          arrays: array type of observations, rewards and flags. JAX arrays stay on the device, and
-            other libraries can import them through DLPack.
-          autoreset: resets ended environments automatically; otherwise all wait for `reset`.
-          **task: fields of `TaskConfig` other than those of the hand's training.
+          arrays: array type of observations, rewards and flags. NumPy arrays are copies, which the
+            caller may change. JAX arrays stay on the device, and other libraries can import them
+            through DLPack.
+          autoreset_mode: mode of Gymnasium, or its name or value.
+          **task: fields of `TaskConfig` other than those of the hand's training. `autoreset=False`
+            is short for the mode DISABLED.
 
         Raises:
-          CongraspError: there is no environment, or no such hand, engine or field of the task.
+          CongraspError: there is no environment, or no such hand, engine, mode or field of the
+            task.
         """
         if num_envs < 1:
             raise CongraspError(f"There are {num_envs} environments.", "Make one or more.")
+        if not task.pop("autoreset", True):
+            autoreset_mode = AutoresetMode.DISABLED
+        self._mode = _mode_of(autoreset_mode)
         config = get_preset(FULL, hand)
-        self.task = dataclasses.replace(
-            config.task, **{"reward": config.curriculum.reward, **_known(task)}
-        )
+        fields = {"reward": config.curriculum.reward, **_task_fields(task)}
+        self.task = dataclasses.replace(config.task, **fields)
         self.hand = get_hand(config.task.hand)
         pool = dataclasses.replace(config.objects, count=objects)
-        made = training_set(self.hand, dataclasses.replace(config, task=self.task, objects=pool), 0)
-        engine = make_physics(physics, self.hand, self.task, made.objects, threads=cores())
+        prepared = training_set(
+            self.hand, dataclasses.replace(config, task=self.task, objects=pool), 0
+        )
+        engine = make_physics(physics, self.hand, self.task, prepared.objects, threads=cores())
         self._worker = RolloutWorker(
-            self.hand, self.task, engine, None, _given, batch=num_envs, seed=0, half_precision=False
+            self.hand,
+            self.task,
+            engine,
+            None,
+            _commanded,
+            batch=num_envs,
+            seed=0,
+            half_precision=False,
         )
-        self._bank, self._autoreset, self._arrays = made.bank, autoreset, arrays
-        self._key = jax.random.key(0)
+        self._streams = EpisodeStreams(self.hand, self.task, prepared.bank, num_envs)
+        self._arrays = arrays
+        self._begun = False
+        self._pending = np.zeros(num_envs, bool)
         self.num_envs = num_envs
-        self.metadata = {
-            "autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED
-        }
-        size = sum(count for _, count in layout(self.hand, self.task))
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.single_action_space = gym.spaces.Box(
-            -ACTION, ACTION, (len(self.hand.motors) + 6,), np.float32
-        )
-        self.observation_space = gym.vector.utils.batch_space(
-            self.single_observation_space, num_envs
-        )
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+        self.metadata = {"autoreset_mode": self._mode}
+        self._define_spaces()
 
+    @compiling_entry
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Seed = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts new episodes in all environments; returns observations (num_envs, D).
+        """Starts new episodes; returns observations (num_envs, D).
 
         Args:
-          seed: seed of all later draws.
-          options: not supported.
-        """
-        if seed is not None:
-            self._key = jax.random.key(seed)
-        self._worker.begin(self._drawn())
-        return self._given_out(self._worker.observe()), {}
+          seed: seed of all later draws: non-negative integers of any size, one for each
+            environment; or one integer, of which environment i gets i more. Without a seed the
+            first episodes differ in each process.
+          options: `reset_mask` (num_envs,) bool starts new episodes only where it is true.
 
+        Raises:
+          CongraspError: seeds or mask do not fit the environments, there is another option, or the
+            environment is closed.
+        """
+        self._require_open()
+        mask = self._reset_mask(options)
+        self._streams.seed(seed)
+        if isinstance(seed, int | np.integer):
+            self._np_random, self._np_random_seed = gym.utils.seeding.np_random(int(seed))
+        conditions = self._streams.draw(mask)
+        if mask.all():
+            self._worker.begin(conditions)
+        else:
+            self._require_begun()
+            self._worker.renew(mask, conditions)
+        self._begun = True
+        self._pending = self._pending & ~mask
+        return self._exported(self._worker.observe()), {}
+
+    @entry
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Simulates one control step under actions (num_envs, A): obs, rewards, terminated,
         truncated, infos.
+
+        Raises:
+          CongraspError: the actions are of another shape or not finite, no episode has begun, or
+            the environment is closed.
         """
-        rollout = self._worker.collect(jax.numpy.asarray(actions, np.float32), 1)
-        observation, infos = rollout.last_observation, {}
-        ended = np.asarray(rollout.terminal[0])
-        if self._autoreset and ended.any():
-            infos = {
-                "final_obs": self._given_out(observation),
-                "_final_obs": ended,
-                **self._episodes(rollout),
-            }
-            self._worker.renew(ended, self._drawn())
+        self._require_open()
+        self._require_begun()
+        rollout = self._worker.collect(self._checked(actions), 1)
+        observation = rollout.last_observation
+        reward = rollout.reward[0]
+        ended = np.array(rollout.terminal[0])
+        truncated = np.array(rollout.truncated[0])
+        renewed = np.zeros(self.num_envs, bool)
+        if self._mode is AutoresetMode.NEXT_STEP:
+            renewed = self._pending
+            ended = ended & ~renewed
+            truncated = truncated & ~renewed
+            reward = jax.numpy.where(renewed, 0.0, reward)
+            self._pending = ended
+        infos = self._infos(rollout, ended)
+        if self._mode is AutoresetMode.SAME_STEP:
+            renewed = ended
+            if ended.any():
+                infos |= self._final(observation, ended, infos)
+        if renewed.any():
+            self._worker.renew(renewed, self._streams.draw(renewed))
             observation = self._worker.observe()
-        terminated = rollout.terminal[0] & ~rollout.truncated[0]
-        found = (observation, rollout.reward[0], terminated, rollout.truncated[0])
-        return (*map(self._given_out, found), infos)
+        return (
+            self._exported(observation),
+            self._exported(reward),
+            self._exported(ended & ~truncated),
+            self._exported(truncated),
+            infos,
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the engine."""
         self._worker.physics.close()
 
-    def _drawn(self) -> initial.InitialConditions:
-        """Draws initial conditions of episodes."""
-        self._key, key = jax.random.split(self._key)
-        return self._worker.programs.sample(self._bank, key, np.array(False))
+    def _define_spaces(self) -> None:
+        """Sets the spaces of observations and actions."""
+        size = sum(count for _, count in layout(self.hand, self.task))
+        actions = len(self.hand.motors) + 6
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = gym.spaces.Box(-ACTION, ACTION, (actions,), np.float32)
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
 
-    def _episodes(self, rollout: Rollout) -> dict[str, Any]:
-        """Metrics of the episodes that have just ended."""
-        columns = np.asarray(rollout.episodes).T
+    def _require_open(self) -> None:
+        """Raises a CongraspError once the environment is closed."""
+        if self.closed:
+            raise CongraspError("The environment is closed.", "Make another one.")
+
+    def _require_begun(self) -> None:
+        """Raises a CongraspError before the first call of `reset`."""
+        if not self._begun:
+            raise CongraspError("No episode has begun.", "Call reset for all environments first.")
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
+        """Returns the environments (num_envs,) bool that a call of `reset` restarts."""
+        options = options or {}
+        for name in options:
+            if name != _RESET_MASK:
+                raise CongraspError(f"There is no option '{name}'.", f"Known: {_RESET_MASK}.")
+        if _RESET_MASK not in options:
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(options[_RESET_MASK])
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise CongraspError(
+                f"{_RESET_MASK} has shape {mask.shape} and type {mask.dtype}.",
+                f"It must have shape ({self.num_envs},) and type bool.",
+            )
+        if not mask.any():
+            raise CongraspError(f"{_RESET_MASK} is false everywhere.", "Set one or more.")
+        return mask
+
+    def _checked(self, actions: Any) -> jax.Array:
+        """Returns actions (num_envs, A) float32."""
+        shape = self.action_space.shape
+        try:
+            array = jax.numpy.asarray(actions, np.float32)
+        except (TypeError, ValueError):
+            raise CongraspError(
+                "The actions are not an array of numbers.", f"Pass one of shape {shape}."
+            ) from None
+        if array.shape != shape:
+            raise CongraspError(f"The actions have shape {array.shape}.", f"It must be {shape}.")
+        if not jax.numpy.isfinite(array).all():
+            raise CongraspError("An action is not finite.", "Pass finite numbers.")
+        return array
+
+    def _infos(self, rollout: Rollout, ended: np.ndarray) -> dict[str, Any]:
+        """Metrics of the episodes that have just ended (num_envs,), if there are any."""
+        if not ended.any():
+            return {}
+        columns = np.array(rollout.episodes).T
         named = zip(episode_fields(self.task), columns, strict=True)
-        ended = np.asarray(rollout.has_episode)
-        found = {
-            name.removeprefix("episode/"): column
-            for name, column in named
-            if name.startswith("episode/")
+        metrics = {
+            name.removeprefix(_PREFIX): column for name, column in named if name.startswith(_PREFIX)
         }
-        return {"episode": found, "_episode": ended}
+        return {METRICS: metrics, f"_{METRICS}": ended.copy()}
 
-    def _given_out(self, array: Any) -> Any:
-        """Converts an array to the requested type."""
-        return np.asarray(array) if self._arrays == "numpy" else jax.numpy.asarray(array)
+    def _final(self, observation: Any, ended: np.ndarray, infos: dict[str, Any]) -> dict[str, Any]:
+        """Entries of Gymnasium for episodes that end and restart in the same step."""
+        return {
+            "final_obs": self._exported(observation),
+            "_final_obs": ended.copy(),
+            "final_info": dict(infos),
+            "_final_info": ended.copy(),
+        }
+
+    def _exported(self, array: Any) -> Any:
+        """Converts an array to the requested type, as a copy for NumPy."""
+        return np.array(array) if self._arrays == "numpy" else jax.numpy.asarray(array)
 
 
 class GraspEnv(gym.Env[np.ndarray, np.ndarray]):
     """One hand and one object: a vector environment of size one, which waits for `reset` at the
-    end.
+    end. `info["metrics"]` then holds the episode's metrics by name.
     """
 
     def __init__(self, **settings: Any):
         """Creates the environment; for the arguments see `GraspVectorEnv`."""
-        self._vector = GraspVectorEnv(1, autoreset=False, **settings)
+        settings = {**settings, "autoreset_mode": AutoresetMode.DISABLED}
+        self._vector = GraspVectorEnv(1, **settings)
         self.observation_space = self._vector.single_observation_space
         self.action_space = self._vector.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Starts a new episode; returns its first observation (D,)."""
+        """Starts a new episode; returns its first observation (D,).
+
+        Args:
+          seed: seed of all later draws.
+          options: none are known.
+
+        Raises:
+          CongraspError: the seed is negative or not an integer.
+        """
+        observation, infos = self._vector.reset(seed=seed, options=options)
         super().reset(seed=seed)
-        observation, infos = self._vector.reset(seed=seed)
         return observation[0], infos
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Simulates one control step under an action (A,)."""
-        observation, reward, terminated, truncated, infos = self._vector.step(action[None])
-        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), infos
+        """Simulates one control step under an action (A,).
+
+        Raises:
+          CongraspError: the action is of another shape or not finite, or no episode has begun.
+        """
+        shape = self.action_space.shape
+        if np.shape(action) != shape:
+            raise CongraspError(f"The action has shape {np.shape(action)}.", f"It must be {shape}.")
+        observation, reward, terminated, truncated, infos = self._vector.step([action])
+        metrics = infos.get(METRICS, {})
+        info = {METRICS: {name: float(column[0]) for name, column in metrics.items()}}
+        return (
+            observation[0],
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            info if metrics else {},
+        )
 
     def close(self) -> None:
         """Closes the engine."""
@@ -193,12 +328,21 @@ def make_vec(id: str = ID, num_envs: int = 64, **settings: Any) -> GraspVectorEn
     return GraspVectorEnv(num_envs, **settings)
 
 
-def _given(action: Any, observation: Any, key: Any) -> tuple[Any, Any]:
+def _commanded(action: Any, observation: Any, key: Any) -> tuple[Any, Any]:
     """Policy of an external learner: its parameters are the actions."""
     return action, jax.numpy.zeros(action.shape[0])
 
 
-def _known(task: dict[str, Any]) -> dict[str, Any]:
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    """Returns an autoreset mode by itself, its name or its value, such as `next_step`."""
+    for one in AutoresetMode:
+        if mode is one or str(mode).upper() in (one.name, one.value.upper()):
+            return one
+    names = ", ".join(one.name for one in AutoresetMode)
+    raise CongraspError(f"There is no autoreset mode '{mode}'.", f"Known: {names}.")
+
+
+def _task_fields(task: dict[str, Any]) -> dict[str, Any]:
     """Returns the given fields of the task; raises a CongraspError for an unknown one."""
     names = [field.name for field in dataclasses.fields(TaskConfig)]
     for name in task:

@@ -16,6 +16,8 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 
+from congrasp.common.runtime.environment import child_environment
+
 GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
 CHILD_GRACE = 2.0
@@ -152,7 +154,7 @@ class Child:
     @property
     def program(self) -> list[str]:
         """Command line of the process."""
-        return [sys.executable, "-m", "congrasp", *self.arguments]
+        return [sys.executable, "-P", "-m", "congrasp", *self.arguments]
 
     def start(self) -> int:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
@@ -161,7 +163,8 @@ class Child:
         # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
         # frames.
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
-        environment = {**jax, **os.environ, **self.environment, _PARENT: str(os.getpid())}
+        own = {**self.environment, _PARENT: str(os.getpid())}
+        environment = {**jax, **child_environment(**own)}
         with self.log.open("ab") as log:
             self.begun = log.tell()
             self.process = subprocess.Popen(

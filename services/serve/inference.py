@@ -19,6 +19,7 @@ from congrasp.common.hands.spec import Hand, right_name
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, mean_action
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.task import control, observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
@@ -168,6 +169,7 @@ def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> 
 class LocalPolicy(EpisodePolicy):
     """The `Policy` of a bundle."""
 
+    @compiling_entry
     def __init__(self, bundle: PolicyBundle):
         """Compiles `act`, so that no control step waits for it; `act_each` is compiled at its first
         call.
@@ -199,6 +201,7 @@ class LocalPolicy(EpisodePolicy):
         )
 
 
+@compiling_entry
 def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
     """Loads the policy of a file, or the pretrained one of a hand, in this process.
 

@@ -26,6 +26,7 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.common.io.journal import AUDIT
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import stage
 from congrasp.common.transport import urls
@@ -157,10 +158,10 @@ def accelerators() -> tuple[str, int]:
       CongraspError: JAX does not start.
     """
     code = "import jax; print(jax.default_backend(), jax.local_device_count())"
-    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    environment = child_environment(XLA_PYTHON_CLIENT_PREALLOCATE="false")
     try:
         seen = subprocess.run(
-            [sys.executable, "-c", code],
+            [sys.executable, "-P", "-c", code],
             env=environment,
             capture_output=True,
             text=True,

@@ -1,4 +1,6 @@
-"""The task as Gymnasium sees it: its own checker, ends, and what comes after them."""
+"""The task as Gymnasium sees it: its own checker and wrappers, ends, seeds and actions."""
+
+import hashlib
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.services.gym.vector_env import ACTION, GraspEnv, GraspVectorEnv
+from tests.children import python
 
 # Episodes of five steps, which end within a test, of a task whose programs are small.
 SHORT = {
@@ -39,8 +42,8 @@ def test_gymnasium_accepts_the_environment():
 
 
 def test_environments_restart_in_the_same_step(vector):
-    """Without the object up an end is a termination; the last observation comes beside the first
-    one of the next.
+    """Without the object up an end is a termination; the last observation is returned with the
+    first one of the next episode.
     """
     first, infos = vector.reset(seed=3)
     assert first in vector.observation_space and infos == {}
@@ -55,13 +58,13 @@ def test_environments_restart_in_the_same_step(vector):
         )
         assert not (terminated | truncated).any() and infos == {}
     observation, _, terminated, truncated, infos = steps[-1]
-    assert (terminated ^ truncated).all() and infos["_final_obs"].all() and infos["_episode"].all()
+    assert (terminated ^ truncated).all() and infos["_final_obs"].all() and infos["_metrics"].all()
     assert infos["final_obs"] in vector.observation_space
     assert (np.abs(infos["final_obs"] - observation).max(-1) > 0.01).all()
     np.testing.assert_array_equal(
-        infos["episode"]["length"], SHORT["approach_steps"] + SHORT["hold_steps"]
+        infos["metrics"]["length"], SHORT["approach_steps"] + SHORT["hold_steps"]
     )
-    np.testing.assert_array_equal(infos["episode"]["success"] > 0, truncated)
+    np.testing.assert_array_equal(infos["metrics"]["success"] > 0, truncated)
 
 
 def test_a_seed_decides_everything(vector):
@@ -106,3 +109,201 @@ def test_gymnasium_makes_it_by_its_id():
 def test_unknown_names_and_no_environments(asked, says):
     with pytest.raises(CongraspError, match=says):
         congrasp.make_vec(**asked)
+
+
+LENGTH = SHORT["approach_steps"] + SHORT["hold_steps"]
+
+
+@pytest.fixture(scope="module")
+def next_step():
+    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode="NextStep", **SHORT)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def manual():
+    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
+    yield made
+    made.close()
+
+
+def still(envs):
+    return np.zeros(envs.action_space.shape, np.float32)
+
+
+def test_environments_restart_in_the_next_step(next_step):
+    assert next_step.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    next_step.reset(seed=3)
+    for _ in range(LENGTH):
+        last, _, terminated, truncated, infos = next_step.step(still(next_step))
+    assert (terminated ^ truncated).all() and infos["_metrics"].all()
+    first, reward, terminated, truncated, infos = next_step.step(still(next_step))
+    assert infos == {} and not reward.any() and not (terminated | truncated).any()
+    assert (np.abs(first - last).max(-1) > 0.01).all()
+    ends = [next_step.step(still(next_step))[2:4] for _ in range(LENGTH)]
+    assert [bool((a | b).all()) for a, b in ends] == [False] * (LENGTH - 1) + [True]
+
+
+def test_both_automatic_modes_draw_the_same_episodes(vector, next_step):
+    vector.reset(seed=5)
+    next_step.reset(seed=5)
+    for _ in range(LENGTH):
+        observation = vector.step(still(vector))[0]
+        next_step.step(still(next_step))
+    np.testing.assert_array_equal(observation, next_step.step(still(next_step))[0])
+
+
+def test_a_mask_resets_some_environments(manual):
+    manual.reset(seed=1)
+    before = manual.step(still(manual))[0]
+    mask = np.array([True, False, False, True])
+    after, _ = manual.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    assert (np.abs(after[mask] - before[mask]).max(-1) > 0.01).all()
+
+
+def test_each_environment_has_its_own_seed(manual):
+    together = manual.reset(seed=[7, 8, 2**40, 2**100])[0]
+    np.testing.assert_array_equal(manual.reset(seed=[8, 7, 2**100, 0])[0][:3], together[[1, 0, 3]])
+    np.testing.assert_array_equal(manual.reset(seed=np.int64(7))[0][:2], together[:2])
+    different = manual.reset(seed=[0, 2**32, 2**40, 2**64])[0]
+    assert len(np.unique(different, axis=0)) == COUNT
+    kept = manual.reset(seed=[None, 7, None, None])[0]
+    np.testing.assert_array_equal(kept[1], together[0])
+    assert len(np.unique([*kept, *different], axis=0)) == 2 * COUNT
+
+
+def test_an_environment_alone_draws_what_it_draws_among_others(manual):
+    env = GraspEnv(**SHORT)
+    np.testing.assert_array_equal(env.reset(seed=3)[0], manual.reset(seed=[1, 3, 5, 7])[0][1])
+    env.close()
+
+
+def test_episodes_without_a_seed_differ_between_processes(vector):
+    code = "import congrasp, hashlib\n"
+    code += f"envs = congrasp.make_vec(num_envs={COUNT}, **{SHORT!r})\n"
+    code += "print(hashlib.sha1(envs.reset()[0].tobytes()).hexdigest())"
+    here = congrasp.make_vec(num_envs=COUNT, **SHORT)
+    digest = hashlib.sha1(here.reset()[0].tobytes()).hexdigest()
+    here.close()
+    assert python("-c", code).stdout.strip() not in (digest, "")
+
+
+def test_arrays_may_be_changed_by_the_caller(vector):
+    vector.reset(seed=1)
+    step = vector.step(still(vector))
+    for array in step[:4]:
+        array[...] = 0
+    after = vector.step(still(vector))
+    assert after[0].any() and after[1].any()
+
+
+SHAPE = (COUNT, 26)
+
+
+@pytest.mark.parametrize(
+    ("actions", "says"),
+    [
+        (np.zeros(SHAPE[1]), "shape"),
+        (np.zeros((3, SHAPE[1])), "shape"),
+        (np.zeros((COUNT, SHAPE[1] + 1)), "shape"),
+        (np.full(SHAPE, np.nan), "finite"),
+        (np.full(SHAPE, 1e300), "finite"),
+        ([["a"] * SHAPE[1]] * COUNT, "numbers"),
+    ],
+)
+def test_invalid_actions_are_refused(actions, says, vector):
+    vector.reset(seed=1)
+    with pytest.raises(CongraspError, match=says):
+        vector.step(actions)
+    assert np.isfinite(vector.step(still(vector))[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": 1.5}, "seed is 1.5"),
+        ({"seed": [1, 2]}, "2 seeds for 4"),
+        ({"options": {"reset_masks": 1}}, "reset_masks"),
+        ({"options": {"reset_mask": np.ones(3, bool)}}, "reset_mask has shape"),
+        ({"options": {"reset_mask": np.ones(COUNT)}}, "type float64"),
+        ({"options": {"reset_mask": np.zeros(COUNT, bool)}}, "false everywhere"),
+    ],
+)
+def test_invalid_resets_are_refused(arguments, says, vector):
+    with pytest.raises(CongraspError, match=says):
+        vector.reset(**arguments)
+
+
+def test_a_step_needs_an_episode_and_an_open_environment():
+    envs = congrasp.make_vec(num_envs=2, **SHORT)
+    with pytest.raises(CongraspError, match="Call reset"):
+        envs.step(still(envs))
+    envs.close()
+    with pytest.raises(CongraspError, match="closed"):
+        envs.reset()
+
+
+def test_an_unknown_autoreset_mode_is_refused():
+    with pytest.raises(CongraspError, match=r"'sometimes'.*NEXT_STEP"):
+        congrasp.make_vec(autoreset_mode="sometimes")
+
+
+WRAPPERS = gym.wrappers.vector
+
+
+def test_statistics_of_gymnasium_count_episodes(vector, next_step):
+    for envs in (vector, next_step):
+        counted = WRAPPERS.RecordEpisodeStatistics(envs)
+        counted.reset(seed=1)
+        for _ in range(LENGTH):
+            *_, infos = counted.step(still(envs))
+        np.testing.assert_array_equal(infos["episode"]["l"], LENGTH)
+        assert infos["_metrics"].all()
+
+
+def test_wrappers_of_gymnasium_accept_vectors(next_step):
+    normal = WRAPPERS.NormalizeReward(WRAPPERS.NormalizeObservation(next_step))
+    halved = WRAPPERS.TransformObservation(next_step, lambda obs: obs / 2)
+    flat = WRAPPERS.FlattenObservation(next_step)
+    for envs in (normal, halved, flat):
+        envs.reset(seed=1)
+        for _ in range(LENGTH + 2):
+            observation, reward, *_ = envs.step(still(envs))
+        assert observation.shape == next_step.observation_space.shape
+        assert np.isfinite(observation).all() and np.isfinite(reward).all()
+
+
+def test_wrappers_of_gymnasium_accept_a_single_environment():
+    env = gym.make("congrasp.services.gym:congrasp/Grasp-v0", **SHORT)
+    env = gym.wrappers.RecordEpisodeStatistics(gym.wrappers.FlattenObservation(env))
+    env = gym.wrappers.NormalizeReward(gym.wrappers.NormalizeObservation(env))
+    env = gym.wrappers.TransformObservation(env, lambda obs: obs.clip(-10, 10), None)
+    env.reset(seed=1)
+    for _ in range(LENGTH):
+        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+    assert terminated or truncated
+    assert info["episode"]["l"] == info["metrics"]["length"] == LENGTH
+    assert np.abs(observation).max() <= 10
+    env.close()
+
+
+def test_a_loop_like_those_of_cleanrl_collects_returns(next_step):
+    """PPO's collection: arrays of all steps, without those of a restart, which have no action."""
+    envs = WRAPPERS.RecordEpisodeStatistics(next_step)
+    envs.reset(seed=1)
+    rng = np.random.default_rng(0)
+    returns = []
+    used = []
+    restarted = np.zeros(COUNT, bool)
+    for _ in range(3 * (LENGTH + 1)):
+        actions = rng.normal(size=envs.action_space.shape).clip(-ACTION, ACTION)
+        _, _, terminated, truncated, infos = envs.step(actions)
+        used.append(~restarted)
+        restarted = terminated | truncated
+        if "episode" in infos:
+            returns += infos["episode"]["r"][infos["_episode"]].tolist()
+    assert np.sum(used) == 3 * LENGTH * COUNT
+    assert len(returns) == 3 * COUNT and np.isfinite(returns).all()

@@ -114,6 +114,18 @@ def test_both_answers_are_equal(policies, episode, names):
     assert first.version == 7 and first.active and not np.array_equal(first.action, second.action)
 
 
+def test_answers_may_be_changed(policies, episode):
+    for policy in policies:
+        answers = []
+        for factor in (1.0, 0.0):
+            policy.reset(episode.request)
+            first = policy.act(episode.state)
+            for array in first[:3]:
+                array *= factor
+            answers.append(policy.act(episode.state))
+        same(*answers)
+
+
 BAD_REQUESTS = [
     ({"constraints": {"levitation": {}}}, UnknownConstraintError),
     ({"constraints": {"heading": {}}}, RefusedError),

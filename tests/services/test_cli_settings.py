@@ -1,0 +1,96 @@
+"""Commands own their process: variables and folders left over from other programs change nothing."""
+
+import functools
+import pathlib
+
+import pytest
+
+from tests.children import python
+
+NAMES = ("random", "json", "types", "logging", "numpy", "jax", "mujoco", "trimesh", "rich", "tyro")
+"""Modules that a user's folder may have, too."""
+CHILD = """
+import pathlib
+from congrasp.services.ops.lifetime import Child
+child = Child("list", ["hands", "list"], pathlib.Path("list.log"))
+child.start()
+child.process.wait(100)
+print(child.code, child.log.read_text())
+"""
+
+
+def output(*arguments: str, env: dict[str, str] | None = None, **options) -> str:
+    """Standard output of a command."""
+    done = python(*arguments, env={"COLUMNS": "80", **(env or {})}, **options)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@functools.cache
+def plain(*arguments: str) -> str:
+    """Standard output of a command without leftovers."""
+    text = output("-m", "congrasp", *arguments)
+    assert text.count("\n") > 4
+    return text
+
+
+LEFTOVERS = [
+    {"COLUMNS": "1", "LINES": "0"},
+    {"COLUMNS": "wide"},
+    {"MUJOCO_GL": "osmesa"},
+    {"MUJOCO_GL": "foo"},
+    {"MPLBACKEND": "module://matplotlib_inline.backend_inline"},
+    {"PYTHONOPTIMIZE": "2"},
+    {"PYTHONWARNINGS": "error"},
+    {"JAX_ENABLE_X64": "1", "JAX_NUMPY_RANK_PROMOTION": "raise", "JAX_DISABLE_JIT": "1"},
+    {"LC_ALL": "POSIX"},
+]
+TOGETHER = {
+    "COLUMNS": "0",
+    "MUJOCO_GL": "osmesa",
+    "MPLBACKEND": "module://absent",
+    "PYTHONOPTIMIZE": "2",
+    "PYTHONWARNINGS": "error",
+    "JAX_ENABLE_X64": "1",
+    "JAX_NUMPY_RANK_PROMOTION": "raise",
+}
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [TOGETHER, *[pytest.param(one, marks=pytest.mark.slow) for one in LEFTOVERS]],
+    ids=lambda variables: "-".join(variables),
+)
+def test_variables_change_no_command(variables):
+    assert output("-m", "congrasp", "hands", "list", env=variables) == plain("hands", "list")
+
+
+@pytest.mark.parametrize("command", ["hands", "grasp", "export"])
+def test_help_without_docstrings_is_the_same(command):
+    variables = {"PYTHONOPTIMIZE": "2"}
+    assert output("-m", "congrasp", command, "--help", env=variables) == plain(command, "--help")
+
+
+def test_variables_do_not_reach_libraries():
+    code = "from congrasp.services.cli.main import run; run(['hands', 'list'])\n"
+    code += "import jax, matplotlib, mujoco, os\n"
+    code += "print(jax.config.jax_enable_x64, matplotlib.get_backend(), os.environ['MUJOCO_GL'])"
+    variables = {"JAX_ENABLE_X64": "1", "MPLBACKEND": "module://absent", "MUJOCO_GL": "osmesa"}
+    assert output("-c", code, env=variables).splitlines()[-1] == "False Agg disable"
+
+
+@pytest.fixture
+def folder(tmp_path) -> pathlib.Path:
+    """A folder whose modules have names of Python's."""
+    for name in NAMES:
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('a module of the user')\n")
+    return tmp_path
+
+
+def test_modules_of_the_folder_are_not_imported(folder):
+    assert output("-m", "congrasp", "hands", "list", cwd=folder) == plain("hands", "list")
+
+
+def test_children_do_not_import_modules_of_the_folder(folder):
+    text = output("-P", "-c", CHILD, cwd=folder)
+    assert text.startswith("0 ") and plain("hands", "list") in text
