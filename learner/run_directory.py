@@ -4,15 +4,14 @@ It holds `config.json`, `initial.safetensors` (unless training starts from rando
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its
-learner, while it runs), `lock` (held by the process of its learner) and, after an update that was
+learner, while it runs), `lock` (held by the process of its learner), `claim` (in its place on a
+file system without locks) and, after an update that was
 not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed
 to `*.aside`.
 """
 
 import contextlib
 import dataclasses
-import errno
-import fcntl
 import os
 import pathlib
 from collections.abc import Callable, Iterator
@@ -20,8 +19,12 @@ from typing import BinaryIO
 
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.claims import Claim
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
+from congrasp.common.io.locks import NoLocksError, try_lock
+from congrasp.common.io.opening import open_to_update
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.learner.checkpoint import Checkpoints, set_aside
@@ -35,6 +38,7 @@ CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _ENDPOINT_FILE = "endpoint"
 _LOCK_FILE = "lock"
+_CLAIM_FILE = "claim"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
@@ -65,6 +69,7 @@ def create_run(
       CongraspError: the directory already has a run, or remains of one; or the initial policy does
         not match the run.
     """
+    check_spelling(run_dir)
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
             f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it."
@@ -107,7 +112,7 @@ def exclusive(
 
     Args:
       run_dir: directory of the run.
-      notify: called if the file system has no locks.
+      notify: called if the file system has no locks; a claim (`common.io.claims`) replaces them.
 
     Yields:
       A function that locks the directory again if the lock's file was removed; it raises a
@@ -118,7 +123,14 @@ def exclusive(
     """
     path = run_dir / _LOCK_FILE
     with contextlib.ExitStack() as stack:
-        held = stack.enter_context(_locked(run_dir, notify))
+        try:
+            held = stack.enter_context(_locked(run_dir))
+        except NoLocksError:
+            notify(f"{run_dir} is on a file system without locks: {_CLAIM_FILE} stands in for one.")
+            claim = Claim(run_dir / _CLAIM_FILE)
+            stack.callback(claim.close)
+            yield claim.check
+            return
 
         def check() -> None:
             nonlocal held
@@ -127,37 +139,36 @@ def exclusive(
             except FileNotFoundError:
                 intact = False
             if not intact:
-                held = stack.enter_context(_locked(run_dir, notify))
+                held = stack.enter_context(_locked(run_dir))
 
         yield check
 
 
-def _locked(run_dir: pathlib.Path, notify: Callable[[str], None]) -> BinaryIO:
-    """The locked file of a run directory, see `exclusive`."""
-    # A lock by `lockf` belongs to the process: forked children do not inherit it.
-    file = open(run_dir / _LOCK_FILE, "a+b", 0)  # noqa: SIM115  the lock ends when it closes
-    try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            file.seek(0)
-            holder = f"process {file.read(32).decode(errors='replace')}"
-            file.close()
-            url = learner_url(run_dir)
-            raise CongraspError(
-                f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
-                "Stop it first, or choose another --run-dir.",
-            ) from None
-        notify(
-            f"{run_dir} is on a file system without locks: a second learner would not be detected."
-        )
-    else:
-        with contextlib.suppress(
-            OSError
-        ):  # a full disk only removes the number from another process's error
-            file.truncate(0)
-            file.write(f"{os.getpid()}".encode())
+def _locked(run_dir: pathlib.Path) -> BinaryIO:
+    """The locked file of a run directory, see `exclusive`; closing it unlocks the directory."""
+    path = run_dir / _LOCK_FILE
+    with os_errors_as(f"{path} cannot be opened", "Choose another --run-dir."):
+        file = open_to_update(path)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(file)
+        if not try_lock(file):
+            raise _in_use(run_dir, file.read(32).decode(errors="replace"))
+        stack.pop_all()
+    # A full disk only removes the number from another process's error.
+    with contextlib.suppress(OSError):
+        file.truncate(0)
+        file.write(f"{os.getpid()}".encode())
     return file
+
+
+def _in_use(run_dir: pathlib.Path, process: str) -> CongraspError:
+    """Error of a run directory that another process has locked."""
+    url = learner_url(run_dir)
+    address = f", which listens at {url}" if url else ""
+    return CongraspError(
+        f"{run_dir} is in use by process {process}{address}.",
+        "Stop it first, or choose another --run-dir.",
+    )
 
 
 @contextlib.contextmanager
@@ -240,11 +251,7 @@ def note_version(run_dir: pathlib.Path, version: int) -> None:
       CongraspError: it could not be written.
     """
     path = run_dir / _VERSION_FILE
-    how = os.O_WRONLY | os.O_CREAT
-    with (
-        os_errors_as(f"{path} could not be written"),
-        open(os.open(path, how, 0o644), "wb", 0) as file,
-    ):
+    with os_errors_as(f"{path} could not be written"), open_to_update(path) as file:
         file.write(f"{version:020d}\n".encode())
 
 

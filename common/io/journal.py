@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.inputs import open_file
+from congrasp.common.io.opening import open_to_append
 
 AUDIT = "audit"
 """Folder of the journals in a run directory."""
@@ -48,7 +49,7 @@ class Journal:
         with os_errors_as(f"The journal {path} cannot be opened"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._cut, self._after = _end_of(path)
-            self._file = path.open("ab", buffering=0)
+            self._file = open_to_append(path)
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:

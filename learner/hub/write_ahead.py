@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
+from congrasp.common.io.opening import temporary_file
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
 from congrasp.learner.checkpoint import set_aside
@@ -116,13 +117,13 @@ class WriteAheadLog:
             if not self.write or identity in self._files or distance > self._max_staleness:
                 return True
             path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
-            part = path.with_name(path.name + PART)
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                part.write_bytes(encode(message))
-                part.rename(path)
+                with temporary_file(path, PART) as (part, file):
+                    file.write(encode(message))
+                    file.close()
+                    part.rename(path)
             except OSError as error:
-                _remove([part])
                 is_new, self._full, why = not self._full, True, error.strerror
             else:
                 self._files[identity] = path

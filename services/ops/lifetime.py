@@ -16,6 +16,9 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 
+from congrasp.common.errors import os_errors_as
+from congrasp.common.io.opening import open_to_append
+
 GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
 CHILD_GRACE = 2.0
@@ -162,8 +165,10 @@ class Child:
         # frames.
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         environment = {**jax, **os.environ, **self.environment, _PARENT: str(os.getpid())}
-        with self.log.open("ab") as log:
-            self.begun = log.tell()
+        with os_errors_as(f"{self.log} cannot be opened"):
+            opened = open_to_append(self.log)
+        with opened as log:
+            self.begun = log.seek(0, os.SEEK_END)
             self.process = subprocess.Popen(
                 self.program,
                 stdout=log,

@@ -21,6 +21,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.opening import create_new
 from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
@@ -232,7 +233,7 @@ class LogWriter:
         run: str = "",
         max_bytes: int = 256 << 20,
         max_seconds: float = 600.0,
-        open_file: Callable[[pathlib.Path], IO[bytes]] = lambda path: path.open("xb"),
+        open_file: Callable[[pathlib.Path], IO[bytes]] = create_new,
     ):
         """Creates the directory; the first entry opens the first file.
 
