@@ -259,13 +259,29 @@ def published_version(run_dir: pathlib.Path) -> int:
     """Newest version known to the run directory, from `version`, the policy or the journals; -1 if
     there is none.
     """
+    return max(version_of_files(run_dir), _possible(journalled_version(run_dir)))
+
+
+def version_of_files(run_dir: pathlib.Path) -> int:
+    """Newest version known to the run directory without its journals: from `version`, the policy
+    or the newest checkpoint; -1 if there is none.
+    """
     try:
-        noted = int((run_dir / _VERSION_FILE).read_text())
-    except (OSError, ValueError):
+        noted = int(read_file(run_dir / _VERSION_FILE, _MAX_ENDPOINT))
+    except (CongraspError, ValueError):
         noted = -1
     policy = _policy_version(run_dir)
-    known = (noted, -1 if policy is None else policy, journalled_version(run_dir))
-    return max((version for version in known if version < _MAX_VERSION), default=-1)
+    if policy is None:
+        policy = -1
+    checkpoint = Checkpoints(run_dir / CHECKPOINTS).newest()
+    return max(_possible(noted), _possible(policy), _possible(checkpoint))
+
+
+def _possible(version: int) -> int:
+    """The version; -1 for a damaged one."""
+    if version < _MAX_VERSION:
+        return version
+    return -1
 
 
 def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, str], None]) -> None:

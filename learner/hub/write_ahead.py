@@ -166,6 +166,15 @@ class WriteAheadLog:
         _remove(paths)
 
 
+def stored(run_dir: pathlib.Path) -> set[Identity] | None:
+    """Rollouts in the folders of all learners of a run; None if it has no such folder."""
+    folder = run_dir / FOLDER
+    if not folder.is_dir():
+        return None
+    names = (_NAME.fullmatch(path.name) for path in folder.glob("*/*.safetensors"))
+    return {(name[2], name[3], int(name[4])) for name in names if name}
+
+
 def _remove(paths: Iterable[pathlib.Path]) -> None:
     """Removes files; one that remains is ignored, or too old, when it is read again."""
     for path in paths:
