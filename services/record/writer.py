@@ -49,6 +49,8 @@ CONVENTIONS = {
 """Metadata of every file: meaning of the numbers."""
 PART = ".part"
 """Suffix of a file that is being written, or whose writer was killed."""
+FLUSH_SECONDS = 0.5
+"""Seconds between two flushes; a killed recorder loses no more than these."""
 CHUNK = 1 << 20
 """Bytes of a chunk before compression."""
 _INDEXES = IndexType.CHUNK | IndexType.MESSAGE | IndexType.METADATA
