@@ -122,7 +122,7 @@ class Checkpoints:
         damaged = []
         for path in self.files():
             try:
-                arrays, meta = _read(path)
+                arrays, meta = read_checkpoint(path)
             except CongraspError as error:
                 damaged.append((path, str(error)))
                 continue
@@ -165,7 +165,7 @@ def _update(path: pathlib.Path) -> int:
     return int(found[1]) if found else -1
 
 
-def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
+def read_checkpoint(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
     """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is
     not intact.
     """

@@ -1,6 +1,7 @@
 """The directory of a run.
 
-It holds `config.json`, `initial.safetensors` (unless training starts from random weights),
+It holds `config.json`, its checksum `config.sha256`, `initial.safetensors` (unless training starts
+from random weights),
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its
@@ -10,10 +11,13 @@ not finite, `failure/`. Files that a resume could not read, or does not continue
 to `*.aside`.
 """
 
+import codecs
 import contextlib
 import dataclasses
+import hashlib
 import os
 import pathlib
+import shlex
 from collections.abc import Callable, Iterator
 from typing import BinaryIO
 
@@ -27,12 +31,13 @@ from congrasp.common.io.opening import open_to_update
 from congrasp.common.io.spelling import check_spelling
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.learner.checkpoint import Checkpoints, set_aside
+from congrasp.learner.checkpoint import Checkpoints, read_checkpoint, set_aside
 from congrasp.learner.hub.used_rollouts import journalled_version
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
+CHECKSUM_FILE = "config.sha256"
 LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
@@ -83,8 +88,50 @@ def create_run(
         spec = bundles.policy_spec(config.task, config.network)
         begun = bundles.with_inputs_of(spec, config.task, initial)
         bundles.save(begun, run_dir / INITIAL_FILE)
-    write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+    store_config(run_dir, config)
     (run_dir / LOGS).mkdir(exist_ok=True)
+
+
+def store_config(run_dir: pathlib.Path, config: RunConfig) -> None:
+    """Writes a run's configuration, with its checksum before it.
+
+    A process that is killed between the two leaves the configuration of the newest checkpoint.
+    """
+    text = to_json(config).encode()
+    write_atomically(run_dir / CHECKSUM_FILE, f"{config_checksum(text)}\n".encode())
+    write_atomically(run_dir / CONFIG_FILE, text)
+
+
+def config_checksum(text: bytes) -> str:
+    """SHA-256 of a run's configuration as JSON, which its checkpoints keep.
+
+    An editor's mark at the beginning, and its line ends, make no difference.
+    """
+    plain = text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").strip()
+    return hashlib.sha256(plain).hexdigest()
+
+
+def check_config(run_dir: pathlib.Path, kept: str) -> None:
+    """Raises a CongraspError if the configuration file was changed by something else than congrasp.
+
+    Args:
+      run_dir: directory of the run.
+      kept: checksum in the checkpoint from which it resumes; empty in one of an older version.
+    """
+    try:
+        stored = read_file(run_dir / CHECKSUM_FILE, _MAX_ENDPOINT).decode(errors="replace").strip()
+    except CongraspError:
+        stored = ""
+    expected = {kept, stored} - {""}
+    actual = config_checksum(read_file(run_dir / CONFIG_FILE, _MAX_CONFIG))
+    if expected and actual not in expected:
+        policy = shlex.quote(str(run_dir / POLICY_FILE))
+        raise CongraspError(
+            f"{run_dir / CONFIG_FILE} is damaged or was edited: its checksum is neither that of "
+            f"the checkpoint nor that in {CHECKSUM_FILE}.",
+            f"Restore it from a copy. To change a setting, pass it as an option with --resume, or "
+            f"start another run with --initial {policy}.",
+        )
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:
@@ -228,6 +275,7 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
         using it.
     """
     before = open_run(run_dir)
+    check_config(run_dir, _kept_checksum(run_dir))
     for field in dataclasses.fields(config):
         if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(
             before, field.name
@@ -238,7 +286,17 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
             )
     with exclusive(run_dir):
         if config != before:
-            write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+            store_config(run_dir, config)
+
+
+def _kept_checksum(run_dir: pathlib.Path) -> str:
+    """Checksum of the configuration in the newest intact checkpoint; empty if there is none."""
+    checkpoints = Checkpoints(run_dir / CHECKPOINTS)
+    for path in checkpoints.files():
+        with contextlib.suppress(CongraspError):
+            _, meta = read_checkpoint(path)
+            return str(meta.get("config", ""))
+    return ""
 
 
 def note_version(run_dir: pathlib.Path, version: int) -> None:
