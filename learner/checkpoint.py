@@ -3,7 +3,8 @@ rest.
 
 A checkpoint is written to a temporary name, flushed and renamed, so that every file is complete
 whenever the process or the machine dies. Its name contains its update, and a run resumes from the
-newest intact one; the link `latest` is a convenience for users.
+newest intact one; the link `latest` is a convenience for users (a
+file with the name, where the file system has no links).
 """
 
 import contextlib
@@ -23,6 +24,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.io.inputs import open_file
+from congrasp.common.io.opening import random_name
 from congrasp.common.wire.codec import Message, decode, encode
 
 KEPT = 3
@@ -57,17 +59,29 @@ class Checkpoints:
         text = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         message = Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})
         write_atomically(path, encode(message))
-        link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
-        with os_errors_as(f"{self._directory / _LATEST} could not be set"):
-            link.unlink(missing_ok=True)
-            link.symlink_to(path.name)
-            link.replace(self._directory / _LATEST)
-            sync_directory(self._directory)
+        self._point_to(path)
         for old in self.files()[KEPT:]:
             if old != path:
                 with contextlib.suppress(OSError):
                     old.unlink()
         return path
+
+    def _point_to(self, path: pathlib.Path) -> None:
+        """Makes `latest` a link to a checkpoint, or a file with its name where links do not exist.
+
+        Nothing depends on it, so that a failure leaves it as it is.
+        """
+        latest = self._directory / _LATEST
+        link = self._directory / random_name(_LATEST)
+        try:
+            link.symlink_to(path.name)
+            link.replace(latest)
+            sync_directory(self._directory)
+        except OSError:
+            with contextlib.suppress(OSError):
+                link.unlink(missing_ok=True)
+            with contextlib.suppress(CongraspError):
+                write_atomically(latest, f"{path.name}\n".encode())
 
     def files(self) -> list[pathlib.Path]:
         """Files of the checkpoints, intact or not, the newest first."""
@@ -108,7 +122,7 @@ class Checkpoints:
         damaged = []
         for path in self.files():
             try:
-                arrays, meta = _read(path)
+                arrays, meta = read_checkpoint(path)
             except CongraspError as error:
                 damaged.append((path, str(error)))
                 continue
@@ -151,7 +165,7 @@ def _update(path: pathlib.Path) -> int:
     return int(found[1]) if found else -1
 
 
-def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
+def read_checkpoint(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
     """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is
     not intact.
     """

@@ -48,14 +48,15 @@ from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.learner.run_directory import (
     CHECKPOINTS,
-    CONFIG_FILE,
     INITIAL_FILE,
     POLICY_FILE,
+    config_checksum,
     exclusive,
     keep_policy,
     note_version,
     open_run,
     published_version,
+    store_config,
 )
 from congrasp.learner.statistics import CollapseWatch, Pace, overall, summary
 
@@ -239,7 +240,7 @@ class _Learner:
             if resume:
                 state, meta = self._checkpoints.load(state, self._event)
                 keep_policy(self._run_dir, state.version + meta["skipped"], self._event)
-                write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
+                store_config(self._run_dir, config)
             elif newest >= 0:
                 raise CongraspError(
                     f"{self._run_dir} has checkpoints of a run.",
@@ -475,6 +476,7 @@ class _Learner:
             meta = {
                 "run_id": self._run_id,
                 "skipped": self._skipped,
+                "config": config_checksum(to_json(self._config).encode()),
                 "hubs": [entry["hub"] for entry in everyone],
             }
             try:

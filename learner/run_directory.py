@@ -1,40 +1,49 @@
 """The directory of a run.
 
-It holds `config.json`, `initial.safetensors` (unless training starts from random weights),
+It holds `config.json`, its checksum `config.sha256`, `initial.safetensors` (unless training starts
+from random weights),
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its
-learner, while it runs), `lock` (held by the process of its learner) and, after an update that was
+learner, while it runs), `lock` (held by the process of its learner), `claim` (in its place on a
+file system without locks) and, after an update that was
 not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed
 to `*.aside`.
 """
 
+import codecs
 import contextlib
 import dataclasses
-import errno
-import fcntl
+import hashlib
 import os
 import pathlib
+import shlex
 from collections.abc import Callable, Iterator
 from typing import BinaryIO
 
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.claims import Claim
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
+from congrasp.common.io.locks import NoLocksError, try_lock
+from congrasp.common.io.opening import open_to_update
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.learner.checkpoint import Checkpoints, set_aside
+from congrasp.learner.checkpoint import Checkpoints, read_checkpoint, set_aside
 from congrasp.learner.hub.used_rollouts import journalled_version
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
 CONFIG_FILE = "config.json"
+CHECKSUM_FILE = "config.sha256"
 LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _ENDPOINT_FILE = "endpoint"
 _LOCK_FILE = "lock"
+_CLAIM_FILE = "claim"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
@@ -66,6 +75,7 @@ def create_run(
       CongraspError: the directory already has a run, or remains of one; or the initial policy does
         not match the run.
     """
+    check_spelling(run_dir)
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
             f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it."
@@ -81,7 +91,7 @@ def create_run(
         if not begun.has_critic:
             begun = bundles.with_new_critic(begun, config.seed)
         bundles.save(begun, run_dir / INITIAL_FILE)
-    write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+    store_config(run_dir, config)
     (run_dir / LOGS).mkdir(exist_ok=True)
 
 
@@ -101,6 +111,48 @@ def initial_notes(initial: PolicyBundle, config: RunConfig, file: pathlib.Path) 
         yield (
             f"{file} has other inputs than this run's policy or critic; the new ones start at "
             f"zero weight."
+        )
+
+
+def store_config(run_dir: pathlib.Path, config: RunConfig) -> None:
+    """Writes a run's configuration, with its checksum before it.
+
+    A process that is killed between the two leaves the configuration of the newest checkpoint.
+    """
+    text = to_json(config).encode()
+    write_atomically(run_dir / CHECKSUM_FILE, f"{config_checksum(text)}\n".encode())
+    write_atomically(run_dir / CONFIG_FILE, text)
+
+
+def config_checksum(text: bytes) -> str:
+    """SHA-256 of a run's configuration as JSON, which its checkpoints keep.
+
+    An editor's mark at the beginning, and its line ends, make no difference.
+    """
+    plain = text.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").strip()
+    return hashlib.sha256(plain).hexdigest()
+
+
+def check_config(run_dir: pathlib.Path, kept: str) -> None:
+    """Raises a CongraspError if the configuration file was changed by something else than congrasp.
+
+    Args:
+      run_dir: directory of the run.
+      kept: checksum in the checkpoint from which it resumes; empty in one of an older version.
+    """
+    try:
+        stored = read_file(run_dir / CHECKSUM_FILE, _MAX_ENDPOINT).decode(errors="replace").strip()
+    except CongraspError:
+        stored = ""
+    expected = {kept, stored} - {""}
+    actual = config_checksum(read_file(run_dir / CONFIG_FILE, _MAX_CONFIG))
+    if expected and actual not in expected:
+        policy = shlex.quote(str(run_dir / POLICY_FILE))
+        raise CongraspError(
+            f"{run_dir / CONFIG_FILE} is damaged or was edited: its checksum is neither that of "
+            f"the checkpoint nor that in {CHECKSUM_FILE}.",
+            f"Restore it from a copy. To change a setting, pass it as an option with --resume, or "
+            f"start another run with --initial {policy}.",
         )
 
 
@@ -129,7 +181,7 @@ def exclusive(
 
     Args:
       run_dir: directory of the run.
-      notify: called if the file system has no locks.
+      notify: called if the file system has no locks; a claim (`common.io.claims`) replaces them.
 
     Yields:
       A function that locks the directory again if the lock's file was removed; it raises a
@@ -140,7 +192,14 @@ def exclusive(
     """
     path = run_dir / _LOCK_FILE
     with contextlib.ExitStack() as stack:
-        held = stack.enter_context(_locked(run_dir, notify))
+        try:
+            held = stack.enter_context(_locked(run_dir))
+        except NoLocksError:
+            notify(f"{run_dir} is on a file system without locks: {_CLAIM_FILE} stands in for one.")
+            claim = Claim(run_dir / _CLAIM_FILE)
+            stack.callback(claim.close)
+            yield claim.check
+            return
 
         def check() -> None:
             nonlocal held
@@ -149,37 +208,36 @@ def exclusive(
             except FileNotFoundError:
                 intact = False
             if not intact:
-                held = stack.enter_context(_locked(run_dir, notify))
+                held = stack.enter_context(_locked(run_dir))
 
         yield check
 
 
-def _locked(run_dir: pathlib.Path, notify: Callable[[str], None]) -> BinaryIO:
-    """The locked file of a run directory, see `exclusive`."""
-    # A lock by `lockf` belongs to the process: forked children do not inherit it.
-    file = open(run_dir / _LOCK_FILE, "a+b", 0)  # noqa: SIM115  the lock ends when it closes
-    try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            file.seek(0)
-            holder = f"process {file.read(32).decode(errors='replace')}"
-            file.close()
-            url = learner_url(run_dir)
-            raise CongraspError(
-                f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
-                "Stop it first, or choose another --run-dir.",
-            ) from None
-        notify(
-            f"{run_dir} is on a file system without locks: a second learner would not be detected."
-        )
-    else:
-        with contextlib.suppress(
-            OSError
-        ):  # a full disk only removes the number from another process's error
-            file.truncate(0)
-            file.write(f"{os.getpid()}".encode())
+def _locked(run_dir: pathlib.Path) -> BinaryIO:
+    """The locked file of a run directory, see `exclusive`; closing it unlocks the directory."""
+    path = run_dir / _LOCK_FILE
+    with os_errors_as(f"{path} cannot be opened", "Choose another --run-dir."):
+        file = open_to_update(path)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(file)
+        if not try_lock(file):
+            raise _in_use(run_dir, file.read(32).decode(errors="replace"))
+        stack.pop_all()
+    # A full disk only removes the number from another process's error.
+    with contextlib.suppress(OSError):
+        file.truncate(0)
+        file.write(f"{os.getpid()}".encode())
     return file
+
+
+def _in_use(run_dir: pathlib.Path, process: str) -> CongraspError:
+    """Error of a run directory that another process has locked."""
+    url = learner_url(run_dir)
+    address = f", which listens at {url}" if url else ""
+    return CongraspError(
+        f"{run_dir} is in use by process {process}{address}.",
+        "Stop it first, or choose another --run-dir.",
+    )
 
 
 @contextlib.contextmanager
@@ -239,6 +297,7 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
         using it.
     """
     before = open_run(run_dir)
+    check_config(run_dir, _kept_checksum(run_dir))
     for field in dataclasses.fields(config):
         if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(
             before, field.name
@@ -249,7 +308,17 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
             )
     with exclusive(run_dir):
         if config != before:
-            write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+            store_config(run_dir, config)
+
+
+def _kept_checksum(run_dir: pathlib.Path) -> str:
+    """Checksum of the configuration in the newest intact checkpoint; empty if there is none."""
+    checkpoints = Checkpoints(run_dir / CHECKPOINTS)
+    for path in checkpoints.files():
+        with contextlib.suppress(CongraspError):
+            _, meta = read_checkpoint(path)
+            return str(meta.get("config", ""))
+    return ""
 
 
 def note_version(run_dir: pathlib.Path, version: int) -> None:
@@ -262,11 +331,7 @@ def note_version(run_dir: pathlib.Path, version: int) -> None:
       CongraspError: it could not be written.
     """
     path = run_dir / _VERSION_FILE
-    how = os.O_WRONLY | os.O_CREAT
-    with (
-        os_errors_as(f"{path} could not be written"),
-        open(os.open(path, how, 0o644), "wb", 0) as file,
-    ):
+    with os_errors_as(f"{path} could not be written"), open_to_update(path) as file:
         file.write(f"{version:020d}\n".encode())
 
 
@@ -274,13 +339,29 @@ def published_version(run_dir: pathlib.Path) -> int:
     """Newest version known to the run directory, from `version`, the policy or the journals; -1 if
     there is none.
     """
+    return max(version_of_files(run_dir), _possible(journalled_version(run_dir)))
+
+
+def version_of_files(run_dir: pathlib.Path) -> int:
+    """Newest version known to the run directory without its journals: from `version`, the policy
+    or the newest checkpoint; -1 if there is none.
+    """
     try:
-        noted = int((run_dir / _VERSION_FILE).read_text())
-    except (OSError, ValueError):
+        noted = int(read_file(run_dir / _VERSION_FILE, _MAX_ENDPOINT))
+    except (CongraspError, ValueError):
         noted = -1
     policy = _policy_version(run_dir)
-    known = (noted, -1 if policy is None else policy, journalled_version(run_dir))
-    return max((version for version in known if version < _MAX_VERSION), default=-1)
+    if policy is None:
+        policy = -1
+    checkpoint = Checkpoints(run_dir / CHECKPOINTS).newest()
+    return max(_possible(noted), _possible(policy), _possible(checkpoint))
+
+
+def _possible(version: int) -> int:
+    """The version; -1 for a damaged one."""
+    if version < _MAX_VERSION:
+        return version
+    return -1
 
 
 def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, str], None]) -> None:

@@ -13,7 +13,6 @@ control step serves every program that calls it, wherever JAX places its arrays.
 import concurrent.futures
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import itertools
@@ -23,7 +22,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +51,10 @@ from congrasp.actors.physics.warp_kernels import (
     count,
     place,
 )
+from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.locks import try_lock
+from congrasp.common.io.opening import open_to_append
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import cores
@@ -299,27 +301,32 @@ def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
     They wait for `_PATIENCE` seconds at most, and then build, too.
     """
     names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
+    name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
+    path = pathlib.Path(str(wp.config.kernel_cache_dir), name)
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a folder without locks
-            name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
-            file = stack.enter_context(
-                pathlib.Path(str(wp.config.kernel_cache_dir), name).open("a+")
-            )
-            kind, begun, told = fcntl.LOCK_EX, time.monotonic(), False
-            while (waited := time.monotonic() - begun) < _PATIENCE:
-                try:
-                    fcntl.lockf(file, kind | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    kind = fcntl.LOCK_SH  # together, once the first is done
-                if waited > _WORD and not told:
-                    told = True
-                    _log.info(
-                        "Waiting for the kernels that another process builds, at most %d s.",
-                        _PATIENCE,
-                    )
-                time.sleep(0.1)
+        try:
+            file = stack.enter_context(open_to_append(path))
+            _wait_for_lock(file)
+        except (OSError, CongraspError) as error:
+            _log.info("Kernels are built without waiting for other processes: %s.", error)
         yield
+
+
+def _wait_for_lock(file: BinaryIO) -> None:
+    """Waits for the lock of the first builder, or that of all others, for `_PATIENCE` seconds."""
+    begun = time.monotonic()
+    is_reported = False
+    shared = False
+    while (waited := time.monotonic() - begun) < _PATIENCE:
+        if try_lock(file, shared=shared):
+            return
+        shared = True  # together, once the first is done
+        if waited > _WORD and not is_reported:
+            is_reported = True
+            _log.info(
+                "Waiting for the kernels that another process builds, at most %d s.", _PATIENCE
+            )
+        time.sleep(0.1)
 
 
 def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:

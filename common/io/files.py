@@ -3,20 +3,37 @@ between runs.
 """
 
 import contextlib
+import errno
 import functools
 import hashlib
 import logging
 import os
 import pathlib
+from collections.abc import Iterator
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.opening import temporary_file
+from congrasp.common.io.spelling import check_spelling
 
 if TYPE_CHECKING:  # commands that read no message start without NumPy
     from congrasp.common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
+
+
+_NO_SYNC = (
+    errno.EINVAL,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.ENOSYS,
+    errno.EBADF,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EISDIR,
+)
+"""Errors of file systems that cannot flush a folder: there is nothing more to be done."""
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
@@ -26,22 +43,54 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
     Raises:
       CongraspError: the file cannot be written; earlier content is intact.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with replacement(path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def replacement(path: pathlib.Path) -> Iterator[BinaryIO]:
+    """Context with a new file, which replaces `path` at the end unless an error is raised.
+
+    The file has a random name until then, so that no planted link leads the data elsewhere.
+
+    Args:
+      path: the file to replace; its folder is created if needed.
+
+    Yields:
+      The file, opened for writing.
+
+    Raises:
+      CongraspError: the file cannot be written, and earlier content is intact; or its name and that
+        of an existing file differ in case only, on a file system that does not distinguish them.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            file.write(data)
+        check_spelling(path)
+        with temporary_file(path) as (temporary, file):
+            yield file
             file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+            sync_file(file.fileno())
+            file.close()
+            temporary.replace(path)
+    except OSError as error:
+        raise _unwritten(path, error) from None
+    try:
         sync_directory(path.parent)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise CongraspError(
-            f"{path} could not be written: {error.strerror}.",
-            "Free space or choose another folder. An earlier file of that name is intact.",
+            f"{path} was written, but its folder could not be flushed to disk: {error.strerror}.",
+            "Check the disk.",
         ) from None
+
+
+def _unwritten(path: pathlib.Path, error: OSError) -> CongraspError:
+    """Error of a file that was not written; it names an earlier one where there is one."""
+    remedy = "Free space or choose another folder."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        remedy = "Choose another folder."
+    if os.path.lexists(path):
+        remedy += " An earlier file of that name is intact."
+    return CongraspError(f"{path} could not be written: {error.strerror}.", remedy)
 
 
 def check_free(path: pathlib.Path, *, force: bool = False) -> None:
@@ -119,12 +168,34 @@ def can_cache(folder: pathlib.Path, setting: str) -> bool:
 
 
 def sync_directory(path: pathlib.Path) -> None:
-    """Makes renames inside a directory durable across a power failure."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Makes renames inside a directory durable across a power failure, where its file system can.
+
+    Raises:
+      OSError: the disk failed.
+    """
     try:
-        os.fsync(descriptor)
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        if error.errno in _NO_SYNC:
+            return
+        raise
+    try:
+        sync_file(descriptor)
     finally:
         os.close(descriptor)
+
+
+def sync_file(descriptor: int) -> None:
+    """Flushes an open file or folder to disk, where its file system can.
+
+    Raises:
+      OSError: the disk failed.
+    """
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NO_SYNC:
+            raise
 
 
 @functools.cache

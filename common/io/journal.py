@@ -2,8 +2,9 @@
 
 Every line is one write to the operating system, so that it survives the death of its process. It
 ends with two checksums (CRC-32): that of the previous line, as the field `after`, and that of its
-own preceding text, as the field `crc32`. Lines that were cut or changed are skipped when reading,
-and counted, as are places where lines are missing.
+own preceding text, as the field `crc32`. A note of the last line (`journal_end`) lies next to the
+journal. Lines that were cut or changed are skipped when reading, and counted, as are places where
+lines are missing, be it at the end.
 """
 
 import json
@@ -16,6 +17,8 @@ from typing import Any, NamedTuple
 
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.inputs import open_file
+from congrasp.common.io.journal_end import EndWriter, JournalEnd, read_end
+from congrasp.common.io.opening import open_to_append
 
 AUDIT = "audit"
 """Folder of the journals in a run directory."""
@@ -48,7 +51,8 @@ class Journal:
         with os_errors_as(f"The journal {path} cannot be opened"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._cut, self._after = _end_of(path)
-            self._file = path.open("ab", buffering=0)
+            self._file = open_to_append(path)
+            self._end = EndWriter(path)
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
@@ -69,7 +73,9 @@ class Journal:
                     f"{self._path} could not be written ({reason}); what happens meanwhile is not "
                     f"in it."
                 )
-            self._after = self._after if reason else check
+            if not reason:
+                self._end.write(JournalEnd(self._after, check))
+                self._after = check
             self._refused = bool(reason)
             self._lost = self._lost + 1 if reason else 0
 
@@ -77,6 +83,7 @@ class Journal:
         """Closes the file."""
         with self._lock:
             self._file.close()
+            self._end.close()
 
 
 class JournalLines(NamedTuple):
@@ -114,6 +121,8 @@ def read_journal(
     entries: list[dict[str, Any] | None] = []
     lost = damaged = missing = unchecked = run = 0
     before, cut = "", False
+    end = read_end(path)  # first, since a running process writes more lines meanwhile
+    checks = set[str]()
     with os_errors_as(f"The journal {path} cannot be read"), open_file(path) as file:
         while line := file.readline(_MAX_LINE):
             if not line.strip(b"\n"):
@@ -130,14 +139,21 @@ def read_journal(
                 missing += 1
                 entries.append(None)
             before = check
+            checks.add(check)
             # The disk took a part of the first line that it refused: `lost` counts that one, too.
             refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
             lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
             entries.append(entry)
     cut = cut and run > 0
-    return JournalLines(
-        entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked
-    )
+    missing += not entries or _lacks_end(end, checks, is_cut=cut)
+    return JournalLines(entries, lost + cut, damaged + run - cut, missing, unchecked)
+
+
+def _lacks_end(end: JournalEnd | None, checks: set[str], *, is_cut: bool) -> bool:
+    """True if the last line that was written is missing; one that is cut counts as lost instead."""
+    if end is None or end.check in checks:
+        return False
+    return not (is_cut and (end.after in checks or not end.after))
 
 
 def number(value: Any) -> int:
@@ -167,13 +183,39 @@ def _end_of(path: pathlib.Path) -> tuple[bool, str]:
     """True if a journal ends within a line (its writer was killed in it, or the disk took a part of
     it), and the checksum of its last line; empty if there is none."""
     if not path.exists():
-        return False, ""
+        return False, _continued("", {""}, read_end(path))
+    last = ""
+    is_cut = False
+    checks = set[str]()
     with open_file(path) as file:
-        size = file.seek(0, 2)
-        file.seek(max(0, size - _CHECK_BYTES))
-        end = file.read()
-    found = _END.fullmatch(end)
-    return size > 0 and not end.endswith(b"\n"), found[1].decode() if found else ""
+        while line := file.readline(_MAX_LINE):
+            is_cut = not line.endswith(b"\n")
+            found = _END.fullmatch(line[-_CHECK_BYTES:])
+            if is_cut or found is None:
+                continue
+            last = found[1].decode()
+            checks.add(last)
+    noted = read_end(path)
+    if is_cut:
+        if _lacks_end(noted, checks, is_cut=True):
+            return True, _continued("", checks, noted)
+        return True, ""
+    return False, _continued(last, checks, noted)
+
+
+def _continued(last: str, checks: set[str], noted: JournalEnd | None) -> str:
+    """Checksum that the next line follows: that of the noted line if it was removed from the end.
+
+    The reader then sees that lines are missing.
+
+    Args:
+      last: checksum of the last line.
+      checks: checksums of all lines.
+      noted: the note, if there is one.
+    """
+    if noted is None or noted.check in checks:
+        return last
+    return noted.check
 
 
 def _line(entry: dict[str, Any]) -> tuple[bytes, str]:

@@ -1,8 +1,8 @@
 """TCP ports: defaults of the roles, neighbouring ports, and free ports of this machine."""
 
 import contextlib
-import fcntl
 import functools
+import logging
 import os
 import pathlib
 import re
@@ -12,6 +12,7 @@ import tempfile
 import threading
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.locks import NoLocksError, try_lock
 from congrasp.common.transport.keys import FLOWS
 
 LEARNER_URL = "tcp/127.0.0.1:7447"
@@ -24,6 +25,7 @@ _LOWEST, _COUNT = 15000, 15000
 Linux), which cannot take them."""
 _ATTEMPTS = 1000
 _lock, _reserved = threading.Lock(), set[int]()
+_log = logging.getLogger(__name__)
 
 
 def shifted(url: str, offset: int) -> str:
@@ -85,8 +87,24 @@ def _reserve(file: int, ports: range) -> None:
     with _lock:
         if not _reserved.isdisjoint(ports):
             raise OSError("A port is reserved by this process.")
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, len(ports), ports.start)
+        try:
+            if not try_lock(file, ports):
+                raise OSError("A port is reserved by another process.")
+        except NoLocksError:
+            _report_no_locks()
         _reserved.update(ports)
+
+
+@functools.cache
+def _report_no_locks() -> None:
+    """Logs once that other processes do not see which ports this one will use.
+
+    Two that choose the same port at the same moment are then get the error of a port in use.
+    """
+    _log.warning(
+        "%s is on a file system without locks: ports are not reserved. Set TMPDIR to a local one.",
+        tempfile.gettempdir(),
+    )
 
 
 @functools.cache

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
+from congrasp.common.io.opening import temporary_file
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
 from congrasp.learner.checkpoint import set_aside
@@ -116,13 +117,13 @@ class WriteAheadLog:
             if not self.write or identity in self._files or distance > self._max_staleness:
                 return True
             path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
-            part = path.with_name(path.name + PART)
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                part.write_bytes(encode(message))
-                part.rename(path)
+                with temporary_file(path, PART) as (part, file):
+                    file.write(encode(message))
+                    file.close()
+                    part.rename(path)
             except OSError as error:
-                _remove([part])
                 is_new, self._full, why = not self._full, True, error.strerror
             else:
                 self._files[identity] = path
@@ -163,6 +164,15 @@ class WriteAheadLog:
                 self._files.pop(identity) for identity in identities if identity in self._files
             ]
         _remove(paths)
+
+
+def stored(run_dir: pathlib.Path) -> set[Identity] | None:
+    """Rollouts in the folders of all learners of a run; None if it has no such folder."""
+    folder = run_dir / FOLDER
+    if not folder.is_dir():
+        return None
+    names = (_NAME.fullmatch(path.name) for path in folder.glob("*/*.safetensors"))
+    return {(name[2], name[3], int(name[4])) for name in names if name}
 
 
 def _remove(paths: Iterable[pathlib.Path]) -> None:

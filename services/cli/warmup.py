@@ -14,8 +14,8 @@ import tyro
 from rich.console import Console
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
-from congrasp.common.errors import CongraspError, os_errors_as
-from congrasp.common.io.files import cache_folder, check_output, write_atomically
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import cache_folder, check_output, replacement, write_atomically
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.services.ops.lifetime import on_signal
 
@@ -89,26 +89,19 @@ def export_caches(path: pathlib.Path) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    temporary = path.absolute().with_name(f".{path.name}.tmp")
-    try:
-        with os_errors_as(f"{path} could not be written", "Free space or pass another path."):
-            with tarfile.open(temporary, "w") as archive:
-                manifest = tarfile.TarInfo(_MANIFEST)
-                text = json.dumps(_machine()).encode()
-                manifest.size = len(text)
-                archive.addfile(manifest, io.BytesIO(text))
-                for name, folder in _folders().items():
-                    for file in sorted(folder.rglob("[!.]*")):
-                        if file.is_file() and not file.is_symlink():
-                            with contextlib.suppress(
-                                FileNotFoundError
-                            ):  # another process may tidy up meanwhile
-                                archive.add(
-                                    file, f"{name}/{file.relative_to(folder)}", recursive=False
-                                )
-            temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacement(path) as file, tarfile.open(fileobj=file, mode="w") as archive:
+        manifest = tarfile.TarInfo(_MANIFEST)
+        text = json.dumps(_machine()).encode()
+        manifest.size = len(text)
+        archive.addfile(manifest, io.BytesIO(text))
+        for name, folder in _folders().items():
+            for member in sorted(folder.rglob("[!.]*")):
+                if not member.is_file() or member.is_symlink():
+                    continue
+                # Another process may remove it meanwhile.
+                with contextlib.suppress(FileNotFoundError):
+                    inside = member.relative_to(folder)
+                    archive.add(member, f"{name}/{inside}", recursive=False)
 
 
 def import_caches(path: pathlib.Path) -> int:

@@ -24,6 +24,7 @@ from congrasp.common.hands import known_hand
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.io.files import check_free, write_atomically
 from congrasp.common.io.inputs import check_arrays, file_name, read_npz
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
@@ -481,6 +482,7 @@ def export_motions(
                 (file, path.with_name(file.name)) for file in pathlib.Path(workplace).iterdir()
             ]
             for _, target in written:
+                check_spelling(target)
                 check_free(target, force=force)
             for file, target in written:
                 file.replace(target)

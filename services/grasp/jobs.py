@@ -15,6 +15,7 @@ from PIL import Image
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import distinct_names, file_name
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.materials import with_mass
@@ -135,6 +136,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
     """Grasps one object and writes its folder, unless it is finished already."""
     try:
         folder = settings.out / file_name(at.name, "the folder of an object")
+        check_spelling(folder)
         given = {
             name: [
                 _identity(part) for part in ([str(text)] if isinstance(text, str | bool) else text)

@@ -7,7 +7,8 @@ ended. Neither reads the other's journal, and this module does not use the code 
 
 The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are
 no faults, but are counted as not in the journals, and reported as unjudged. A journal without its
-last lines looks like that of a process that was killed.
+last lines is recognised by the note next to it (`common.io.journal_end`), by the newest version of
+the run's files, and by accepted rollouts without a file.
 """
 
 import collections
@@ -23,6 +24,8 @@ from rich.table import Table
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
 from congrasp.learner.hub.used_rollouts import Used, read_uses, replay
+from congrasp.learner.hub.write_ahead import stored
+from congrasp.learner.run_directory import version_of_files
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""
@@ -63,6 +66,8 @@ class Report(NamedTuple):
     """Places in the journals from which lines were removed, and journals without a line."""
     unchecked: int
     """Lines of older versions of congrasp, between which missing ones cannot be detected."""
+    unrecorded: tuple[int, int] | None = None
+    """Newest version of the learners' journals, and that of the run's files, if it is newer."""
 
     @property
     def exit_code(self) -> int:
@@ -103,15 +108,42 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
             "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these "
             "files.",
         )
+    # In this order, since a running learner writes meanwhile: a rollout that an actor knows to be
+    # accepted, and that the learner has not used, is in one of the two listings of files.
     notes = [read_journal(path, _is_entry) for path in actors]
+    reached = version_of_files(run_dir)
+    files = stored(run_dir)
     books = [read_uses(path) for path in learners]
+    if files is not None:
+        files |= stored(run_dir) or set()
     gaps = _Gaps(
         *(
             any(each.lost or each.damaged or each.missing for each in group)
             for group in (notes, books)
         )
     )
-    return _compare(_made(notes), _outcomes(book.intact for book in books), gaps, [*notes, *books])
+    outcomes = _outcomes(book.intact for book in books)._replace(files=files)
+    report = _compare(_made(notes), outcomes, gaps, [*notes, *books])
+    covered = _covered_version(books)
+    if covered < reached and not gaps.learners:
+        return report._replace(missing=report.missing + 1, unrecorded=(covered, reached))
+    return report
+
+
+def _covered_version(books: Iterable[JournalLines]) -> int:
+    """Newest version that a run can have reached by its learners' journals.
+
+    An update leads to one more than its line says, and so may every start of a session, which skips
+    versions that were lost.
+    """
+    newest = -1
+    sessions = 0
+    for book in books:
+        for entry in book.intact:
+            sessions += "session_id" in entry
+            if "version" in entry:
+                newest = max(newest, entry["version"] + ("used" in entry))
+    return newest + sessions
 
 
 def _is_entry(entry: dict[str, Any]) -> bool:
@@ -159,6 +191,8 @@ class _Session:
     """It recovered rollouts from disk, after which it accepts."""
     taken: set[Identity] = dataclasses.field(default_factory=set)
     unwritten: set[Identity] = dataclasses.field(default_factory=set)
+    saved: int = 0
+    """Version of its newest checkpoint."""
     waiting: set[Identity] | None = None
     """Queued rollouts at its end; None while it runs, or if it was killed."""
 
@@ -176,6 +210,8 @@ class _Outcomes(NamedTuple):
     undone: set[Identity]
     dropped: set[Identity]
     spoilt: set[Identity]
+    files: set[Identity] | None = None
+    """Accepted rollouts on disk; None if the run has no folder of them."""
 
 
 def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
@@ -204,6 +240,7 @@ def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
             sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
         saved = entry.get("saved", entry["version"] if "session_id" in entry else saved)
         if sessions:
+            sessions[-1].saved = saved
             sessions[-1].started |= "taken" in entry
             sessions[-1].taken.update(_rows(entry, "taken"))
             sessions[-1].unwritten.update(_rows(entry, "unwritten"))
@@ -296,10 +333,29 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
             continue
         last, after = book[had[-1]], book[had[-1] + 1 : had[-1] + 2]
         if not after:
-            return "waiting" if last.waiting is None or identity in last.waiting else "lost"
+            return _at_the_end(identity, rollout.version, last, found.files)
         return _without_trace(
             identity, rollout.version, last, after[0], undone=identity in found.undone
         )
+    return UNJUDGED
+
+
+def _at_the_end(
+    identity: Identity, version: int, last: _Session, files: set[Identity] | None
+) -> str:
+    """Outcome of a rollout that the last session neither used nor dropped.
+
+    Without the session's end, its file shows that it waits. Rollouts that no resume could use have
+    no file: those of versions too far from that of the newest checkpoint.
+    """
+    if last.waiting is not None:
+        if identity in last.waiting:
+            return "waiting"
+        return "lost"
+    has_file = files is None or identity in files
+    needs_file = last.kept and identity not in last.unwritten
+    if has_file or not needs_file or abs(version - last.saved) > last.max_staleness:
+        return "waiting"
     return UNJUDGED
 
 
@@ -356,6 +412,12 @@ def audit(
         console.print(
             f"{report.holes} line(s) are missing in the journals: the disk was full, or their end "
             f"was cut."
+        )
+    if report.unrecorded:
+        covered, reached = report.unrecorded
+        console.print(
+            f"The run reached version {reached}, but the learner's journal ends at version "
+            f"{covered}: its end is missing."
         )
     if report.missing:
         console.print(

@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import write_atomically
 from congrasp.common.transport.certificates import Certificate, load, read
 from congrasp.common.transport.keys import check_name
 from congrasp.common.transport.security import (
@@ -90,7 +91,7 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
     )
     folder.mkdir(parents=True, exist_ok=True)
     _write_secret(folder / CA_KEY_FILE, key)
-    (folder / CA_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    write_atomically(folder / CA_FILE, made.public_bytes(serialization.Encoding.PEM))
     (folder / REVOKED_FILE).unlink(missing_ok=True)
     return Certificate(None, run, (), made.not_valid_after_utc)
 
@@ -223,9 +224,7 @@ def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = No
     name = str(Identity(run or read(folder / CA_FILE).run, role, number))
     listed = "".join(f"{one}\n" for one in sorted(Credentials(folder, role).revoked() | {name}))
     for place in (folder, *(path for one in ROLES for path in folder.glob(f"{one}.*"))):
-        part = place / f"{REVOKED_FILE}.part"
-        part.write_text(listed)
-        part.replace(place / REVOKED_FILE)
+        write_atomically(place / REVOKED_FILE, listed.encode())
     return name
 
 

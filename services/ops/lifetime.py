@@ -16,6 +16,8 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 
+from congrasp.common.errors import os_errors_as
+from congrasp.common.io.opening import open_to_append
 from congrasp.common.runtime.environment import child_environment
 
 GRACE = 3.5
@@ -165,8 +167,10 @@ class Child:
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         own = {**self.environment, _PARENT: str(os.getpid())}
         environment = {**jax, **child_environment(**own)}
-        with self.log.open("ab") as log:
-            self.begun = log.tell()
+        with os_errors_as(f"{self.log} cannot be opened"):
+            opened = open_to_append(self.log)
+        with opened as log:
+            self.begun = log.seek(0, os.SEEK_END)
             self.process = subprocess.Popen(
                 self.program,
                 stdout=log,

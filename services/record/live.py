@@ -32,6 +32,13 @@ _BACKLOG, _BYTES = (
     20000,
     256 << 20,
 )
+_SOCKETS = 32  # connections at a time
+# Bytes that wait for a client that does not read, and the time after which it is dropped
+_UNREAD, _UNREAD_SECONDS = (
+    4 << 20,
+    10.0,
+)
+_SOCKET_BUFFER = 256 << 10  # bytes of the system's buffer for each connection
 _TOPICS = 4096  # open channels; beyond this the one that was silent for longest is closed
 _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 
@@ -178,6 +185,7 @@ class _Gate:
     def __init__(self, outside: socket.socket, inside: tuple[str, int]):
         """Accepts connections of a listening socket, for the server at an address."""
         self._outside, self._inside = outside, inside
+        self._connections = 0
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True, name="live gate")
         self._thread.start()
@@ -200,6 +208,18 @@ class _Gate:
         loop.close()
 
     async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Passes on a connection while there is room."""
+        if self._connections >= _SOCKETS:
+            with contextlib.closing(writer), contextlib.suppress(OSError):
+                _answer(writer, "503 Service Unavailable", f"{_SOCKETS} viewers are connected.")
+            return
+        self._connections += 1
+        try:
+            await self._serve(reader, writer)
+        finally:
+            self._connections -= 1
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Passes on the connection of an allowed client, and answers others with the reason."""
         with (
             contextlib.closing(writer),
@@ -209,24 +229,50 @@ class _Gate:
         ):
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
             if fault := _fault(head.decode("latin-1")):
-                body = f"{fault}\n".encode()
-                writer.write(
-                    b"HTTP/1.1 403 Forbidden\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body)
-                )
-                await writer.drain()
+                _answer(writer, "403 Forbidden", fault)
+                await asyncio.wait_for(writer.drain(), _HEAD_SECONDS)
                 return
             to_reader, to_writer = await asyncio.open_connection(*self._inside)
             with contextlib.closing(to_writer):
                 to_writer.write(head)
-                await asyncio.gather(_pump(reader, to_writer), _pump(to_reader, writer))
+                await _relay(reader, writer, to_reader, to_writer)
+
+
+def _answer(writer: asyncio.StreamWriter, status: str, text: str) -> None:
+    """Sends an answer without a connection to the server behind."""
+    body = f"{text}\n".encode()
+    head = f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    writer.write(head.encode() + body)
+
+
+async def _relay(
+    reader: asyncio.StreamReader,
+    writer: asyncio.StreamWriter,
+    to_reader: asyncio.StreamReader,
+    to_writer: asyncio.StreamWriter,
+) -> None:
+    """Copies both directions of a connection until one ends; then both are dropped at once."""
+    writer.transport.set_write_buffer_limits(high=_UNREAD)
+    directions = (
+        asyncio.ensure_future(_pump(reader, to_writer)),
+        asyncio.ensure_future(_pump(to_reader, writer)),
+    )
+    try:
+        await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for direction in directions:
+            direction.cancel()
+        await asyncio.gather(*directions, return_exceptions=True)
+        for end in (writer, to_writer):
+            if end.transport.get_write_buffer_size():
+                end.transport.abort()
 
 
 async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Copies one direction of a connection until it ends."""
-    with contextlib.closing(writer):
-        while data := await reader.read(1 << 16):
-            writer.write(data)
-            await writer.drain()
+    """Copies one direction of a connection until it ends, or its receiver does not read."""
+    while data := await reader.read(1 << 16):
+        writer.write(data)
+        await asyncio.wait_for(writer.drain(), _UNREAD_SECONDS)
 
 
 def _fault(head: str) -> str:

@@ -33,6 +33,7 @@ from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
 from congrasp.learner.hub.limits import certificate
 from congrasp.services.record.scene import check_episode, duration, episode_entries
 from congrasp.services.record.writer import (
+    FLUSH_SECONDS,
     ROLLOUT_SCHEMA,
     Entry,
     JsonChannels,
@@ -66,8 +67,6 @@ _LEVELS = {
     "error": Log.ERROR,
     "fatal": Log.FATAL,
 }
-FLUSH_SECONDS = 0.5
-"""Seconds between two flushes; a killed recorder loses no more than these."""
 _TOPIC = "/metrics/learner/"
 
 

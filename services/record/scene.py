@@ -30,6 +30,7 @@ from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.spec import Colours
 from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
@@ -197,6 +198,7 @@ def save_episode(path: pathlib.Path, actor: str, episode: Message) -> None:
       CongraspError: the file cannot be written.
     """
     with os_errors_as(f"{path} could not be written"):
+        check_spelling(path)
         writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
         writer.write(*episode_entries(actor, episode, time.time_ns(), 0, JsonChannels()))
         writer.close()

@@ -21,6 +21,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.opening import create_new
 from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
@@ -48,6 +49,8 @@ CONVENTIONS = {
 """Metadata of every file: meaning of the numbers."""
 PART = ".part"
 """Suffix of a file that is being written, or whose writer was killed."""
+FLUSH_SECONDS = 0.5
+"""Seconds between two flushes; a killed recorder loses no more than these."""
 CHUNK = 1 << 20
 """Bytes of a chunk before compression."""
 _INDEXES = IndexType.CHUNK | IndexType.MESSAGE | IndexType.METADATA
@@ -232,7 +235,7 @@ class LogWriter:
         run: str = "",
         max_bytes: int = 256 << 20,
         max_seconds: float = 600.0,
-        open_file: Callable[[pathlib.Path], IO[bytes]] = lambda path: path.open("xb"),
+        open_file: Callable[[pathlib.Path], IO[bytes]] = create_new,
     ):
         """Creates the directory; the first entry opens the first file.
 

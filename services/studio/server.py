@@ -44,11 +44,18 @@ _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
-_TIMEOUT = 30.0  # seconds that a request may take to arrive
+_TIMEOUT = 30.0  # seconds that a connection may be silent, and a request's head may take
+_CONNECTIONS = 256  # at a time; a browser opens six
 # Bytes read of a refused body, so that the answer arrives before the close
 _DRAINED, _DRAIN_SECONDS = (
     64 << 10,
     1.0,
+)
+
+
+_FULL = (
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nRetry-After: 5\r\n"
+    b"Connection: close\r\n\r\n"
 )
 
 
@@ -220,7 +227,29 @@ class _Server(http.server.ThreadingHTTPServer):
         """Listens at (interface, port)."""
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
+        self._places = threading.BoundedSemaphore(_CONNECTIONS)
         super().__init__(address, handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serves a connection in a thread, or answers that there is no room for it."""
+        if not self._places.acquire(blocking=False):
+            with contextlib.suppress(OSError):
+                request.setblocking(False)
+                request.send(_FULL)
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # no thread can be started
+            self._places.release()
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serves a connection, then makes room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignores browsers that disconnect during an answer."""
@@ -230,6 +259,29 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     timeout = _TIMEOUT
     server: _Server
+
+    def handle_one_request(self) -> None:
+        """Serves one request, whose head must arrive within `_TIMEOUT`, however slowly it comes."""
+        timer = threading.Timer(_TIMEOUT, self._give_up)
+        timer.daemon = True
+        self._head_timer = timer
+        timer.start()
+        try:
+            super().handle_one_request()
+        finally:
+            timer.cancel()
+
+    def parse_request(self) -> bool:
+        """Reads the headers; then the head is complete."""
+        try:
+            return super().parse_request()
+        finally:
+            self._head_timer.cancel()
+
+    def _give_up(self) -> None:
+        """Ends the connection, which a thread is reading."""
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
 
     def do_GET(self) -> None:
         """Answers by a route, or with a file."""

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from mcap.reader import make_reader
 
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.task.constraints import CONSTRAINTS
@@ -27,12 +26,13 @@ from congrasp.common.wire.codec import Message, decode
 from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops import status as statuses
 from congrasp.services.ops.logs import log
+from congrasp.services.record.chunks import DamagedChunkError
 from congrasp.services.record.reader import (
-    DAMAGE,
     Record,
     intact_summary,
     is_episode,
     log_files,
+    messages_between,
     metrics_of,
     read_records,
 )
@@ -492,7 +492,7 @@ def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, 
     """
     with (
         os_errors_as(f"{file} cannot be read"),
-        contextlib.suppress(*DAMAGE),
+        contextlib.suppress(DamagedChunkError),
         file.open("rb") as stream,
     ):
         if (summary := intact_summary(stream)) is None or (
@@ -504,13 +504,7 @@ def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, 
         topics = [
             channel.topic for channel in summary.channels.values() if is_episode(channel.topic)
         ]
-        messages = (
-            make_reader(stream, validate_crcs=True).iter_messages(
-                topics, starting_at=begin, ending_before=end
-            )
-            if topics
-            else ()
-        )
+        messages = messages_between(stream, summary, topics, begin, end)
         return [
             (message.log_time, channel.topic, message.data)
             for schema, channel, message in messages

@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.hands import known_hand
+from congrasp.common.io.opening import temporary_file
+from congrasp.common.io.spelling import check_spelling
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import active_blocks, grasp_span, phases_of
@@ -251,6 +253,10 @@ def save_episode_video(
             yield frame
             progress(done / len(steps))
 
-    unfinished = path.with_name(f".{path.name}")
-    save_video(unfinished, frames(), film.size, film.fps)
-    unfinished.replace(path)
+    with (
+        os_errors_as(f"{path} could not be written"),
+        temporary_file(path, path.suffix) as (unfinished, _),
+    ):
+        check_spelling(path)
+        save_video(unfinished, frames(), film.size, film.fps)
+        unfinished.replace(path)

@@ -14,11 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.run_directory import (
+    config_checksum,
     continue_run,
     create_run,
     exclusive,
@@ -310,3 +312,44 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0
+
+
+def edited_config(text: bytes, kind: str) -> bytes:
+    """The text of a configuration with one change."""
+    if kind == "bit":
+        return text.replace(b'"gamma": 0.9', b'"gamma": 0.8', 1)
+    if kind == "editor":
+        return b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n")
+    return text
+
+
+@pytest.mark.parametrize("stored", ["both", "checkpoint", "file", "neither"])
+@pytest.mark.parametrize("kind", ["bit", "editor", "none"])
+def test_a_changed_config_is_refused_on_resume(tmp_path, stored, kind):
+    config = RunConfig()
+    create_run(tmp_path, config)
+    path = tmp_path / "config.json"
+    text = path.read_bytes()
+    meta = {}
+    if stored in ("both", "checkpoint"):
+        meta["config"] = config_checksum(text)
+    Checkpoints(tmp_path / "checkpoints").save(tree(1.0), meta, 1)
+    if stored in ("checkpoint", "neither"):
+        (tmp_path / "config.sha256").unlink()
+    path.write_bytes(edited_config(text, kind))
+    assert (path.read_bytes() == text) == (kind == "none")
+    if kind == "bit" and stored != "neither":
+        with pytest.raises(CongraspError, match=r"config\.json.*--initial"):
+            continue_run(tmp_path, open_run(tmp_path))
+    else:
+        continue_run(tmp_path, open_run(tmp_path))
+
+
+def test_a_setting_that_may_change_changes_on_resume(tmp_path):
+    create_run(tmp_path, RunConfig())
+    text = (tmp_path / "config.json").read_bytes()
+    Checkpoints(tmp_path / "checkpoints").save(tree(1.0), {"config": config_checksum(text)}, 1)
+    more = dataclasses.replace(RunConfig(), updates=RunConfig().updates + 1)
+    continue_run(tmp_path, more)
+    continue_run(tmp_path, open_run(tmp_path))
+    assert open_run(tmp_path) == more

@@ -5,6 +5,7 @@ import math
 import os
 import pathlib
 import re
+import shlex
 import stat
 import tempfile
 import urllib.parse
@@ -217,7 +218,8 @@ def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:  # noqa: C901
         stem = path.name.partition(".")[0]
         plain = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_plain.urdf"
         raise _Known(
-            f"this is xacro, of which ROS makes a URDF. Run 'xacro {path.name} > {plain}' and "
+            f"this is xacro, of which ROS makes a URDF. Run "
+            f"'xacro {shlex.quote(path.name)} > {shlex.quote(plain)}' and "
             f"import that"
         )
     if kind == "robot":
@@ -305,8 +307,9 @@ def robot_text(path: pathlib.Path) -> str:
         if mark[0] == "<":
             return text[mark.start() :]
         if mark[0] == "<!ENTITY":
-            command = f"xmllint --noent --dropdtd {path.name} > plain_{path.name}"
-            raise _Known(f"{path.name} declares entities. Run '{command}' and name that")
+            raise _Known(
+                f"{path.name} declares entities, which are not read. Export it without a DOCTYPE"
+            )
     return ""
 
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal
+from congrasp.learner.run_directory import note_version
 from congrasp.services.ops.audit import audit as command
 from congrasp.services.ops.audit import compare as audit
 
@@ -223,7 +224,8 @@ def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
 
 def test_lines_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
-    for path in (run_dir / AUDIT).iterdir():
+    for path in (run_dir / AUDIT).glob("*.jsonl"):
+        path.with_name(f"{path.name}.end").unlink()
         lines = [json.loads(line) for line in path.read_text().split("\n") if line]
         texts = [
             json.dumps({k: v for k, v in line.items() if k not in ("after", "crc32")})[:-1]
@@ -301,6 +303,91 @@ def whole_run(folder):
         used(1, 2, version=7, incarnation="2"),
         {"end": [["a", "2", 3]]},
     )
+
+
+def recomputed(line):
+    """A line with another number and the checksum that belongs to it."""
+    entry = json.loads(line)
+    entry.pop("crc32")
+    entry["forged"] = 1
+    text = json.dumps(entry)[:-1]
+    return f'{text}, "crc32": "{zlib.crc32(text.encode()):08x}"}}\n'.encode()
+
+
+TAMPERED = {
+    "first removed": lambda lines: lines[1:],
+    "one removed": lambda lines: lines[:3] + lines[4:],
+    "last removed": lambda lines: lines[:-1],
+    "83 % removed": lambda lines: lines[: len(lines) // 6],
+    "swapped": lambda lines: [*lines[:2], lines[3], lines[2], *lines[4:]],
+    "last swapped": lambda lines: [*lines[:-2], lines[-1], lines[-2]],
+    "edited": lambda lines: [*lines[:2], recomputed(lines[2]), *lines[3:]],
+    "last edited": lambda lines: [*lines[:-1], recomputed(lines[-1])],
+    "repeated": lambda lines: [*lines, lines[-1]],
+}
+
+
+@pytest.mark.parametrize("which", ["a.jsonl", "learner-0.jsonl"])
+@pytest.mark.parametrize("case", TAMPERED)
+@pytest.mark.parametrize("is_resumed", [False, True])
+def test_a_tampered_journal_fails(tmp_path, which, case, is_resumed):
+    whole_run(tmp_path)
+    path = tmp_path / AUDIT / which
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(TAMPERED[case](lines)))
+    if is_resumed and which == "a.jsonl":
+        Journal(path).write(actor="a", incarnation="3")
+    elif is_resumed:
+        learner(tmp_path, life("z", version=7), {"end": []})
+    report = audit(tmp_path)
+    assert report.missing and command(tmp_path) == 7
+
+
+def test_a_journal_may_be_one_line_ahead_of_its_note(tmp_path):
+    whole_run(tmp_path)
+    for path in (tmp_path / AUDIT).glob("*.jsonl"):
+        note = path.with_name(f"{path.name}.end")
+        before = note.read_bytes()
+        Journal(path).write(actor="a", incarnation="3", dropped=[])
+        note.write_bytes(before)
+    assert command(tmp_path) == 0
+    for path in (tmp_path / AUDIT).glob("*.jsonl"):
+        Journal(path).write(actor="a", incarnation="4", dropped=[])
+    assert command(tmp_path) == 0
+
+
+def shortened(folder):
+    """A run without notes of its journals, whose learner's journal lacks its second half."""
+    whole_run(folder)
+    for note in (folder / AUDIT).glob("*.end"):
+        note.unlink()
+    path = folder / AUDIT / "learner-0.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:3]))
+
+
+@pytest.mark.parametrize("kind", ["version", "checkpoint", "accepted"])
+def test_a_journal_is_compared_with_the_run(tmp_path, kind):
+    shortened(tmp_path)
+    if kind == "version":
+        note_version(tmp_path, 8)
+    elif kind == "checkpoint":
+        folder = tmp_path / "checkpoints"
+        folder.mkdir()
+        (folder / "checkpoint_000000008.safetensors").write_bytes(b"of a later update")
+    else:
+        (tmp_path / "accepted" / "0").mkdir(parents=True)
+    assert command(tmp_path) == 7
+
+
+def test_a_waiting_rollout_has_a_file(run_dir):
+    learner(run_dir, life(), used(0, 1), {"saved": 5})
+    folder = run_dir / "accepted" / "0"
+    folder.mkdir(parents=True)
+    assert faults(run_dir) == {"not in the journals": 2, "waiting": 2}
+    for sequence in (4, 5):
+        (folder / f"{sequence:012d}~a~1~{sequence}.safetensors").write_bytes(b"")
+    assert faults(run_dir) == {"waiting": 4}
 
 
 garbage = st.one_of(

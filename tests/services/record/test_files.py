@@ -5,16 +5,27 @@ import functools
 import io
 import json
 import pathlib
+import struct
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.record.reader import log_files, read_metrics, read_records
+from congrasp.services.export.layout import export_layout
+from congrasp.services.record.reader import (
+    log_files,
+    read_episodes,
+    read_metrics,
+    read_records,
+    read_rollouts,
+)
 from congrasp.services.record.writer import (
     CONVENTIONS,
     Entry,
@@ -23,6 +34,7 @@ from congrasp.services.record.writer import (
     opaque_channel,
 )
 from tests.children import python
+from tests.limits import limited
 from tests.recordings import is_complete
 
 SECOND = 10**9
@@ -270,3 +282,125 @@ def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(tmp_path_factory, 
     said: list[str] = []
     read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
     assert read == sorted(set(read)) and set(read) <= set(range(15)) and len(said) <= 1
+
+
+def compressed_file(
+    path: pathlib.Path, compression: CompressionType, messages: int = 30, size: int = 0
+) -> pathlib.Path:
+    """A finished file of metrics with a second between them, of several chunks."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=compression)
+        writer.start()
+        schema = writer.register_schema("metrics", "jsonschema", b"{}")
+        channel = writer.register_channel("/metrics/learner/0", "json", schema)
+        for i in range(messages):
+            data = json.dumps({"update": i, "values": {"kl": 0.5}}).encode() + b" " * size
+            writer.add_message(channel, (i + 1) * SECOND, data, (i + 1) * SECOND)
+        writer.finish()
+    return path
+
+
+COMPRESSED = [CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE]
+
+
+@pytest.mark.parametrize("compression", COMPRESSED)
+def test_every_compression_is_read(tmp_path, compression):
+    path = compressed_file(tmp_path / "a.mcap", compression, size=200)
+    notices: list[str] = []
+    records = list(read_records(path, warn=notices.append))
+    assert [json.loads(record.data)["update"] for record in records] == [*range(30)]
+    assert not notices
+
+
+@pytest.mark.parametrize("compression", COMPRESSED[:2])
+def test_a_damaged_chunk_of_any_compression_is_dropped(tmp_path, compression):
+    path = compressed_file(tmp_path / "a.mcap", compression, size=200)
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[1]
+    data = bytearray(path.read_bytes())
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle : middle + 20] = bytes(20)
+    path.write_bytes(data)
+    notices: list[str] = []
+    records = list(read_records(path, warn=notices.append))
+    assert 20 < len(records) < 30
+    assert len(notices) == 1 and "damaged in 1 place" in notices[0]
+
+
+def notices_of(path: pathlib.Path) -> list[str]:
+    """Warnings about a file."""
+    notices: list[str] = []
+    for _ in read_records(path, warn=notices.append):
+        pass
+    return notices
+
+
+def bomb(path: pathlib.Path, compression: str, claimed: int, actual: int, chunks: int) -> None:
+    """A file of chunks that inflate to `actual` zeros, and claim another size."""
+    compress = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}[compression]
+    data = compress(bytes(actual))
+    head = struct.pack("<QQQI", SECOND, SECOND, claimed, 0)
+    name = struct.pack("<I", len(compression)) + compression.encode()
+    record = head + name + struct.pack("<Q", len(data)) + data
+    path.write_bytes(
+        MCAP0_MAGIC + (struct.pack("<BQ", 6, len(record)) + record) * chunks + MCAP0_MAGIC
+    )
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("claimed", [1 << 40, 1 << 10])
+def test_a_chunk_of_another_size_is_dropped(tmp_path, compression, claimed):
+    bomb(tmp_path / "a.mcap", compression, claimed, 64 << 20, 1)
+    notice = limited(notices_of, tmp_path / "a.mcap", memory=300 << 20)
+    assert "damaged in 1 place" in notice
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_file_that_inflates_without_end_is_refused(tmp_path, compression):
+    bomb(tmp_path / "a.mcap", compression, 64 << 20, 64 << 20, 4)
+    with pytest.raises(CongraspError, match=r"a\.mcap cannot be read"):
+        list(read_records(tmp_path / "a.mcap", warn=lambda text: None))
+
+
+def test_an_unknown_compression_is_damage(tmp_path):
+    bomb(tmp_path / "a.mcap", "lz4", 1 << 10, 1 << 10, 1)
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(data.replace(b"lz4", b"xyz"))
+    notices: list[str] = []
+    assert not list(read_records(tmp_path / "a.mcap", warn=notices.append))
+    assert len(notices) == 1
+
+
+READERS = {
+    "records": lambda path: list(read_records(path)),
+    "metrics": read_metrics,
+    "episodes": lambda path: list(read_episodes(path)),
+    "rollouts": lambda path: list(read_rollouts(path)),
+    "layout": lambda path: export_layout(path, path.with_name("layout.json")),
+}
+
+
+@pytest.mark.parametrize("compression", COMPRESSED)
+@pytest.mark.parametrize("reader", READERS)
+def test_a_file_without_its_end_is_named(tmp_path, compression, reader, caplog):
+    path = compressed_file(tmp_path / "a.mcap", compression, size=200)
+    READERS[reader](path)
+    assert not caplog.messages
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    READERS[reader](path)
+    assert len(caplog.messages) == 1
+    line = caplog.messages[0]
+    assert str(path) in line and "not finished" in line and " s or more may be missing" in line
+
+
+def test_the_seconds_of_a_cut_chunk_are_counted(tmp_path):
+    path = compressed_file(tmp_path / "a.mcap", CompressionType.ZSTD, size=200)
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    second = chunks[1]
+    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2])
+    notices: list[str] = []
+    list(read_records(path, warn=notices.append))
+    lost = (second.message_end_time - chunks[0].message_end_time) / SECOND
+    assert lost > 2 and f"{lost:.1f} s" in notices[0]
