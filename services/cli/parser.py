@@ -34,7 +34,7 @@ def of_command(
 
     def parse(rest: list[str]) -> Callable[[], Any]:
         bound = functools.partial(_deferred(command), **defaults(rest))
-        with _epilog(examples(command)):
+        with _epilog(examples(command), rest):
             return tyro.cli(
                 bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY
             )
@@ -49,7 +49,7 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
         if rest and rest[0] in commands:
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
-        with _epilog([examples(command)[0] for command in commands.values()]):
+        with _epilog([examples(command)[0] for command in commands.values()], rest):
             return tyro.extras.subcommand_cli_from_dict(
                 deferred, prog=prog, description=description, args=rest
             )
@@ -69,14 +69,14 @@ def examples(command: Command) -> list[str]:
 
 
 @contextlib.contextmanager
-def _epilog(lines: Sequence[str]) -> Iterator[None]:
-    """Prints examples after the help, which is what a parser prints when it exits without an
-    error.
+def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
+    """Prints examples after the help, which a parser prints when it exits without an error; with
+    other arguments it prints scripts of shells.
     """
     try:
         yield
     except SystemExit as end:
-        if not end.code:
+        if not end.code and {"-h", "--help"} & set(arguments):
             print("\n".join(("Examples:", *(f"  {line}" for line in lines))))
         raise
 
