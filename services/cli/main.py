@@ -23,8 +23,8 @@ import congrasp
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder, can_cache, check_output
 from congrasp.services.cli import suggestions
-from congrasp.services.cli.completion import spec_of
 from congrasp.services.cli.not_a_number import check_numbers
+from congrasp.services.cli.shell_specs import spec_of
 from congrasp.services.ops.interrupts import ending, interrupts_reach
 from congrasp.services.ops.lifetime import SIGNALS, follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
@@ -315,7 +315,7 @@ def _parsed(
         what = " ".join(inside[: rules[0]]).rstrip(".")
         mistyped = suggestions.unrecognized(what)
         if mistyped and not similar:
-            similar = suggestions.similar_words(mistyped, arguments, spec_of(name))
+            similar = suggestions.similar_words(mistyped, arguments, spec_of(parse))
         hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
         what = suggestions.plain_error(what)
         raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None

@@ -9,8 +9,8 @@ from congrasp.common.errors import CongraspError
 
 
 def check_numbers(parameters: Mapping[str, Any]) -> None:
-    """Raises a CongraspError for the first option in a group that is NaN; commands check the range
-    of their other options themselves.
+    """Raises a CongraspError for the first option of a configuration (with a dot) that is NaN;
+    commands check the range of their other options themselves.
 
     Args:
       parameters: parameters of a command; a group of options is a dataclass.
@@ -28,7 +28,7 @@ def _check(options: Mapping[str, Any], prefix: str) -> None:
             _check(_fields(value), f"{option}.")
             continue
         values = value if isinstance(value, tuple) else (value,)
-        if any(isinstance(one, float) and math.isnan(one) for one in values):
+        if prefix and any(isinstance(one, float) and math.isnan(one) for one in values):
             raise CongraspError(f"--{option} is nan, which is not a number.", "Give a number.")
 
 
