@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from congrasp.services.cli.main import COMMANDS, load
+from congrasp.services.cli import main
 from congrasp.services.cli.shell_specs import SPEC, printed, spec_in, spec_of
 
 Shell = Literal["bash", "zsh", "fish"]
@@ -28,8 +28,8 @@ def completion(shell: Annotated[Shell, tyro.conf.Positional]) -> int:
 def script(shell: Shell) -> str:
     """Returns the completion script of all commands."""
     subcommands = {}
-    for name, description in COMMANDS.items():
-        subcommands[name] = {"description": description, **spec_of(load(name))}
+    for name, description in main.COMMANDS.items():
+        subcommands[name] = {"description": description, **spec_of(main.load(name))}
     empty = printed(lambda words: tyro.cli(_nothing, prog="congrasp", args=words), shell)
     spec = {**spec_in(empty), "prog": "congrasp", "subcommands": subcommands}
     return SPEC.sub(lambda _: f"COMPLETION_SPEC = {spec!r}", empty)
