@@ -140,6 +140,12 @@ class LateError(RefusedError):
     code = "late"
 
 
+class StartingError(RefusedError):
+    """The server compiles its policy, and answers soon."""
+
+    code = "starting"
+
+
 class UnknownConstraintError(RefusedError):
     """The constraint does not exist, or the policy does not support it."""
 
@@ -165,6 +171,7 @@ _BY_CODE = {
     for error in (
         OverloadedError,
         LateError,
+        StartingError,
         UnknownConstraintError,
         ContradictionError,
         LayoutError,

@@ -28,9 +28,11 @@ from zenoh.handlers import FifoChannel
 from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
 from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, Transport
-from congrasp.common.transport.keys import FLOWS, Flow, account, flow
+from congrasp.common.transport.keys import FLOWS, Flow, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
+from congrasp.common.transport.senders import sent_by
+from congrasp.common.transport.zenoh_senders import Senders, Sources
 from congrasp.common.transport.zenoh_session import (
     STAMP,
     Sessions,
@@ -273,7 +275,10 @@ class ZenohTransport(Transport):
         self._identity = str(credentials.identity) if credentials else ""
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
-        self._outbox, self._pace, self._sessions = Outbox(), Pace(), Sessions()
+        self._outbox = Outbox()
+        self._pace = Pace()
+        self._sessions = Sessions()
+        self._sources = Sources()
         self._finalizer = weakref.finalize(self, self._sessions.close)
         deadline, known = (
             time.monotonic() + wait,
@@ -310,7 +315,10 @@ class ZenohTransport(Transport):
     ) -> None:
         """See `Transport.serve`."""
         hooks = on_damage or (lambda *_: None), admission or (lambda _: None)
-        server = _Server(handler, *hooks, self._max_message, self._outbox)
+        senders = Senders(
+            lambda: self._sessions.get(flow(key)), has_certificates=bool(self._identity)
+        )
+        server = _Server(handler, *hooks, self._max_message, self._outbox, senders)
         works = [functools.partial(_serve, server=server)] * workers
         self._sessions.declare(
             flow(key), lambda session: session.declare_queryable(key, FifoChannel(depth)), *works
@@ -360,13 +368,15 @@ class ZenohTransport(Transport):
         refused: zenoh.ReplyError | None = None
         try:
             with self._sessions.inside():
-                replies = self._session(key).get(
+                session = self._session(key)
+                replies = session.get(
                     key,
                     FifoChannel(4),
                     payload=payload,
                     attachment=attachment,
                     timeout=timeout,
                     congestion_control=zenoh.CongestionControl.BLOCK,
+                    source_info=self._sources.of_session(session, key),
                 )
                 for reply in replies:
                     if reply.ok:
@@ -479,22 +489,31 @@ class _Server(NamedTuple):
     admission: Admission
     max_message: int
     outbox: Outbox
+    senders: Senders
 
 
 def _serve(queries: Any, server: _Server) -> None:
     """Answers queries until the session closes; runs in a separate thread."""
     for query in received(queries):
         key = str(query.key_expr)
+        peer = server.senders.of_query(query, key)
         wanted = query.attachment.to_bytes() if query.attachment else b""
         if not is_request(wanted):
-            _reply(
-                query, key, functools.partial(_answer, query, key, server), server.outbox, wanted
-            )
+            with sent_by(peer):
+                _reply(
+                    query,
+                    key,
+                    functools.partial(_answer, query, key, server),
+                    server.outbox,
+                    wanted,
+                    peer.account,
+                )
         else:
             with (
                 contextlib.suppress(zenoh.ZError, CongraspError),
+                sent_by(peer),
                 query,
-                server.outbox.turn(account(key)) as mine,
+                server.outbox.turn(peer.account) as mine,
             ):
                 if mine and server.admission(key) is None:
                     query.reply(key, server.outbox.piece(wanted), attachment=wanted)
@@ -520,6 +539,7 @@ def _reply(
     outcome: Callable[[], Message | Future[Message]],
     outbox: Outbox,
     attachment: bytes,
+    account: str,
 ) -> None:
     """Replies to a query with the result of a function once it is available, or with message and
     code of its error.
@@ -531,7 +551,7 @@ def _reply(
         result = outcome()
         if isinstance(result, Future):
             result.add_done_callback(
-                lambda done: _reply(query, key, done.result, outbox, attachment)
+                lambda done: _reply(query, key, done.result, outbox, attachment, account)
             )
             return
         payload = encode(result)
@@ -545,5 +565,5 @@ def _reply(
             encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
             query.reply_err(message.encode(errors="replace"), encoding=encoding)
         else:
-            with outbox.first(payload, attachment, account(key)) as (piece, head):
+            with outbox.first(payload, attachment, account) as (piece, head):
                 query.reply(key, piece, attachment=head)

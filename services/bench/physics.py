@@ -146,7 +146,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
     """Prints control steps per second of actors (policy, observation, reward, reset) and of engines
     that only step.
     """
-    console = Console()
+    console = Console(markup=False)
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
     objects = scale_objects(hand, config.task, load_pool(config.objects))

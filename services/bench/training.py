@@ -166,7 +166,7 @@ def bench_scaling(
         }
         out.write_text(json.dumps(result, indent=2))
         _print(console, config, stages)
-    console.print(f"Written to {out}.", soft_wrap=True)
+    console.print(f"Written to {out}.", soft_wrap=True, markup=False)
 
 
 def _measure(
@@ -181,7 +181,7 @@ def _measure(
     ranks = plan.launch.ranks
     run_dir = pathlib.Path(tempfile.mkdtemp(prefix=f"congrasp-scaling-{ranks}-"))
     stop = threading.Event()
-    meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}"))
+    meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}", markup=False))
     create_run(run_dir, config)
     try:
         train(
@@ -190,7 +190,7 @@ def _measure(
             plan,
             stop=stop,
             report=meter.show,
-            notify=lambda text: console.print(f"  {text}", soft_wrap=True),
+            notify=lambda text: console.print(f"  {text}", soft_wrap=True, markup=False),
         )
         if len(meter.metrics) <= _LEAST_UPDATES:
             raise TransportError(
@@ -201,7 +201,7 @@ def _measure(
     except CongraspError:
         for log in sorted((run_dir / "logs").glob("*.log")):
             console.print(
-                f"[bold]{log}[/]",
+                f"{log}",
                 *log.read_text(errors="replace").splitlines()[-15:],
                 sep="\n",
                 markup=False,
@@ -267,7 +267,7 @@ def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> N
         table.add_column(name, justify="right")
     for name in names:
         table.add_row(name, *(found.get(name, "") for found in starts.values()))
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     console.print(
         "Stages of different threads overlap. Warp's kernels are in a separate cache, which is "

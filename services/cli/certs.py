@@ -132,7 +132,7 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
         table.add_row(
             one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style
         )
-    Console().print(table)
+    Console(markup=False).print(table)
     return int(any(one.days <= 0 for one in found))
 
 

@@ -22,6 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError, printable
+from congrasp.services.ops.interrupts import check_stopped
 from congrasp.services.ops.logs import announced
 
 Track = Callable[[str, int | None], Callable[[int], None]]
@@ -119,6 +120,11 @@ def tracked() -> Iterator[Track]:
         def track(text: str, total: int | None) -> Callable[[int], None]:
             """Adds a bar."""
             task = progress.add_task(text, total=total)
-            return lambda done: progress.update(task, completed=done)
+
+            def advance(done: int) -> None:
+                check_stopped()
+                progress.update(task, completed=done)
+
+            return advance
 
         yield track

@@ -186,7 +186,7 @@ class Evaluate:
         skipped rows.
         """
         console, rows = (
-            Console(highlight=False, width=None if sys.stdout.isatty() else 160),
+            Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 160),
             _rows(results),
         )
         where = (

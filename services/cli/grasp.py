@@ -15,6 +15,7 @@ from congrasp.common.task.constraints.base import Option
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.console import bars, in_range, report_error, say
+from congrasp.services.cli.dependent_options import check_together
 
 if TYPE_CHECKING:
     from congrasp.services.grasp.jobs import Result
@@ -113,6 +114,7 @@ class Grasp:
             raise CongraspError(
                 "There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj"
             )
+        check_together(self, ("size", "fps", "overlays"), "video")
         in_range(1, _MOST_ATTEMPTS, "side by side", attempts=self.attempts)
         in_range(0.0, 10.0, "seconds", approach=self.approach)
         in_range(0.0, 0.5, "metres", lift=self.lift)

@@ -15,6 +15,7 @@ from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.hands.skin import skin_of_meshes
 from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.shell import shell_command
 from congrasp.services.cli.console import in_range, say, show_table
 from congrasp.services.ops.logs import announced
 
@@ -134,7 +135,9 @@ def import_hand(  # noqa: PLR0913
         proposal = model_files.import_hand(file, choices)
     _keep(proposal, out, png)
     called = proposal.hand.name if out is None else out
-    print(f"Try: congrasp hands train {called}, or congrasp train --hand {called} --physics native")
+    direct = shell_command("congrasp", "hands", "train", called)
+    general = shell_command("congrasp", "train", "--hand", called, "--physics", "native")
+    print(f"Try: {direct}, or {general}")
     return 0
 
 

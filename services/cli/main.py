@@ -23,7 +23,11 @@ import congrasp
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder, can_cache, check_output
 from congrasp.common.runtime.environment import child_environment, own_environment
+from congrasp.services.cli import suggestions
+from congrasp.services.cli.not_a_number import check_numbers
+from congrasp.services.cli.shell_specs import spec_of
 from congrasp.services.cli.terminal import ensure_width
+from congrasp.services.ops.interrupts import ending, interrupts_reach
 from congrasp.services.ops.lifetime import SIGNALS, follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
 
@@ -51,6 +55,7 @@ COMMANDS = {
     "audit": "the outcome of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
     "certs": "certificates for mutual TLS between the processes of a run",
+    "completion": "completion of commands and options in bash, zsh and fish",
     "doctor": "what is wrong with this machine or installation",
 }
 """Commands in the order of the help."""
@@ -80,6 +85,8 @@ _QUIET_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning,
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
+_TELL_THEIR_END = ("train", "learner", "actor", "serve", "record")
+"""Commands that print or log themselves that a signal stopped them."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LESS_MEMORY = (
@@ -217,21 +224,26 @@ def run(arguments: list[str]) -> int:
         print(congrasp.__version__)
         return 0
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, 1)
-        meant = f"Did you mean '{near[0]}'?" if near else f"Choose one of: {', '.join(COMMANDS)}."
-        raise CongraspError(f"There is no command '{name}'.", meant)
+        kind = "option" if name.startswith("-") else "command"
+        remedy = suggestions.command_remedy(arguments, list(COMMANDS))
+        raise CongraspError(f"There is no {kind} '{name}'.", remedy)
     _check_files(rest)
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
             with announced(f"Loading 'congrasp {name}'"):
                 call = _parsed(name, load(name), rest)
+            check_numbers(getattr(call, "keywords", {}))
             _check_outputs(call)
-            result = call()
+            with interrupts_reach(stop):
+                result = call()
         except KeyboardInterrupt:
             result = None
             stop.wait(1.0)  # the thread that records the signal may be slightly late
-        return stop.exit_code or (result if isinstance(result, int) else 0)
+        code = stop.exit_code or (result if isinstance(result, int) else 0)
+    if code in SIGNALLED and name not in _TELL_THEIR_END:
+        _last_words(sys.stderr, f"{ending(code)}\n")
+    return code
 
 
 def _check_files(arguments: Sequence[str]) -> None:
@@ -305,13 +317,13 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
 
 
 def _parsed(
-    name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]
+    name: str, parse: Callable[[list[str]], Callable[[], Any]], arguments: list[str]
 ) -> Callable[[], Any]:
     """Parses a command line; errors are one line instead of the parser's box."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return parse(rest)
+            return parse(arguments)
     except SystemExit as end:
         if not end.code:
             raise
@@ -320,8 +332,12 @@ def _parsed(
         rest = inside[rules[0] :]
         options = [line.split()[0].rstrip(",") for line in rest if line.startswith("--")]
         similar = options if "Perhaps you meant:" in rest else []
-        hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
         what = " ".join(inside[: rules[0]]).rstrip(".")
+        mistyped = suggestions.unrecognized(what)
+        if mistyped and not similar:
+            similar = suggestions.similar_words(mistyped, arguments, spec_of(parse))
+        hint = f"Perhaps you meant {' or '.join(similar)}. " if similar else ""
+        what = suggestions.plain_error(what)
         raise CongraspError(f"{what}.", f"{hint}See 'congrasp {name} --help'.") from None
 
 

@@ -34,7 +34,7 @@ def of_command(
 
     def parse(rest: list[str]) -> Callable[[], Any]:
         bound = functools.partial(_deferred(command), **defaults(rest))
-        with _epilog(examples(command)):
+        with _epilog(examples(command), rest):
             return tyro.cli(
                 bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY
             )
@@ -50,7 +50,7 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
         first = [line for command in commands.values() for line in examples(command)[:1]]
-        with _epilog(first):
+        with _epilog(first, rest):
             return tyro.extras.subcommand_cli_from_dict(
                 deferred, prog=prog, description=description, args=rest
             )
@@ -70,14 +70,15 @@ def examples(command: Command) -> list[str]:
 
 
 @contextlib.contextmanager
-def _epilog(lines: Sequence[str]) -> Iterator[None]:
-    """Prints examples after the help, which is what a parser prints when it exits without an
-    error.
+def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
+    """Prints examples after the help, which a parser prints when it exits without an error; with
+    other arguments it prints scripts of shells.
     """
     try:
         yield
     except SystemExit as end:
-        if not end.code and lines:
+        asks_for_help = not {"-h", "--help"}.isdisjoint(arguments)
+        if not end.code and lines and asks_for_help:
             print("\n".join(("Examples:", *(f"  {line}" for line in lines))))
         raise
 

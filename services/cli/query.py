@@ -5,6 +5,7 @@ from typing import Annotated
 
 import tyro
 
+from congrasp.common.errors import TransportError
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.cli.console import in_range
 from congrasp.services.client.policy_client import PolicyClient
@@ -49,8 +50,9 @@ def query(  # noqa: PLR0913
     in_range(0, rate=rate)
     if health:
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
-            print(json_module.dumps(client.health()))
-        return 0
+            found = client.health()
+        print(json_module.dumps(found))
+        return 0 if found["ready"] else TransportError.exit_code
     from congrasp.services.serve.load import example_episode, measure, one_answer
 
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:

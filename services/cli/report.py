@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import shlex
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -81,7 +82,7 @@ class Report:
                 ),
                 file.name,
                 self.out,
-                subject=f"--policy {file}" if self.source else f"--hand {self.hand}",
+                subject=self._subject(file),
                 objects=self.objects,
                 run_dir=run_dir,
                 check=checked,
@@ -94,6 +95,12 @@ class Report:
             print(f"Left out: {error}")
         print(f"The report is in {self.out}: open it in a browser.")
         return 0
+
+    def _subject(self, file: pathlib.Path) -> str:
+        """Options of 'congrasp evaluate' that select the policy."""
+        if self.source:
+            return f"--policy {shlex.quote(str(file))}"
+        return f"--hand {self.hand}"
 
 
 def _checked(file: pathlib.Path) -> "HandCheck":

@@ -3,9 +3,10 @@
 import os
 import secrets
 import time
+from collections.abc import Callable
 from typing import Any
 
-from congrasp.common.errors import RefusedError, TransportError
+from congrasp.common.errors import RefusedError, StartingError, TransportError
 from congrasp.common.runtime import forks
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
@@ -35,7 +36,8 @@ class PolicyClient(EpisodePolicy):
           run: name under which the policy is served.
           hand: name of the controlled hand; the policy of another one is refused.
           timeout: deadline of one call, s.
-          wait: seconds to wait for the server to appear.
+          wait: seconds to wait for the server to appear, and to compile its policy: the first call
+            lasts until then.
           certs: folder of a client's certificate, for a server that requires one.
 
         Raises:
@@ -43,11 +45,15 @@ class PolicyClient(EpisodePolicy):
         """
         super().__init__()
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
-        self._keys, self._hand, self._timeout, self._wait = Keys(run), hand, timeout, wait
+        self._keys = Keys(run)
+        self._hand = hand
+        self._timeout = timeout
+        self._wait = wait
+        self._is_known = False  # the server has answered
         self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
 
     def health(self) -> dict[str, object]:
-        """Readiness, version, hand and queue of the server."""
+        """Readiness, version, hand and queue of the server, or how long it has been compiling."""
         return dict(
             self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta
         )
@@ -55,16 +61,25 @@ class PolicyClient(EpisodePolicy):
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
         forks.require_same_process(self._opened, "policy")
+        return self._patiently(self._metadata)
+
+    def _described(self) -> dict[str, Any]:
+        """The metadata; only the first call waits, since later ones are part of a control loop."""
+        return self._metadata() if self._is_known else self.metadata()
+
+    def _patiently(self, ask: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Repeats a query until a server that is starting answers it, for the seconds to wait."""
         deadline = time.monotonic() + self._wait
         while True:
             try:
-                return self._described()
+                return ask()
             except TransportError as error:
-                if isinstance(error, RefusedError) or time.monotonic() > deadline:
+                is_final = isinstance(error, RefusedError) and not isinstance(error, StartingError)
+                if is_final or time.monotonic() > deadline:
                     raise
                 time.sleep(_AGAIN)
 
-    def _described(self) -> dict[str, Any]:
+    def _metadata(self) -> dict[str, Any]:
         """The metadata of a server that responds."""
         query = Message({}, {"metadata": True})
         found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
@@ -76,6 +91,7 @@ class PolicyClient(EpisodePolicy):
             raise RefusedError(
                 f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'."
             )
+        self._is_known = True
         return found
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import collections
 import dataclasses
 import functools
 import pathlib
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from congrasp.common.errors import need_package
 from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import engine_title
+from congrasp.common.shell import shell_command
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.plausibility import CLEAN_MM
@@ -136,13 +138,19 @@ def report_on(
     for row, sheet, causes in failure_sheets(experiment, results, _PICTURED, _PICTURED):
         sheets.append(Picture(row, png_of(sheet), count_causes(causes)))
         advance(len(sheets))
-    subject += f" --objects {objects}" if objects else f" --pool {len(experiment.objects)}"
+    subject += (
+        f" --objects {shlex.quote(str(objects))}"
+        if objects
+        else f" --pool {len(experiment.objects)}"
+    )
     numbers = (
         f"--episodes {experiment.episodes} --physics {experiment.physics} --seed {experiment.seed}"
     )
     command = f"congrasp evaluate --table single composed {subject} {numbers}"
     commands = Commands(
-        command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else ""
+        command,
+        f"{command} --pictures pictures",
+        shell_command("congrasp", "plot", run_dir) if curves else "",
     )
     rules = (
         f". {found.heading_rules.sentence(policy.spec.hand_name)}" if found.heading_rules else ""

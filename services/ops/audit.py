@@ -391,7 +391,7 @@ def audit(
       congrasp audit runs/mine --journals actor.1 actor.2
     """
     report = compare(run_dir, journals)
-    console = Console()
+    console = Console(markup=False)
     table = Table("rollouts", "number", "kind", title=f"Audit of {run_dir}")
     for name, value in report.counts.items():
         style = "bold red" if name in FAULTS and value else ""

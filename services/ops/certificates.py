@@ -23,6 +23,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
+from congrasp.common.shell import shell_command
 from congrasp.common.transport.certificates import Certificate, load, read
 from congrasp.common.transport.keys import check_name
 from congrasp.common.transport.security import (
@@ -238,7 +239,8 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     found = [read(path) for path in files if path.exists()]
     if not found:
         raise CongraspError(
-            f"{folder} holds no certificates.", f"Create them: congrasp certs init {folder}"
+            f"{folder} holds no certificates.",
+            f"Create them: {shell_command('congrasp', 'certs', 'init', folder)}",
         )
     return sorted(found, key=lambda one: one.identity or Identity("", "", 0))
 
@@ -292,7 +294,8 @@ def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurve
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
         raise CongraspError(
-            f"{folder} holds no authority.", f"Create one: congrasp certs init {folder}"
+            f"{folder} holds no authority.",
+            f"Create one: {shell_command('congrasp', 'certs', 'init', folder)}",
         ) from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     return load(folder / CA_FILE), key

@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.shell import shell_command
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
@@ -152,12 +153,12 @@ class Status:
                 if self.json:
                     print(json.dumps(found))
                 else:
-                    Console().print(tables(found))
+                    Console(markup=False).print(tables(found))
             elif self.json:
                 for now in follow(transport, run, self.every):
                     print(json.dumps(now), flush=True)
             else:
-                with Live(tables(found), auto_refresh=False) as live:
+                with Live(tables(found), console=Console(markup=False), auto_refresh=False) as live:
                     for now in follow(transport, run, self.every):
                         live.update(
                             tables(now) if now else f"The learner of '{run}' is disconnected …",
@@ -178,7 +179,7 @@ class Status:
         if not connect:
             raise CongraspError(
                 f"No learner is running in {run_dir}.",
-                f"Draw its recordings with 'congrasp plot {run_dir}'.",
+                f"Draw its recordings with '{shell_command('congrasp', 'plot', run_dir)}'.",
             )
         return connect, run
 

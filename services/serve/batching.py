@@ -1,34 +1,38 @@
 """Batches queries that arrive together: a bounded queue and a worker thread, which a single query
 bypasses.
 
-Peers take turns in the queue, and each has a limited share of it, so that a flood from one does not
-exclude the others. While several peers send queries, batches are small and the peers share each
-equally, so that a long query, answered in parts, delays the others by no more than a small batch.
+Clients share the queue fairly (`fair_queue`), so that a flood from one does not exclude the others.
+While several peers send queries, batches are small and the clients share each equally, so that a
+long query, answered in parts, delays the others by no more than a small batch.
 """
 
-import collections
+import contextlib
 import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, InvalidStateError
 from typing import Generic, NamedTuple, TypeVar
 
 from congrasp.common.errors import CongraspError, LateError, OverloadedError
+from congrasp.common.transport.senders import Peer
+from congrasp.services.serve.fair_queue import FairQueue
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
+_ANYONE = Peer()
 _ALONE = 1.0  # seconds without a query of another peer until one counts as alone
 
 
 class Parts(NamedTuple, Generic[T, R]):
     """Splitting of an item into parts."""
 
-    most: int
-    """Limit of a batch's weight while several peers, at most as many as this, send queries."""
+    sizes: tuple[int, ...]
+    """Limits of a batch's weight while several peers send queries: the first that has room for one
+    state of each peer."""
     cut: Callable[[T, int, int], T]
     """(item, first, end) -> the part of weight `end` - `first`."""
     join: Callable[[T, list[R]], R | Exception]
@@ -70,8 +74,8 @@ class Batcher(Generic[T, R]):
         for each item.
       size: limit of the weight of a batch.
       window: longest wait for further items, s.
-      depth: limit of the queue; further items are refused with `OverloadedError`.
-      share: limit of one peer's queued items; by default `depth`.
+      depth: limit of the queue (`FairQueue`); items in excess fail with `OverloadedError`.
+      share: limit of one peer's queued items; by default that of the queue alone.
       weigh: returns an item's weight, at most `size`.
       parts: splitting of items; None runs each as a whole.
     """
@@ -88,19 +92,15 @@ class Batcher(Generic[T, R]):
         parts: Parts[T, R] | None = None,
     ):
         self._run = run
-        self._weigh, self._parts = weigh, parts
+        self._weigh = weigh
+        self._parts = parts
         self._size = size
         self._window = window
         self._depth = depth
-        self._share = depth if share is None else share
-        self._queues: collections.OrderedDict[str, collections.deque[_Waiting[T, R]]] = (
-            collections.OrderedDict()
-        )
-        # Peer, and the time at which it counts as alone
-        self._latest, self._several_until = (
-            "",
-            -math.inf,
-        )
+        self._share = share or depth + 1
+        self._queue: FairQueue[_Waiting[T, R]] = FairQueue(depth, self._share)
+        self._latest: Peer | None = None
+        self._several_until = -math.inf  # time at which the latest peer counts as alone
         self._changed = threading.Condition()
         self._running = False
         self._expected = 1
@@ -108,51 +108,65 @@ class Batcher(Generic[T, R]):
         self._thread = threading.Thread(target=self._work, daemon=True, name="batcher")
         self._thread.start()
 
-    def check_room(self, peer: str) -> None:
+    def check_room(self, peer: Peer) -> None:
         """Raises an `OverloadedError` if the peer may not queue another item."""
         with self._changed:
-            if len(self) >= self._depth:
-                raise OverloadedError(
-                    f"Overloaded: {self._depth} queries are queued.", "Try again later."
-                )
-            if len(self._queues.get(peer, ())) >= self._share:
+            if self._queue.is_at_share(peer):
                 raise OverloadedError(
                     f"Overloaded: {self._share} of your queries are queued.", "Try again later."
                 )
+            if not self._queue.has_room(peer):
+                raise self._full()
+
+    def _full(self) -> OverloadedError:
+        """Error of an item that has no place in the full queue."""
+        return OverloadedError(f"Overloaded: {self._depth} queries are queued.", "Try again later.")
 
     def __len__(self) -> int:
         """Number of queued items."""
         with self._changed:
-            return sum(len(queue) for queue in self._queues.values())
+            return len(self._queue)
 
-    def submit(self, item: T, timeout: float, peer: str = "") -> "Future[R]":
+    def submit(self, item: T, timeout: float, peer: Peer = _ANYONE) -> "Future[R]":
         """Queues an item of a peer with a deadline of `timeout` seconds.
 
+        Its future fails with an `OverloadedError` if the item loses its place to another client's.
+
         Raises:
-          OverloadedError: `depth` items are queued already, or `share` of this peer.
+          OverloadedError: there is no room for this peer's item.
           CongraspError: the queue is closed.
         """
         now = time.monotonic()
         waiting: _Waiting[T, R] = _Waiting(item, self._weigh(item), Future(), now, now + timeout)
+        evicted = None
         with self._changed:
             if self._closed:
                 raise CongraspError("The server is shutting down.")
-            if peer != self._latest:
-                self._several_until, self._latest = (
-                    (now + _ALONE) if self._latest else -math.inf,
-                    peer,
-                )
-            alone = not self._running and not self._queues and self._expected == 1
-            alone = alone and waiting.weight <= self._limits()[0]
-            if alone:
+            self._note_peer(peer, now)
+            runs_here = self._is_idle() and waiting.weight <= self._room()
+            if runs_here:
                 self._running = True
             else:
                 self.check_room(peer)
-                self._queues.setdefault(peer, collections.deque()).append(waiting)
+                evicted = self._queue.add(waiting, peer)
                 self._changed.notify()
-        if alone:
+        if evicted is not None:
+            _resolve(evicted.future, self._full())
+        if runs_here:
             self._answer([_Part(waiting, item)])
         return waiting.future
+
+    def _note_peer(self, peer: Peer, now: float) -> None:
+        """Notes the peer of the latest item, which decides whether several send items."""
+        if peer == self._latest:
+            return
+        if self._latest is not None:
+            self._several_until = now + _ALONE
+        self._latest = peer
+
+    def _is_idle(self) -> bool:
+        """True if nothing runs, is queued or is expected to arrive at once."""
+        return not self._running and not len(self._queue) and self._expected == 1
 
     def close(self, timeout: float = 2.0) -> None:
         """Refuses queued items and ends the worker."""
@@ -165,7 +179,7 @@ class Batcher(Generic[T, R]):
         """Runs batches until the batcher is closed; runs in the worker thread."""
         while batch := self._collect():
             self._answer(batch)
-        for waiting in (one for queue in self._queues.values() for one in queue):
+        for waiting in self._queue:
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
     def _answer(self, batch: list[_Part[T, R]]) -> None:
@@ -189,6 +203,8 @@ class Batcher(Generic[T, R]):
             self._running = False
             self._changed.notify()
         for (waiting, item), result in zip(batch, results, strict=True):
+            if waiting.future.done():  # a part was running when the item lost its place
+                continue
             if (
                 self._parts is not None
                 and item is not waiting.item
@@ -201,17 +217,17 @@ class Batcher(Generic[T, R]):
             if isinstance(result, Exception):
                 self._fail(waiting, result)
             else:
-                waiting.future.set_result(result)
+                _resolve(waiting.future, result)
 
     def _collect(self) -> list[_Part[T, R]]:
         """Returns the next batch; empty once closed."""
         with self._changed:
-            while (self._running or not self._queues) and not self._closed:
+            while (self._running or not len(self._queue)) and not self._closed:
                 if not self._changed.wait(self._window if self._expected > 1 else None):
                     self._expected = 1
             if self._closed:
                 return []
-            until = min(queue[0].arrival for queue in self._queues.values()) + self._window
+            until = min(waiting.arrival for waiting in self._queue) + self._window
             while (
                 len(self) < self._expected
                 and (rest := until - time.monotonic()) > 0
@@ -219,41 +235,54 @@ class Batcher(Generic[T, R]):
             ):
                 self._changed.wait(rest)
             batch = self._take()
-            self._running, self._expected = True, len(batch)
+            self._running = True
+            self._expected = len(batch)
             return batch
 
-    def _limits(self) -> tuple[int, int]:
-        """Limits of a batch's weight and of one peer's weight in it; the caller holds the lock."""
-        if self._parts is None or time.monotonic() >= self._several_until:
-            return self._size, self._size
-        room = self._parts.most if len(self._queues) <= self._parts.most else self._size
-        return room, max(1, room // max(1, len(self._queues)))
+    def _is_shared(self) -> bool:
+        """True if several peers share batches; the caller holds the lock."""
+        return self._parts is not None and time.monotonic() < self._several_until
+
+    def _room(self) -> int:
+        """Limit of a batch's weight; the caller holds the lock."""
+        if self._parts is None or not self._is_shared():
+            return self._size
+        peers = self._queue.peers
+        return next((size for size in self._parts.sizes if size >= peers), self._size)
+
+    def _share_of_batch(self, peer: Peer) -> int:
+        """Limit of a peer's weight in a batch: accounts share it, and the peers of an account."""
+        if not self._is_shared():
+            return self._size
+        of_account = max(1, self._room() // self._queue.accounts)
+        return max(1, of_account // self._queue.peers_of(peer.account))
 
     def _take(self) -> list[_Part[T, R]]:
         """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the
         lock.
         """
         batch: list[_Part[T, R]] = []
-        room, most = self._limits()
-        turns = collections.Counter[str]()
-        while waiting := [peer for peer in self._queues if turns[peer] < most]:
-            peer = waiting[0]  # the peer whose turn it is
-            queue = self._queues[peer]
-            first = queue[0]
+        is_shared = self._is_shared()
+        room = self._room()
+        shares = {peer: self._share_of_batch(peer) for peer in self._queue.in_turn()}
+        while room and (peer := self._next_peer(shares)):
+            first = self._queue.first(peer)
             weight = first.weight - first.taken
-            if most < self._size:
-                weight = min(weight, most - turns[peer], room)
-            if weight > room or not room:
+            if is_shared:
+                weight = min(weight, shares[peer], room)
+            if weight > room:
                 break
             batch.append(self._part(first, weight))
-            turns[peer] += weight
+            shares[peer] -= weight
             room -= weight
-            self._queues.move_to_end(peer)
+            self._queue.end_turn(peer)
             if first.taken == first.weight:
-                queue.popleft()
-            if not queue:
-                del self._queues[peer]
+                self._queue.pop(peer)
         return batch
+
+    def _next_peer(self, shares: Mapping[Peer, int]) -> Peer | None:
+        """Peer whose turn it is among those that have items and a rest of their share."""
+        return next((peer for peer in self._queue.in_turn() if shares[peer] > 0), None)
 
     def _part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
         """Takes a part of this weight from an item."""
@@ -266,10 +295,14 @@ class Batcher(Generic[T, R]):
     def _fail(self, waiting: _Waiting[T, R], error: Exception) -> None:
         """Resolves an item with an error, and drops its further parts."""
         with self._changed:
-            for peer, queue in self._queues.items():
-                if waiting in queue:
-                    queue.remove(waiting)
-                    if not queue:
-                        del self._queues[peer]
-                    break
-        waiting.future.set_exception(error)
+            self._queue.discard(waiting)
+        _resolve(waiting.future, error)
+
+
+def _resolve(future: "Future[R]", outcome: R | Exception) -> None:
+    """Resolves a future, unless its item lost its place meanwhile, which resolved it."""
+    with contextlib.suppress(InvalidStateError):
+        if isinstance(outcome, Exception):
+            future.set_exception(outcome)
+        else:
+            future.set_result(outcome)

@@ -18,7 +18,9 @@ from congrasp.services.ops.lifetime import Child, command, end_all
 
 
 @contextlib.contextmanager
-def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]]:
+def serving(
+    policy: pathlib.Path, log: pathlib.Path, certs: pathlib.Path | None = None
+) -> Iterator[tuple[str, int]]:
     """Context with a server of a policy file on this machine: yields its endpoint and process id.
 
     The server may still be compiling: a client's `metadata` waits for it.
@@ -26,10 +28,13 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
     Args:
       policy: the file.
       log: file for the server's output.
+      certs: folder of a server's certificate.
     """
     endpoint = local_url()
     shared = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # a GPU's memory, with this process
-    server = Child("server", command("serve", policy=policy, listen=endpoint), log, shared)
+    server = Child(
+        "server", command("serve", policy=policy, listen=endpoint, certs=certs), log, shared
+    )
     try:
         yield endpoint, server.start()
     finally:

@@ -12,12 +12,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError, LateError, OverloadedError, TransportError
+from congrasp.common.errors import (
+    CongraspError,
+    LateError,
+    OverloadedError,
+    StartingError,
+    TransportError,
+)
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
 from congrasp.common.transport.base import Transport
-from congrasp.common.transport.keys import Keys, account, below
+from congrasp.common.transport.keys import Keys, below
+from congrasp.common.transport.senders import sender
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.batching import Batcher, Parts
@@ -29,13 +36,11 @@ Source = Callable[[int], PolicyBundle | None]
 WINDOW = 0.001
 """Longest time that a query waits for others to join its batch, s."""
 DEPTH = 64
-"""Limit of queued queries; further ones are refused at once."""
+"""Limit of queued queries: in excess of it, the client with the most loses its newest."""
 SHARE = 16
 """Limit of queued queries of one peer."""
-SHARED = BATCH_SIZES[1]
-"""Limit of a batch's states while several peers share it: takes hardly longer than a single
-state.
-"""
+SHARED = BATCH_SIZES[1:]
+"""Limits of a batch's states while several peers share it, by their number."""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 
@@ -64,7 +69,7 @@ class PolicyServer:
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
     ):
-        """Loads the first policy, compiles, and starts serving.
+        """Loads the first policy, and compiles; meanwhile queries get a `StartingError`.
 
         Args:
           transport: endpoint of the server.
@@ -88,10 +93,12 @@ class PolicyServer:
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
-        self._seconds = self._function.warm_up(self._held.inference_parameters)
+        self._seconds: dict[int, float] = {}
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
+        self._ready = threading.Event()
+        self._began = time.monotonic()
         self._batcher: Batcher[Query, _Answered] = Batcher(
             self._infer,
             weigh=lambda query: len(query.vectors),
@@ -104,6 +111,8 @@ class PolicyServer:
         transport.serve(keys.health, self._describe)
         # One may infer while the other receives
         transport.serve(below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject)
+        self._seconds = self._function.warm_up(self._held.inference_parameters)
+        self._ready.set()
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
@@ -112,8 +121,11 @@ class PolicyServer:
         (`trouble`), as JSON.
 
         `queue_limit` and `peer_limit` bound the queued queries of all peers and of one.
-        `states_per_second` is the highest throughput, measured at the start.
+        `states_per_second` is the highest throughput, measured at the start. While the server
+        compiles, it is not ready, and `state` tells for how long.
         """
+        if not self._ready.is_set():
+            return {"ready": False, "state": f"compiling, {time.monotonic() - self._began:.0f} s"}
         held = self._held
         return {
             "ready": True,
@@ -134,9 +146,15 @@ class PolicyServer:
 
     def _describe(self, key: str, request: Message) -> Message:
         """The health, or the policy's metadata if the query requests them."""
-        return Message(
-            {}, self._function.metadata() if request.meta.get("metadata") else self.health()
-        )
+        if not request.meta.get("metadata"):
+            return Message({}, self.health())
+        self._check_ready()
+        return Message({}, self._function.metadata())
+
+    def _check_ready(self) -> None:
+        """Raises a `StartingError` until all programs are compiled."""
+        if not self._ready.is_set():
+            raise StartingError(f"The policy server is {self.health()['state']}.", "Wait for it.")
 
     def close(self) -> None:
         """Refuses queued queries, and stops following."""
@@ -147,8 +165,9 @@ class PolicyServer:
     def _reject(self, key: str) -> None:
         """Refuses a query for which the queue has no room, before decoding it."""
         began = time.monotonic()
+        self._check_ready()
         try:
-            self._batcher.check_room(account(key))
+            self._batcher.check_room(sender(key))
         except CongraspError as error:
             self._count(error, began)
             raise
@@ -159,7 +178,7 @@ class PolicyServer:
         try:
             query = self._function.layout.parse(request)
             timeout = self._deadline(request.meta.get("timeout", _TIMEOUT))
-            future = self._batcher.submit(query, timeout, peer=account(key))
+            future = self._batcher.submit(query, timeout, peer=sender(key))
         except CongraspError as error:
             self._count(error, began)
             raise

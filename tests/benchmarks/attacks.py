@@ -142,15 +142,25 @@ def _connecting(endpoint: str) -> float:
 
 def _long_query(client: PolicyClient, episode: Example) -> bytes:
     """The bytes of a query of 64 states."""
-    kept: list[Message] = []
+    return _recorded(client, episode, 64)
+
+
+def single_query(client: PolicyClient, episode: Example) -> bytes:
+    """The bytes of a query of one state."""
+    return _recorded(client, episode, 1)
+
+
+def _recorded(client: PolicyClient, episode: Example, states: int) -> bytes:
+    """The bytes of a client's query."""
+    queries: list[Message] = []
     ask = client._query
 
-    def keep(query: Message) -> Message:
-        kept.append(Message(query.arrays, {"timeout": 60.0, **query.meta}))
+    def record(query: Message) -> Message:
+        queries.append(Message(query.arrays, {"timeout": 60.0, **query.meta}))
         return ask(query)
 
-    client._query = keep  # type: ignore[method-assign]
+    client._query = record  # type: ignore[method-assign]
     client.reset(episode.request)
-    client.act_each([episode.state] * 64)
+    client.act_each([episode.state] * states)
     client._query = ask  # type: ignore[method-assign]
-    return encode(kept[-1])
+    return encode(queries[-1])

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError, LateError, OverloadedError
+from congrasp.common.transport.senders import Peer
 from congrasp.services.serve.batching import Batcher, Parts
 
 
@@ -67,15 +68,15 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
 def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
     batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
     futures = [running(batcher, gate)]
-    futures += [batcher.submit(i, 10.0, peer="greedy") for i in (1, 2, 3)]
+    futures += [batcher.submit(i, 10.0, peer=Peer("greedy")) for i in (1, 2, 3)]
     for refuse in (
-        lambda: batcher.submit(4, 10.0, peer="greedy"),
-        lambda: batcher.check_room("greedy"),
+        lambda: batcher.submit(4, 10.0, peer=Peer("greedy")),
+        lambda: batcher.check_room(Peer("greedy")),
     ):
         with pytest.raises(OverloadedError, match="Overloaded: 3 of your queries are queued"):
             refuse()
-    batcher.check_room("modest")
-    futures += [batcher.submit(i, 10.0, peer="modest") for i in (7, 8)]
+    batcher.check_room(Peer("modest"))
+    futures += [batcher.submit(i, 10.0, peer=Peer("modest")) for i in (7, 8)]
     gate.go.set()
     assert [future.result(10) for future in futures] == [0, 10, 20, 30, 70, 80]
     assert gate.batches == [[0], [1, 7], [2, 8], [3]]
@@ -99,7 +100,7 @@ class Letters(Gate):
 
     def batcher(self):
         parts = Parts(
-            4, lambda item, first, end: item[first:end], lambda item, results: "".join(results)
+            (4,), lambda item, first, end: item[first:end], lambda item, results: "".join(results)
         )
         return Batcher(self, size=8, window=0.0, depth=10, weigh=len, parts=parts)
 
@@ -108,10 +109,10 @@ class Letters(Gate):
         batcher, first = self.batcher(), Future()
         (peer, item), *rest = items
         threading.Thread(
-            target=lambda: first.set_result(batcher.submit(item, 10.0, peer)), daemon=True
+            target=lambda: first.set_result(batcher.submit(item, 10.0, Peer(peer))), daemon=True
         ).start()
         assert self.entered.acquire(timeout=10)
-        futures = [batcher.submit(item, 10.0, peer) for peer, item in rest]
+        futures = [batcher.submit(item, 10.0, Peer(peer)) for peer, item in rest]
         self.go.set()
         return [first.result(10), *futures], batcher
 

@@ -1,0 +1,62 @@
+"""Ctrl-C in a command, also where a callback of a library swallows its exception."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+LOOP = """
+import gc, signal, sys, time
+from congrasp.services.cli import main
+from congrasp.services.ops.interrupts import check_stopped
+
+def collect(phase, info):
+    if phase == "stop" and not collect.done:
+        collect.done = True
+        print("ready", flush=True)
+        ends = time.monotonic() + 60
+        while time.monotonic() < ends:
+            time.sleep(0.01)
+collect.done = False
+
+def swallow():
+    print("ready", flush=True)
+    try:
+        time.sleep(60)
+    except BaseException:
+        pass
+
+def work():
+    if KIND == "callback":
+        gc.callbacks.append(collect)
+        gc.collect()
+    elif KIND == "handler":
+        swallow()
+    else:
+        print("ready", flush=True)
+    while True:
+        if KIND == "handler":
+            check_stopped()
+        time.sleep(0.01)
+
+main.COMMANDS["loop"] = "a loop"
+main.load = lambda name: lambda rest: __import__("functools").partial(work)
+main.main(["loop"])
+"""
+
+
+@pytest.mark.parametrize("kind", ["plain", "callback", "handler"])
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
+)
+def test_command_ends_with_one_line(kind, number, code, word):
+    arguments = [sys.executable, "-c", f"KIND = {kind!r}\n{LOOP}"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        _, error = process.communicate(timeout=30)
+    assert process.returncode == code
+    (line,) = error.splitlines()
+    assert word in line
