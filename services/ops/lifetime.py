@@ -208,8 +208,9 @@ class Child:
         return causes.last_line(self._output()) or "its log is empty"
 
     def cause(self) -> str:
-        """The cause of its end by its log, or else the last line."""
-        return causes.cause_in(self._output()) or self.last_line()
+        """The cause of its end by its log, or else the last line, as a sentence."""
+        reason = causes.cause_in(self._output()) or self.last_line()
+        return f"{reason.rstrip('. ')}."
 
     def death(self) -> str:
         """Its end in a sentence: the signal that killed it or its exit code, and the cause."""
@@ -217,7 +218,7 @@ class Child:
         return causes.end_of(self.name, self.code or 0, self._output(), kernel_killed=kernel_killed)
 
     def _output(self) -> str:
-        """What it has written to its log since it started, or the end of it."""
+        """Its log since it started, or the end of it."""
         return causes.read_end(self.log, self.begun)
 
 

@@ -320,7 +320,7 @@ def _connect(
                 break
     if stop.is_set():
         return None
-    raise ProcessDied(f"The learner did not start: {learner.cause().rstrip('. ')}.", learner.log)
+    raise ProcessDied(f"The learner did not start: {learner.cause()}", learner.log)
 
 
 def _supervise(
