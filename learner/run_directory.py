@@ -225,8 +225,9 @@ def continue_run(
     """
     before = open_run(run_dir)
     restart = f"Start another run with --initial {run_dir / POLICY_FILE}."
+    restore = f"Restore it, or start another run with --initial {run_dir / POLICY_FILE}."
     config = named_inputs.with_absolute_paths(config)
-    inputs = _continued_inputs(before, config, f"Restore it. {restart}")
+    inputs = _continued_inputs(before, config, restore)
     if initial is not None:
         _check_initial(run_dir, before, initial)
     earlier = named_inputs.with_absolute_paths(before)

@@ -109,6 +109,8 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     """
     folder = run_dir / AUDIT
     learners = sorted(folder.glob("learner-*.jsonl"))
+    if not run_dir.is_dir():
+        raise CongraspError(f"There is no folder {run_dir}.", "Pass the folder of a run.")
     if not learners:
         raise CongraspError(
             f"There is no journal of a learner in {folder}.",
