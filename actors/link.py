@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.io.journal import Journal
 from congrasp.common.transport.base import Closing, Transport
-from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.keys import Keys, check_name
 from congrasp.common.wire.codec import Message, SharedMessage, checksum
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
@@ -29,11 +29,10 @@ Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # slowest link that is waited for, bytes/s
 _LONGEST_TICK = 1.0  # s
-# Silence after which a line is logged, and time between two lines, s
-_NOTICED, _NOTICE_AGAIN = (
-    5.0,
-    60.0,
-)
+_NOTICED = 2.0
+"""Silence after which a line is logged, s."""
+_NOTICE_AGAIN = 60.0
+"""Time between two lines, s."""
 _log = logging.getLogger(__name__)
 
 
@@ -81,9 +80,8 @@ class Patience:
             ) from None
         if silence > _NOTICED and now - self._noticed > _NOTICE_AGAIN:
             self._noticed = now
-            _log.warning(
-                "The learner does not answer; waiting for up to %g s: %s", self.limit, error
-            )
+            limit = "" if math.isinf(self.limit) else f" for up to {self.limit:g} s"
+            _log.warning("The learner does not answer; waiting%s: %s", limit, error)
 
 
 class _Upload(NamedTuple):
@@ -98,12 +96,13 @@ class Uploads:
 
     Attributes:
       failure: the reason why sending has stopped, if it has; also set by the owner.
+      journal: records the outcome of each rollout, if the owner sets it.
       free: acquired by the owner for each queued rollout; released when that rollout has its
         outcome.
       closed: set once sending has been stopped.
     """
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         transport: Transport,
         key: str,
@@ -113,7 +112,6 @@ class Uploads:
         max_refusals: int,
         request_timeout: float,
         patience: Patience,
-        journal: Journal | None,
     ):
         """Starts the threads.
 
@@ -125,14 +123,13 @@ class Uploads:
           max_refusals: consecutive refused rollouts after which sending stops.
           request_timeout: deadline of a query in seconds, extended by the rollout's size.
           patience: limit of the learner's silence.
-          journal: records the outcome of each rollout.
         """
         self.failure: CongraspError | None = None
+        self.journal: Journal | None = None
         self.free = threading.Semaphore(window)
         self.closed = threading.Event()
         self._transport, self._key, self._on_reply = transport, key, on_reply
         self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
-        self._journal = journal
         self._refusals = 0
         self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
@@ -212,14 +209,14 @@ class Uploads:
                 if self.failure:
                     raise self.failure
                 outcome = reply.meta["outcome"]
-                if outcome != "retry" and self._journal is not None:
+                if outcome != "retry" and self.journal is not None:
                     who = {name: message.meta[name] for name in ("actor", "incarnation")}
                     answer = {
                         "answer": message.meta["sequence"],
                         "outcome": outcome,
                         "session_id": reply.meta["session_id"],
                     }
-                    self._journal.write(**who, **answer)
+                    self.journal.write(**who, **answer)
                 if outcome == "refused":
                     return self._refused(str(reply.meta["why"]))
                 if outcome != "retry":
@@ -249,6 +246,10 @@ def backoff() -> "itertools.chain[float]":
 
 
 _POLL = 0.2
+_CONFIG_SECONDS = 1.0
+"""Deadline of a request for the configuration, after which a stop is noticed, s."""
+OpenJournal = Callable[[str], Journal | None]
+"""run id -> the journal of this actor's rollouts in that run; None for none."""
 
 
 class RunRestarted(CongraspError):
@@ -293,7 +294,7 @@ class ActorLink(Closing):
         max_refusals: int = 5,
         request_timeout: float = 10.0,
         patience: float = 300.0,
-        journal: Journal | None = None,
+        journal: OpenJournal | None = None,
     ):
         """Announces the actor.
 
@@ -305,7 +306,7 @@ class ActorLink(Closing):
           max_refusals: consecutive refused rollouts after which the link fails.
           request_timeout: deadline of a request in seconds, extended by the size of a rollout.
           patience: seconds without a reply after which the link fails.
-          journal: records every rollout and its outcome; the caller closes it.
+          journal: opens the record of every rollout and its outcome, once the run is known.
         """
         self.keys = Keys(run)
         self.actor = actor
@@ -324,7 +325,8 @@ class ActorLink(Closing):
         self._answered = self._patience.now()
         self._wanted = secrets.token_hex(8)  # the next ticket's id, kept until it is granted
         self._sequence = itertools.count()
-        self._journal = journal
+        self._open_journal = journal
+        self._journal: Journal | None = None
         self._news = threading.Event()
         self._uploads = Uploads(
             transport,
@@ -334,16 +336,14 @@ class ActorLink(Closing):
             max_refusals=max_refusals,
             request_timeout=request_timeout,
             patience=self._patience,
-            journal=journal,
         )
         self._closed = self._uploads.closed
-        self._write()
         self._announcements = transport.subscribe(self.keys.announcement, depth=1)
         transport.declare_alive(self.keys.alive("actor", actor, self.incarnation))
         threading.Thread(target=self._follow, daemon=True, name="announcements").start()
 
     def config(self, timeout: float) -> RunInfo:
-        """Reads the run's configuration, and follows this run from now on.
+        """Reads the run's configuration, opens the journal of the run, and follows it from now on.
 
         Raises:
           TransportError: the learner did not answer within `timeout` seconds.
@@ -352,8 +352,28 @@ class ActorLink(Closing):
         config, run_id, schema = (str(reply.meta[name]) for name in ("config", "run_id", "schema"))
         self._info = RunInfo(config, run_id, schema, tuple(reply.meta["arrays"]))
         self._note(reply.meta)
+        if self._open_journal is not None and self._journal is None:
+            self._journal = self._open_journal(check_name("run", run_id))
+            self._uploads.journal = self._journal
+            self._write()
         self._uploads.start_over()
         return self._info
+
+    def wait_for_config(self, stop: threading.Event) -> RunInfo | None:
+        """Reads the run's configuration as soon as the learner answers; returns None if stopped.
+
+        Raises:
+          TransportError: the learner has been silent for too long.
+          RefusedError: it refuses this actor.
+        """
+        while not stop.is_set():
+            try:
+                return self.config(_CONFIG_SECONDS)
+            except RefusedError:
+                raise
+            except TransportError as error:
+                self._patience.check(self._answered, error)
+        return None
 
     def acquire_ticket(self, timeout: float) -> Ticket | None:
         """Waits for permission to produce a rollout; returns None if there is none within `timeout`

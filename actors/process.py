@@ -14,7 +14,14 @@ import numpy as np
 from congrasp.actors.env import EnvState, episode_fields
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import save_references, with_kept_references
-from congrasp.actors.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
+from congrasp.actors.link import (
+    ActorLink,
+    OpenJournal,
+    RunFinished,
+    RunInfo,
+    RunRestarted,
+    Ticket,
+)
 from congrasp.actors.physics import make_physics, prepare_physics
 from congrasp.actors.rollout import Rollout, Trace, finished_episodes
 from congrasp.actors.training_set import FailureWeights, TrainingSet, training_set
@@ -22,7 +29,7 @@ from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.io.journal import Journal
+from congrasp.common.named_inputs import COPY, OF_ACTORS, check_inputs
 from congrasp.common.policy.bundle import PolicyBundle, acting, policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import stage
@@ -106,6 +113,8 @@ def _begun(state: EnvState, trace: Trace, first: int) -> Followed:
     )
 
 
+COMPLETE = "the run is complete"
+STOPPED = "stopped"
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
 _SAVE_SECONDS = 60.0
@@ -122,9 +131,9 @@ def run_actor(  # noqa: PLR0913
     threads: int = 1,
     patience: float = 60.0,
     on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
-    journal: Journal | None = None,
+    journal: OpenJournal | None = None,
     references: pathlib.Path | None = None,
-) -> None:
+) -> str:
     """Acts for the learner of `run` until it ends or `stop` is set.
 
     Args:
@@ -135,30 +144,40 @@ def run_actor(  # noqa: PLR0913
       stop: ends the actor between two rollouts.
       physics: engine; that of the run by default.
       threads: threads of the `native` engine.
-      patience: seconds without a learner after which the actor gives up.
+      patience: seconds without a learner after which the actor gives up; infinite waits without
+        end.
       on_rollout: called with the metrics of every rollout, including its version.
       journal: see `ActorLink`.
       references: file that preserves the reference poses from the policy's grasps across restarts.
 
+    Returns:
+      The reason of the end, as a phrase: `COMPLETE` or `STOPPED`.
+
     Raises:
-      CongraspError: the learner is gone, or refuses this actor's rollouts.
+      CongraspError: the learner is gone, or refuses this actor's rollouts; or a file or folder that
+        the run names is missing here or has another content.
     """
     while not stop.is_set():
         with ActorLink(transport, run, actor, patience=patience, journal=journal) as link:
             try:
-                info = link.config(patience)
+                info = link.wait_for_config(stop)
+                if info is None:
+                    break
                 config = run_config_from_json(info.config)
+                check_inputs(config.inputs, OF_ACTORS, COPY)
                 engine = physics or config.physics
-                _Actor(config, info, link, transport, engine, threads, on_rollout, references).act(
-                    stop
+                worker = _Actor(
+                    config, info, link, transport, engine, threads, on_rollout, references
                 )
+                worker.act(stop)
                 link.flush(_FLUSH_SECONDS)
-                return
+                break
             except RunFinished:
                 link.flush(_FLUSH_SECONDS)
-                return
+                return COMPLETE
             except RunRestarted:
                 continue
+    return STOPPED
 
 
 def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:

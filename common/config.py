@@ -231,6 +231,18 @@ class CurriculumConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class NamedInput:
+    """A file or folder that a run names, and its content (`common.named_inputs`)."""
+
+    kind: str
+    """One of `common.named_inputs.KINDS`."""
+    path: str
+    """Absolute path on the learner's machine."""
+    digest: str
+    """Sixteen hex digits of the SHA-256 of its content."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RunConfig:
     """One training run."""
 
@@ -283,6 +295,8 @@ class RunConfig:
     """The algorithm's hyperparameters."""
     distill: DistillConfig = DistillConfig()
     """Hyperparameters of distillation."""
+    inputs: tuple[NamedInput, ...] = dataclasses.field(default=(), metadata={"option": False})
+    """Content of the files and folders that the run names; written by the learner."""
 
 
 def to_json(config: Any) -> str:

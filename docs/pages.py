@@ -264,6 +264,8 @@ def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, 
     """Yields name, default and meaning of every field; nested dataclasses follow a dot."""
     meanings = _meanings(type(config))
     for field in dataclasses.fields(config):
+        if not field.metadata.get("option", True):
+            continue
         value, name = getattr(config, field.name), f"{prefix}{field.name}".replace("_", "-")
         if dataclasses.is_dataclass(value):
             yield from _fields(value, f"{prefix}{field.name}.")

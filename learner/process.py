@@ -15,7 +15,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -83,6 +83,7 @@ def run_learner(  # noqa: PLR0913
     resume: bool = False,
     ranks: Ranks | None = None,
     audit: bool = True,
+    on_host: bool = True,
     recorder: contextlib.AbstractContextManager[object] | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Notify = lambda level, text: None,
@@ -101,8 +102,9 @@ def run_learner(  # noqa: PLR0913
       resume: resumes from the newest intact checkpoint (of rank 0), which may come from any number
         of ranks.
       ranks: processes of the learner, if there are several.
-      audit: writes the journal in `audit/` and, if configured, accepted rollouts in `accepted/`.
-        Both need rollouts on the host, not on a device.
+      audit: writes the journal in `audit/`, if rollouts are on the host.
+      on_host: rollouts are on the host, not on a device: accepted ones are written to `accepted/`,
+        if configured.
       recorder: context entered while the learner runs, for example to write the run's logs.
       on_update: called with the metrics of every update.
       on_event: called with level and text of every event.
@@ -125,8 +127,9 @@ def run_learner(  # noqa: PLR0913
                 )
             deaths = stack.enter_context(_watch_threads())
             stack.enter_context(recorder or contextlib.nullcontext())
+            records = _Records(audit and on_host, on_host)
             learner = _Learner(
-                run_dir, config, transport, ranks, resume, audit, on_event, check_lock
+                run_dir, config, transport, ranks, resume, records, on_event, check_lock
             )
             try:
                 learner.train(stop_event, deaths, on_update)
@@ -160,6 +163,15 @@ def _watch_threads() -> Iterator[list[str]]:
         threading.excepthook = previous
 
 
+class _Records(NamedTuple):
+    """Records of rollouts in the run's directory."""
+
+    journal: bool
+    """The outcome of every rollout."""
+    accepted: bool
+    """Accepted rollouts that no checkpoint holds yet."""
+
+
 class _Learner:
     """State of one run between two updates."""
 
@@ -170,7 +182,7 @@ class _Learner:
         transport: Transport,
         ranks: Ranks,
         resume: bool,
-        audit: bool,
+        records: "_Records",
         on_event: Notify,
         check_lock: Callable[[], None],
     ):
@@ -211,9 +223,9 @@ class _Learner:
             StalenessManager(staleness, config.rollouts_per_update),
             events,
             durable=_durable(hubs, ranks.rank),
-            audit=AuditLog(run_dir, name, log_error) if audit else None,
+            audit=AuditLog(run_dir, name, log_error) if records.journal else None,
             log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error)
-            if audit
+            if records.accepted
             else None,
         )
         self._hub = LearnerHub(

@@ -21,7 +21,8 @@ import shlex
 from collections.abc import Callable, Iterator
 from typing import BinaryIO
 
-from congrasp.common.config import RunConfig, run_config_from_json, to_json
+from congrasp.common import named_inputs
+from congrasp.common.config import NamedInput, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.claims import Claim
 from congrasp.common.io.files import write_atomically
@@ -285,30 +286,68 @@ def _remains(run_dir: pathlib.Path) -> list[pathlib.Path]:
     return sorted(found) + [path for path in [run_dir / POLICY_FILE] if path.exists()]
 
 
-def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
-    """Stores the configuration with which a run continues.
+def continue_run(
+    run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None = None
+) -> RunConfig:
+    """Stores the configuration with which a run continues, and returns it.
+
+    Objects, constraint sets and teacher may have moved, but have the content that they had when the
+    run began.
 
     Args:
       run_dir: directory of the run.
       config: that of `open_run`, with changed settings.
+      initial: initial policy named on the command line, which must be that of the run.
 
     Raises:
-      CongraspError: a setting differs that may not, this is not a run directory, or a learner is
-        using it.
+      CongraspError: a setting differs that may not, as does the content of a file or folder that
+        the run names, this is not a run directory, or a learner is using it.
     """
     before = open_run(run_dir)
     check_config(run_dir, _kept_checksum(run_dir))
+    restart = f"Start another run with --initial {run_dir / POLICY_FILE}."
+    restore = f"Restore it, or start another run with --initial {run_dir / POLICY_FILE}."
+    config = named_inputs.with_absolute_paths(config)
+    inputs = _continued_inputs(before, config, restore)
+    if initial is not None:
+        _check_initial(run_dir, before, initial)
+    earlier = named_inputs.with_absolute_paths(before)
+    comparable = named_inputs.with_paths_of(config, earlier) if before.inputs else config
     for field in dataclasses.fields(config):
-        if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(
-            before, field.name
-        ):
-            raise CongraspError(
-                f"A run cannot change '{field.name}' when it is resumed.",
-                f"Start another run with --initial {run_dir / POLICY_FILE}.",
-            )
+        if field.name in (*CHANGEABLE, "inputs"):
+            continue
+        if getattr(comparable, field.name) != getattr(earlier, field.name):
+            raise CongraspError(f"A run cannot change '{field.name}' when it is resumed.", restart)
+    config = dataclasses.replace(config, inputs=inputs)
     with exclusive(run_dir):
         if config != before:
             store_config(run_dir, config)
+    return config
+
+
+def _continued_inputs(before: RunConfig, config: RunConfig, remedy: str) -> tuple[NamedInput, ...]:
+    """Checks the content of what a run names, and returns its records with the current paths."""
+    if not before.inputs:  # of an earlier version of congrasp, or nothing is named
+        return named_inputs.identified(config).inputs
+    paths = named_inputs.paths_of(config)
+    inputs: list[NamedInput] = []
+    for each in before.inputs:
+        path = paths.get(each.kind)
+        if path is not None:
+            named_inputs.check_input(each, path, remedy)
+            each = dataclasses.replace(each, path=str(path))
+        inputs.append(each)
+    return tuple(inputs)
+
+
+def _check_initial(run_dir: pathlib.Path, before: RunConfig, initial: pathlib.Path) -> None:
+    """Raises a CongraspError if a run did not begin with this policy."""
+    remedy = "Leave out --initial, or pass it to a new run in another --run-dir."
+    records = [each for each in before.inputs if each.kind == named_inputs.INITIAL]
+    for each in records:
+        named_inputs.check_input(each, initial, remedy)
+    if not records and not (run_dir / INITIAL_FILE).exists():
+        raise CongraspError(f"{run_dir} did not begin with the policy {initial}.", remedy)
 
 
 def _kept_checksum(run_dir: pathlib.Path) -> str:

@@ -125,12 +125,17 @@ def save(path, content):
 
 def run_actor(folder, endpoint, *, name, steps=FORM.steps, pause=0.0, request_timeout=3.0):
     """Makes rollouts until the run is finished; writes each outcome down."""
-    journal = Journal(folder / AUDIT / f"{name}.jsonl")
+    path = folder / AUDIT / f"{name}.jsonl"
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
         urls.connect(endpoint, "actor") as transport,
         ActorLink(
-            transport, "chaos", name, window=2, request_timeout=request_timeout, journal=journal
+            transport,
+            "chaos",
+            name,
+            window=2,
+            request_timeout=request_timeout,
+            journal=lambda run_id: Journal(path),
         ) as link,
     ):
         with contextlib.suppress(RunFinished):

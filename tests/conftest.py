@@ -9,6 +9,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["XDG_CONFIG_HOME"] = os.path.join(
     tempfile.gettempdir(), "congrasp-tests-without-configuration"
 )
+os.environ["XDG_STATE_HOME"] = os.path.join(tempfile.gettempdir(), "congrasp-tests-state")
 # Every compiled program is kept, so that neither the other modules nor the processes that tests
 # start compile it again.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -7,16 +7,20 @@ journal. Lines that were cut or changed are skipped when reading, and counted, a
 lines are missing, be it at the end.
 """
 
+import contextlib
 import json
 import pathlib
 import re
+import shutil
 import threading
+import time
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from congrasp.common.errors import os_errors_as
-from congrasp.common.io.inputs import open_file
+from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.files import user_folder
+from congrasp.common.io.inputs import file_name, open_file
 from congrasp.common.io.journal_end import EndWriter, JournalEnd, read_end
 from congrasp.common.io.opening import open_to_append
 
@@ -26,6 +30,7 @@ MAX_NUMBER = 1 << 53
 """Exclusive bound of the integers in a journal, since JSON readers do not represent larger ones
 exactly.
 """
+_KEPT_SECONDS = 30 * 86400.0
 _CHECK = ', "crc32": "{}"}}\n'
 _CHECK_BYTES = len(_CHECK.format("00000000"))
 _END = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
@@ -84,6 +89,48 @@ class Journal:
         with self._lock:
             self._file.close()
             self._end.close()
+
+
+def user_journals(run_id: str) -> pathlib.Path:
+    """Folder of the journals that actors of this user write on this machine for a run."""
+    state = user_folder("XDG_STATE_HOME", ".local/state")
+    return state / "congrasp" / AUDIT / file_name(run_id, "a run")
+
+
+def user_journal(
+    run_id: str, actor: str, warn: Callable[[str], None] = lambda text: None
+) -> Journal | None:
+    """Opens an actor's journal in the user's folder, and removes those of runs that have not been
+    written for 30 days.
+
+    Args:
+      run_id: identifies the training.
+      actor: name of the actor.
+      warn: called with one line when the journal or a line of it cannot be written.
+
+    Returns:
+      The journal; None if it cannot be opened, for instance without a home.
+    """
+    folder = user_journals(run_id)
+    try:
+        journal = Journal(folder / f"{file_name(actor, 'an actor')}.jsonl", warn)
+    except CongraspError as error:
+        warn(f"{error} This actor writes no journal; set XDG_STATE_HOME, or pass --audit FILE.")
+        return None
+    with contextlib.suppress(OSError):
+        _remove_old(folder.parent)
+    return journal
+
+
+def _remove_old(folder: pathlib.Path) -> None:
+    """Removes the folders of runs whose journals have not been written for `_KEPT_SECONDS`."""
+    oldest = time.time() - _KEPT_SECONDS
+    for run in folder.iterdir():
+        if run.is_symlink() or not run.is_dir():
+            continue
+        written = [path.stat().st_mtime for path in run.iterdir()]
+        if max(written, default=run.stat().st_mtime) < oldest:
+            shutil.rmtree(run, ignore_errors=True)
 
 
 class JournalLines(NamedTuple):

@@ -10,6 +10,7 @@ import multiprocessing.connection
 import multiprocessing.spawn
 import os
 import pathlib
+import re
 import select
 import signal
 import subprocess
@@ -65,6 +66,15 @@ def memory() -> int:
             ]
         ),
     )
+
+
+def memory_kills() -> int:
+    """Number of processes that the kernel has killed for lack of memory in this control group and
+    those above it.
+    """
+    counters = _limits("memory", "memory.events", "memory.oom_control")
+    counts = [re.search(r"\boom_kill (\d+)", text) for text in counters]
+    return sum(int(count[1]) for count in counts if count)
 
 
 def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:

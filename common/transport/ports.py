@@ -1,6 +1,7 @@
 """TCP ports: defaults of the roles, neighbouring ports, and free ports of this machine."""
 
 import contextlib
+import errno
 import functools
 import logging
 import os
@@ -24,7 +25,9 @@ _LOWEST, _COUNT = 15000, 15000
 """First port for free ports: below the system's range for outgoing connections (from 32768 on
 Linux), which cannot take them."""
 _ATTEMPTS = 1000
-_lock, _reserved = threading.Lock(), set[int]()
+_LAST_PORT = 65535
+_lock = threading.Lock()
+_reserved: set[int] = set()
 _log = logging.getLogger(__name__)
 
 
@@ -35,9 +38,76 @@ def shifted(url: str, offset: int) -> str:
       CongraspError: the URL has no port, or the resulting port does not exist.
     """
     match = _URL.fullmatch(url)
-    if not match or not 0 < int(match["port"]) + offset < 1 << 16:
+    if not match or not 0 < int(match["port"]) <= _LAST_PORT:
         raise CongraspError(f"'{url}' is not an endpoint.", f"Write it like {LEARNER_URL}.")
-    return f"{match['address']}:{int(match['port']) + offset}{match['rest'] or ''}"
+    scheme, _, host = match["address"].partition("/")
+    if ":" in host and not host.startswith("["):
+        raise CongraspError(
+            f"'{url}' has an IPv6 address without brackets.",
+            f"Write it like {scheme}/[{host}]:{match['port']}.",
+        )
+    port = int(match["port"]) + offset
+    if port > _LAST_PORT:
+        raise CongraspError(
+            f"'{url}' leaves no room for the four ports that a learner takes from this one on.",
+            f"Pass a port up to {_LAST_PORT - len(FLOWS) + 1}; each further rank takes four more.",
+        )
+    return f"{match['address']}:{port}{match['rest'] or ''}"
+
+
+def host_of(url: str) -> tuple[str, int] | None:
+    """Returns host and port of a URL, without the brackets of an IPv6 address; None for others."""
+    match = _URL.fullmatch(url)
+    if match is None:
+        return None
+    host = match["address"].partition("/")[2]
+    return host.strip("[]"), int(match["port"])
+
+
+def check_ports(url: str, count: int = len(FLOWS)) -> None:
+    """Checks that a listener can take its ports on this machine.
+
+    Args:
+      url: address of the listener.
+      count: number of its ports, from the URL's on.
+
+    Raises:
+      CongraspError: the URL is malformed, a port is in use, or the address is not of this machine.
+    """
+    shifted(url, count - 1)
+    address = host_of(url)
+    if address is None:
+        return
+    host, first = address
+    for port in range(first, first + count):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise port_in_use(url, port) from None
+                reason = error.strerror or str(error)
+                raise CongraspError(
+                    f"Cannot listen at {url}: {reason}.", "Pass an address of this machine."
+                ) from None
+
+
+def port_in_use(url: str, port: int | None = None) -> CongraspError:
+    """Error for a port of a listener that another process has.
+
+    Args:
+      url: address of the listener.
+      port: the port, if it is known.
+    """
+    flows = ", ".join(FLOWS)
+    which = f"Port {port} of {url}" if port else f"The port of {url}"
+    return CongraspError(
+        f"{which} is in use.",
+        f"Stop the process that listens there, or pass another one with --listen: a learner takes "
+        f"four ports from it on ({flows}).",
+    )
 
 
 def rank_url(url: str, rank: int) -> str:

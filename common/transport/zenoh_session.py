@@ -16,6 +16,7 @@ import logging
 import os
 import re
 import resource
+import socket
 import struct
 import threading
 import time
@@ -28,7 +29,8 @@ import zenoh
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.runtime import forks
 from congrasp.common.transport.base import Subscription, join
-from congrasp.common.transport.keys import FLOWS, Flow
+from congrasp.common.transport.keys import Flow
+from congrasp.common.transport.ports import host_of, port_in_use
 from congrasp.common.transport.security import Credentials, limits, refusal
 from congrasp.common.wire.codec import Message, decode
 
@@ -164,12 +166,7 @@ def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
     except zenoh.ZError as error:
         where = ", ".join(endpoints)
         if "in use" in str(error):
-            raise CongraspError(
-                f"The port of {where} is in use.",
-                f"Stop the process that listens there, or use another port ({', '.join(FLOWS)} "
-                f"take one each, in "
-                "this order).",
-            ) from None
+            raise port_in_use(where) from None
         raise CongraspError(f"Cannot listen on {where}: {first_line(error)}.") from None
 
 
@@ -183,10 +180,12 @@ def connect(
     """Opens a connected session.
 
     Raises:
-      TransportError: there is no response before the deadline.
+      TransportError: there is no response before the deadline, or a host name is unknown.
       CongraspError: the listener rejects our certificate, or its certificate does not allow it to
         listen for this run.
     """
+    for endpoint in endpoints:
+        _check_host(endpoint)
     while True:
         try:
             session = _open(config)
@@ -219,6 +218,24 @@ def _open(config: zenoh.Config) -> zenoh.Session:
     """Opens a session, and with the first one Zenoh's threads."""
     forks.note_started("Zenoh")
     return zenoh.open(config)
+
+
+def _check_host(endpoint: str) -> None:
+    """Raises a `TransportError` if the name of an endpoint's host cannot be resolved, on which
+    Zenoh would wait in silence.
+    """
+    address = host_of(endpoint)
+    if address is None:
+        return
+    host, port = address
+    try:
+        socket.getaddrinfo(host, port)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise TransportError(
+            f"The host name '{host}' of {endpoint} cannot be resolved: {reason}.",
+            "Correct the name, or pass the host's address.",
+        ) from None
 
 
 def first_line(error: Exception) -> str:

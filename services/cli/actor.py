@@ -1,20 +1,27 @@
 """`congrasp actor`: one actor."""
 
 import dataclasses
+import math
 import pathlib
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from congrasp.actors.physics import PhysicsName
-from congrasp.common.io.journal import Journal
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.journal import Journal, user_journal
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import process_name
 from congrasp.common.transport.ports import LEARNER_URL
-from congrasp.services.ops.lifetime import on_signal
-from congrasp.services.ops.logs import Watch, announced, log
+from congrasp.services.ops.lifetime import Stop, on_signal
+from congrasp.services.ops.logs import Watch, log
 from congrasp.services.ops.metrics import ActorMetrics
+from congrasp.services.ops.waiting import connect_when_up
+
+if TYPE_CHECKING:
+    from congrasp.actors.link import OpenJournal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +44,13 @@ class Actor:
     """Engine; auto takes warp on an NVIDIA GPU and native on a CPU."""
     threads: int = 0
     """Threads of the native engine; 0 uses all cores."""
-    patience: float = 60.0
-    """Seconds without a learner after which the actor gives up."""
+    patience: float | None = None
+    """Seconds without a learner after which the actor gives up; by default it waits without end."""
     audit: pathlib.Path | None = None
-    """Journal of every rollout and the learner's reply, for 'congrasp audit'; none by default."""
+    """Journal of every rollout and the learner's reply, for 'congrasp audit'; by default in
+    ~/.local/state/congrasp/audit, where that command finds it on this machine."""
+    no_audit: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write no journal."""
     references: pathlib.Path | None = None
     """File that preserves the reference poses from the policy's grasps for the next start."""
     watch: Watch = Watch()  # noqa: RUF009
@@ -52,13 +62,40 @@ class Actor:
 
     def __call__(self) -> int:
         """Acts until the run ends or a signal comes."""
-        from congrasp.actors.process import run_actor
-        from congrasp.common.runtime.stages import imported, since_start
+        from congrasp.common.runtime.stages import since_start
 
-        name, metrics = (
-            urls.name_on_wire(self.id or process_name("actor"), self.certs),
-            ActorMetrics(),
-        )
+        if self.no_audit and self.audit is not None:
+            raise CongraspError(
+                f"--audit {self.audit} contradicts --no-audit.", "Leave out one of them."
+            )
+        name = urls.name_on_wire(self.id or process_name("actor"), self.certs)
+        metrics = ActorMetrics()
+        with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
+            ready = since_start()
+            transport = connect_when_up(
+                self.connect,
+                "actor",
+                certs=self.certs,
+                run=self.run,
+                patience=self.patience,
+                stop=stop,
+            )
+            reason = "stopped"
+            if transport is not None:
+                with transport:
+                    log("info", f"Connected to the learner at {self.connect}.")
+                    reason = self._act(transport, name, metrics, stop, ready)
+            if stop.is_set():
+                reason = stop.reason
+            log("info", f"The actor ends: {reason}.")
+            return stop.exit_code
+
+    def _act(
+        self, transport: Transport, name: str, metrics: ActorMetrics, stop: Stop, ready: float
+    ) -> str:
+        """Acts over a connected transport; returns the reason of the end."""
+        from congrasp.actors.process import run_actor
+        from congrasp.common.runtime.stages import imported
 
         def report(values: dict[str, float]) -> None:
             metrics.rollout(values)
@@ -68,31 +105,32 @@ class Actor:
                 values,
             )
 
-        with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
-            ready = since_start()
-            with announced(f"Waiting up to {self.patience:g} s for the learner at {self.connect}"):
-                transport = urls.connect(
-                    self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run
-                )
-            with transport:
-                log("info", f"Connected to the learner at {self.connect}.")
-                imported(ready)
-                journal = (
-                    Journal(self.audit, lambda text: log("error", text)) if self.audit else None
-                )
-                run_actor(
-                    transport,
-                    run=self.run,
-                    actor=name,
-                    stop=stop,
-                    physics=self.physics,
-                    threads=self.threads or cores(),
-                    patience=self.patience,
-                    on_rollout=report,
-                    journal=journal,
-                    references=self.references,
-                )
-            return stop.exit_code
+        imported(ready)
+        return run_actor(
+            transport,
+            run=self.run,
+            actor=name,
+            stop=stop,
+            physics=self.physics,
+            threads=self.threads or cores(),
+            patience=math.inf if self.patience is None else self.patience,
+            on_rollout=report,
+            journal=None if self.no_audit else self._journal_of(name),
+            references=self.references,
+        )
+
+    def _journal_of(self, name: str) -> "OpenJournal":
+        """Opens the journal named by --audit, or else that of the user's folder."""
+
+        def warn(text: str) -> None:
+            log("error", text)
+
+        def opened(run_id: str) -> Journal | None:
+            if self.audit is not None:
+                return Journal(self.audit, warn)
+            return user_journal(run_id, name, warn)
+
+        return opened
 
 
 COMMAND = Actor

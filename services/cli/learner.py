@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import pathlib
+import shlex
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
@@ -10,7 +11,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
-from congrasp.services.ops.lifetime import on_signal
+from congrasp.services.ops.lifetime import Stop, command, on_signal
 from congrasp.services.ops.logs import Watch, log, log_error, logging_as
 from congrasp.services.train.presets import with_hand
 
@@ -66,26 +67,37 @@ class Options:
     """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files
     there, for `wandb sync`), wandb (needs an account); without a name, none."""
 
-    def prepare(self, config: RunConfig) -> None:
-        """Creates the directory of the run, or stores the configuration with which it continues."""
-        from congrasp.common.policy import bundle as bundles
-        from congrasp.learner.run_directory import (
-            CONFIG_FILE,
-            continue_run,
-            create_run,
-            initial_notes,
-        )
+    audit: bool = True
+    """Journal of all rollouts in the run's folder, for 'congrasp audit'."""
 
-        if self.resume or (self.or_resume and (self.run_dir / CONFIG_FILE).exists()):
-            continue_run(self.run_dir, config)
-            return
+    @property
+    def resumes(self) -> bool:
+        """True if the run in --run-dir continues."""
+        from congrasp.learner.run_directory import CONFIG_FILE
+
+        return self.resume or (self.or_resume and (self.run_dir / CONFIG_FILE).exists())
+
+    def prepare(self, config: RunConfig) -> RunConfig:
+        """Creates the directory of the run, or stores the configuration with which it continues;
+        returns the configuration.
+        """
+        from congrasp.common.named_inputs import identified
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.learner.run_directory import continue_run, create_run, initial_notes
+        from congrasp.services.train.start import check_config
+
+        if self.resumes:
+            return continue_run(self.run_dir, config, self.initial)
+        check_config(config)
+        config = identified(config, self.initial)
         if self.initial is None:
             create_run(self.run_dir, config)
-            return
+            return config
         initial = bundles.load(self.initial)
         create_run(self.run_dir, config, initial)
         for note in initial_notes(initial, config, self.initial):
             log("info", note)
+        return config
 
 
 def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
@@ -104,53 +116,78 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
+    from congrasp.common.named_inputs import COPY, OF_LEARNERS, check_inputs
     from congrasp.common.runtime.stages import imported
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
     from congrasp.services.train.learn import learn, longest_rollout
+    from congrasp.services.train.start import Folder, removed_without_checkpoint
 
-    run_dir, rank, config = options.run_dir, options.rank, with_hand(config, options.hand)
+    run_dir = options.run_dir
+    rank = options.rank
+    config = with_hand(config, options.hand)
+    url = rank_url(options.listen, rank)
+    # Other ranks use the settings of rank 0
+    longest = longest_rollout(config) if options.ranks == 1 else None
     try:
         with (
             on_signal() as stop,
             logging_as(watch.log_format, role="learner", id=str(rank), run=config.name),
             urls.listen(
-                url := rank_url(options.listen, rank),
+                url,
                 "learner",
                 certs=options.certs,
                 insecure=options.insecure,
                 run=config.name,
-                longest_rollout=longest_rollout(config)
-                if options.ranks == 1
-                else None,  # others use rank 0's settings
+                longest_rollout=longest,
             ) as transport,
+            contextlib.ExitStack() as stack,
         ):
             imported()
             if rank == 0:
-                options.prepare(config)
+                is_new = not options.resumes
+                before = Folder.of(run_dir)
+                config = options.prepare(config)
+                if is_new:
+                    stack.enter_context(removed_without_checkpoint(before))
+                stack.enter_context(listening(run_dir, reachable_url(url)))
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
-            config = run_config_from_json(
-                ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"]
+            entries = ranks.exchange({"config": to_json(config)}).meta["entries"]
+            config = run_config_from_json(entries[0]["config"])
+            if rank:
+                check_inputs(config.inputs, OF_LEARNERS, COPY)
+            learn(
+                run_dir,
+                config,
+                wire=transport,
+                inside=config.physics if options.inside else None,
+                stop=stop,
+                ranks=ranks,
+                writers=options.metric_writers,
+                watch=watch,
+                audit=options.audit,
+                on_update=_log_update,
+                on_event=log,
             )
-            with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
-                learn(
-                    run_dir,
-                    config,
-                    wire=transport,
-                    inside=config.physics if options.inside else None,
-                    stop=stop,
-                    ranks=ranks,
-                    writers=options.metric_writers,
-                    watch=watch,
-                    on_update=_log_update,
-                    on_event=log,
-                )
+            log("info", _end(run_dir, stop))
             return stop.exit_code
     except CongraspError as error:
         if options.ranks > 1:
             log_error(str(error))
             end_process(str(error), error.exit_code)
         raise
+
+
+def _end(run_dir: pathlib.Path, stop: Stop) -> str:
+    """The reason why the learner ends, for its last line."""
+    from congrasp.services.train.start import can_resume
+
+    if not stop.is_set():
+        return "The learner ends: the run is complete."
+    if not can_resume(run_dir):
+        return f"The learner ends: {stop.reason} before its first checkpoint."
+    resume = shlex.join(command("congrasp", "learner", run_dir=run_dir, resume=True))
+    return f"The learner ends: {stop.reason}. To resume: {resume}"
 
 
 def _log_update(values: dict[str, float]) -> None:

@@ -181,13 +181,20 @@ def _dataclass(
         fields=tuple(
             tyro.constructors.StructFieldSpec(
                 field.name,
-                _described(field.name, hints[field.name]),
+                _option(field, hints[field.name]),
                 getattr(source, field.name, tyro.MISSING),
                 functools.partial(_meanings(info.type).get, field.name),
             )
             for field in dataclasses.fields(info.type)
         ),
     )
+
+
+def _option(field: "dataclasses.Field[Any]", hint: Any) -> Any:
+    """Type of a field for the parser; a field that commands compute is no option."""
+    if field.metadata.get("option", True):
+        return _described(field.name, hint)
+    return Annotated[hint, tyro.conf.Fixed, tyro.conf.Suppress]
 
 
 @functools.cache

@@ -1,11 +1,11 @@
 """`congrasp record`: a run as MCAP."""
 
 import contextlib
-import functools
 import math
 import pathlib
 import secrets
 import time
+from collections.abc import Callable
 
 from rich.console import Console
 
@@ -13,6 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, process_name
 from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import LogFormat, log, logging_as
 from congrasp.services.record.live import LiveServer
 from congrasp.services.record.recorder import Recorder
@@ -50,17 +51,19 @@ def record(
       congrasp record --run human --out recordings --live 8765
     """
     structured = log_format == "json"
-    end = math.inf if duration is None else time.monotonic() + duration
     console = Console(stderr=True, quiet=structured)
-    warn = (
-        functools.partial(log, "warning")
-        if structured
-        else lambda text: console.print(f"congrasp: {text}")
-    )
+
+    def warn(text: str) -> None:
+        """Reports a problem of the recording."""
+        if structured:
+            log("warning", text)
+        else:
+            console.print(f"congrasp: {text}", markup=False)
+
     with contextlib.ExitStack() as stack:
-        stack.enter_context(
-            logging_as(log_format, role="recorder", id=process_name("recorder"), run=run)
-        )
+        name = process_name("recorder")
+        stack.enter_context(logging_as(log_format, role="recorder", id=name, run=run))
+        stop = stack.enter_context(on_signal())
         transport = stack.enter_context(urls.connect(connect, "observer", certs=certs, run=run))
         sinks = [] if live is None else [stack.enter_context(LiveServer(live))]
         for server in sinks:
@@ -68,14 +71,10 @@ def record(
         recorder = stack.enter_context(
             Recorder(transport, run, out, name="record", sinks=sinks, warn=warn)
         )
-        transport.declare_alive(
-            Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4))
-        )
+        transport.declare_alive(Keys(run).alive("recorder", name, secrets.token_hex(4)))
         try:
             with console.status(_state(recorder)) as status:
-                while time.monotonic() < end and (sinks or not recorder.error):
-                    time.sleep(max(0.0, min(_REFRESH, end - time.monotonic())))
-                    status.update(_state(recorder))
+                _wait(recorder, duration, stop, always=bool(sinks), update=status.update)
         finally:
             recorder.close(_CLOSE)
             for file in recorder.files:
@@ -93,7 +92,29 @@ def record(
                 f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its "
                 f"processes."
             )
-    return 0
+        reason = stop.reason if stop.is_set() else f"--duration {duration} s is over"
+        if structured:
+            log("info", f"The recorder ends: {reason}.")
+        else:
+            console.print(f"The recorder ends: {reason}.")
+        return stop.exit_code
+
+
+def _wait(
+    recorder: Recorder,
+    duration: float | None,
+    stop: Stop,
+    *,
+    always: bool,
+    update: Callable[[str], None],
+) -> None:
+    """Waits for the end of a recording: its duration, a signal or, unless `always`, an error."""
+    end = math.inf if duration is None else time.monotonic() + duration
+    while not stop.is_set() and time.monotonic() < end:
+        if recorder.error and not always:
+            return
+        stop.wait(max(0.0, min(_REFRESH, end - time.monotonic())))
+        update(_state(recorder))
 
 
 def _state(recorder: Recorder) -> str:

@@ -5,14 +5,19 @@ import dataclasses
 import os
 import pathlib
 import secrets
+from typing import TYPE_CHECKING
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL
-from congrasp.services.ops.lifetime import on_signal
+from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch, announced, log
 from congrasp.services.ops.metrics import ServerMetrics
+from congrasp.services.ops.waiting import connect_when_up, when_up
+
+if TYPE_CHECKING:
+    from congrasp.services.serve.server import Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +38,9 @@ class Serve:
     """A learner's endpoint to follow instead of a file."""
     run: str = "quickstart"
     """Name of the run to follow."""
+    patience: float | None = None
+    """Seconds without the learner of --connect after which the server gives up at its start; by
+    default it waits without end."""
     listen: str = SERVER_URL
     """Endpoint for the clients."""
     name: str = "policy"
@@ -55,7 +63,7 @@ class Serve:
         import jax
 
         from congrasp.common.policy.pretrained import policy_file
-        from congrasp.services.serve.server import PolicyServer, follow_file, follow_run
+        from congrasp.services.serve.server import PolicyServer, follow_file
 
         if self.policy is not None and self.connect:
             raise CongraspError(
@@ -71,17 +79,12 @@ class Serve:
             contextlib.ExitStack() as stack,
         ):
             if self.connect:
-                upstream = stack.enter_context(
-                    urls.connect(self.connect, "server", certs=self.certs, run=self.run)
-                )
-                upstream.declare_alive(
-                    Keys(self.run).alive("server", self.name, secrets.token_hex(4))
-                )
-                source = follow_run(
-                    upstream, self.run, urls.name_on_wire(self.name, self.certs, "server")
-                )
+                source = self._source_of_run(stack, stop)
             else:
                 source = follow_file(policy_file(self.policy, self.hand))
+            if source is None:
+                log("info", f"The server ends: {stop.reason}.")
+                return stop.exit_code
             transport = stack.enter_context(
                 urls.listen(self.listen, "server", certs=self.certs, insecure=self.insecure)
             )
@@ -98,7 +101,30 @@ class Serve:
             )
             stop.wait()
             server.close()
+            log("info", f"The server ends: {stop.reason}.")
         return stop.exit_code
+
+    def _source_of_run(self, stack: contextlib.ExitStack, stop: Stop) -> "Source | None":
+        """Connects to the learner and waits for its first policy; returns None if stopped."""
+        from congrasp.services.serve.server import follow_run
+
+        upstream = connect_when_up(
+            self.connect,
+            "server",
+            certs=self.certs,
+            run=self.run,
+            patience=self.patience,
+            stop=stop,
+        )
+        if upstream is None:
+            return None
+        stack.enter_context(upstream)
+        name = urls.name_on_wire(self.name, self.certs, "server")
+        upstream.declare_alive(Keys(self.run).alive("server", self.name, secrets.token_hex(4)))
+        source = follow_run(upstream, self.run, name)
+        what = f"the learner of the run '{self.run}' at {self.connect}"
+        first = when_up(lambda: source(-1), what, patience=self.patience, stop=stop)
+        return None if first is None else source
 
 
 COMMAND = Serve

@@ -69,22 +69,27 @@ def train(  # noqa: PLR0913
       congrasp train --preset check
       congrasp train --preset human --run-dir runs/human --seed 5
     """
-    from congrasp.services.train.command import run_training
+    from congrasp.services.train.command import RUNS, run_training
 
     config = with_hand(config if method is None else with_method(config, method), hand)
-    given: dict[str, Any] = {"constraints": constraints and str(constraints), "split": split}
-    objects = dataclasses.replace(
-        config.objects, **{name: value for name, value in given.items() if value}
-    )
+    changes: dict[str, Any] = {}
+    if constraints is not None:
+        changes["constraints"] = str(constraints)
+    if split is not None:
+        changes["split"] = split
+    objects = dataclasses.replace(config.objects, **changes)
+    if run_dir is None and not resume:
+        name = file_name(config.name, "a run")
+        run_dir = pathlib.Path(RUNS) / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    if evaluation is None:
+        evaluation = min(192, 3 * config.environments)
     return run_training(
         dataclasses.replace(config, objects=objects),
-        run_dir
-        or pathlib.Path("runs")
-        / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
+        run_dir,
         launch,
         resume=resume,
         initial=initial,
-        evaluation=min(192, 3 * config.environments) if evaluation is None else evaluation,
+        evaluation=evaluation,
     )
 
 

@@ -12,9 +12,10 @@ the run's files, and by accepted rollouts without a file.
 """
 
 import collections
+import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import tyro
@@ -22,14 +23,26 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
+from congrasp.common.io.journal import (
+    AUDIT,
+    JournalLines,
+    has_fields,
+    read_journal,
+    user_journals,
+)
 from congrasp.learner.hub.used_rollouts import Used, read_uses, replay
 from congrasp.learner.hub.write_ahead import stored
 from congrasp.learner.run_directory import version_of_files
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""
-FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
+FAULTS = {
+    "lost": "loss",
+    "duplicated": "surplus",
+    "corrupted": "damage",
+    "unmatched": "surplus",
+    "above the limit on lag": "surplus",
+}
 """Faults of rollouts, and their kinds."""
 EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
 """Exit codes of `congrasp audit` by kind, the most serious first; 2 to 4 are those of errors."""
@@ -100,13 +113,25 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     """
     folder = run_dir / AUDIT
     learners = sorted(folder.glob("learner-*.jsonl"))
-    actors = [*(path for path in sorted(folder.glob("*.jsonl")) if path not in learners), *more]
-    if not learners or not actors:
-        kind = "actor" if learners else "learner"
+    if not run_dir.is_dir():
+        raise CongraspError(f"There is no folder {run_dir}.", "Pass the folder of a run.")
+    if not learners:
         raise CongraspError(
-            f"There is no journal of {'an' if kind == 'actor' else 'a'} {kind} in {folder}.",
-            "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these "
-            "files.",
+            f"There is no journal of a learner in {folder}.",
+            "A single process ('--actors 0', '--inside') and '--no-audit' keep none.",
+        )
+    books = [read_uses(path) for path in learners]
+    actors = [path for path in sorted(folder.glob("*.jsonl")) if path not in learners]
+    users = _user_journals(books)
+    for path in users:
+        actors += sorted(path.glob("*.jsonl"))
+    actors += more
+    if not actors:
+        places = " or ".join(str(each) for each in (folder, *users))
+        raise CongraspError(
+            f"There is no journal of an actor in {places}.",
+            "Actors on other machines have theirs in ~/.local/state/congrasp/audit there: copy "
+            "them here and pass them with --journals FILE.",
         )
     # In this order, since a running learner writes meanwhile: a rollout that an actor knows to be
     # accepted, and that the learner has not used, is in one of the two listings of files.
@@ -144,6 +169,18 @@ def _covered_version(books: Iterable[JournalLines]) -> int:
             if "version" in entry:
                 newest = max(newest, entry["version"] + ("used" in entry))
     return newest + sessions
+
+
+def _user_journals(books: Iterable[JournalLines]) -> list[pathlib.Path]:
+    """Folders in which actors of this user on this machine wrote the journals of these runs."""
+    run_ids: set[str] = set()
+    for book in books:
+        run_ids |= {str(entry["run_id"]) for entry in book.intact if "run_id" in entry}
+    folders: list[pathlib.Path] = []
+    for run_id in sorted(run_ids):
+        with contextlib.suppress(CongraspError):  # a damaged journal may name anything
+            folders.append(user_journals(run_id))
+    return folders
 
 
 def _is_entry(entry: dict[str, Any]) -> bool:
@@ -268,6 +305,9 @@ def _compare(
         faults.append(f"{'/'.join(map(str, identity))}: {text}")
 
     known = {identity[:2] for identity in made}
+    max_staleness = _max_staleness(found.books)
+    for identity, text in _too_late(standing, max_staleness):
+        fault("above the limit on lag", identity, text)
     for identity, uses in standing.items():
         if identity[:2] not in known:
             counts["of actors without a journal"] += 1
@@ -286,34 +326,65 @@ def _compare(
     for identity, rollout in made.items():
         outcomes = [outcome for outcome, _ in rollout.answers]
         if "accepted" not in outcomes and "duplicate" not in outcomes:
-            counts[
-                "used, answer lost"
-                if identity in standing
-                else outcomes[-1]
-                if outcomes
-                else "unanswered"
-            ] += 1
+            counts[_not_accepted(outcomes, used=identity in standing)] += 1
             continue
         counts["accepted"] += 1
-        outcome = _outcome(identity, rollout, found)
-        if outcome == "lost" and any(gaps):
-            outcome = UNJUDGED
+        outcome = _judged(identity, rollout, found, gaps)
         if outcome == "lost":
             fault("lost", identity, "accepted, but missing afterwards")
         else:
             counts[outcome] += 1
-    lags = [use.lag for uses in standing.values() for use in uses]
+    lags = _lags(standing)
     return Report(
         dict(counts) | {name: counts[name] for name in FAULTS},
         faults,
         sum(lags) / max(1, len(lags)),
         max(lags, default=0),
-        max((session.max_staleness for book in found.books for session in book), default=0),
+        max_staleness,
         sum(journal.lost for journal in journals),
         sum(journal.damaged for journal in journals),
         sum(journal.missing for journal in journals),
         sum(journal.unchecked for journal in journals),
     )
+
+
+def _not_accepted(outcomes: Sequence[str], *, used: bool) -> str:
+    """Outcome of a rollout whose actor received no acceptance."""
+    if used:
+        return "used, answer lost"
+    return outcomes[-1] if outcomes else "unanswered"
+
+
+def _lags(standing: Mapping[Identity, list[Used]]) -> list[int]:
+    """Lags of all uses, versions."""
+    lags: list[int] = []
+    for uses in standing.values():
+        lags += [use.lag for use in uses]
+    return lags
+
+
+def _too_late(
+    standing: Mapping[Identity, list[Used]], limit: int
+) -> Iterator[tuple[Identity, str]]:
+    """Yields the rollouts that were used more than `limit` versions after their policies."""
+    for identity, uses in standing.items():
+        lag = max(use.lag for use in uses)
+        if lag > limit:
+            yield identity, f"used {lag} versions after its policy; the limit is {limit}"
+
+
+def _max_staleness(books: Iterable[list[_Session]]) -> int:
+    """Largest limit on lag of all sessions, versions."""
+    limits = [0]
+    for book in books:
+        limits += [session.max_staleness for session in book]
+    return max(limits)
+
+
+def _judged(identity: Identity, rollout: Made, found: _Outcomes, gaps: _Gaps) -> str:
+    """Outcome of an accepted rollout; a loss cannot be judged while lines are missing."""
+    outcome = _outcome(identity, rollout, found)
+    return UNJUDGED if outcome == "lost" and any(gaps) else outcome
 
 
 def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:

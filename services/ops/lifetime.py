@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.opening import open_to_append
 from congrasp.common.runtime.environment import child_environment
+from congrasp.services.ops import causes
 
 GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
@@ -32,7 +33,6 @@ _PARENT = (
     "CONGRASP_PARENT"  # environment variable with which a process makes its children end with it
 )
 _POLL = 0.5
-_LAST = 10_000  # bytes of a log in which its last line is looked for
 _REAP = 0.5  # deadline for the end of all children, s
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
@@ -52,6 +52,11 @@ class Stop(threading.Event):
     def exit_code(self) -> int:
         """Exit code of a process that a signal ended, for the shell; zero without a signal."""
         return 128 + self.signal if self.signal else 0
+
+    @property
+    def reason(self) -> str:
+        """Phrase for the last line of a process that was stopped."""
+        return f"stopped by {signal.Signals(self.signal).name}" if self.signal else "stopped"
 
 
 @contextlib.contextmanager
@@ -83,10 +88,14 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         stop.signal = number[0]
         stop.set()
         ends = time.monotonic() + grace
+        why = f"it did not end within {grace:g} s"
         reader.settimeout(grace)
         with contextlib.suppress(TimeoutError):
-            if not reader.recv(1):  # the block has ended; later code has the remaining time
+            if reader.recv(1):
+                why = "a second signal came"
+            else:  # the block has ended; later code has the remaining time
                 time.sleep(max(0.0, ends - time.monotonic()))
+        _write_last_line(f"The process was {stop.reason} and ended at once: {why}.")
         _end(stop.exit_code)
 
     def handle(number: int, frame: object) -> None:
@@ -103,6 +112,12 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         for number, handler in previous.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def _write_last_line(text: str) -> None:
+    """Writes a line to the standard error, even while another thread holds its lock."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"congrasp: {text}\n".encode())
 
 
 def _end(code: int) -> None:
@@ -149,13 +164,19 @@ class Child:
     environment: dict[str, str] = dataclasses.field(default_factory=dict)
     process: subprocess.Popen[bytes] | None = None
     restarts: int = 0
+    deaths: int = 0
+    """Deaths since the run last made progress."""
     again_at: float = 0.0
     begun: int = 0
     """Bytes of the log when the process started."""
+    memory_kills: int = 0
+    """`memory_kills` when the process started."""
 
     @property
     def program(self) -> list[str]:
-        """Command line of the process."""
+        """Command line of the process; modules in the working folder, such as a user's random.py,
+        are not imported.
+        """
         return [sys.executable, "-P", "-m", "congrasp", *self.arguments]
 
     def start(self) -> int:
@@ -167,6 +188,7 @@ class Child:
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         own = {**self.environment, _PARENT: str(os.getpid())}
         environment = {**jax, **child_environment(**own)}
+        self.memory_kills = _memory_kills()
         with os_errors_as(f"{self.log} cannot be opened"):
             opened = open_to_append(self.log)
         with opened as log:
@@ -189,17 +211,28 @@ class Child:
 
     def last_line(self) -> str:
         """The last line that it wrote to its log."""
-        with contextlib.suppress(FileNotFoundError), self.log.open("rb") as log:
-            log.seek(max(self.begun, log.seek(0, os.SEEK_END) - _LAST))
-            if lines := log.read().decode(errors="replace").strip().splitlines():
-                return lines[-1].removeprefix("congrasp: error: ")
-        return "its log is empty"
+        return causes.last_line(self._output()) or "its log is empty"
+
+    def cause(self) -> str:
+        """The cause of its end by its log, or else the last line, as a sentence."""
+        reason = causes.cause_in(self._output()) or self.last_line()
+        return f"{reason.rstrip('. ')}."
 
     def death(self) -> str:
-        """Its end in a sentence: the signal that killed it, or its exit code and last line."""
-        if self.code is not None and self.code < 0:
-            return f"The {self.name} was killed by {signal.Signals(-self.code).name}."
-        return f"The {self.name} died (exit code {self.code}): {self.last_line().rstrip('. ')}."
+        """Its end in a sentence: the signal that killed it or its exit code, and the cause."""
+        kernel_killed = _memory_kills() > self.memory_kills
+        return causes.end_of(self.name, self.code or 0, self._output(), kernel_killed=kernel_killed)
+
+    def _output(self) -> str:
+        """Its log since it started, or the end of it."""
+        return causes.read_end(self.log, self.begun)
+
+
+def _memory_kills() -> int:
+    """See `common.runtime.parallel.memory_kills`, whose module a client's installation lacks."""
+    from congrasp.common.runtime.parallel import memory_kills
+
+    return memory_kills()
 
 
 def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:

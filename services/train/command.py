@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
+import shlex
 import shutil
 import sys
 import time
@@ -11,10 +12,12 @@ from collections.abc import Iterator
 from typing import Any, Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.padding import Padding
 
 from congrasp.common.config import ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.named_inputs import identified
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
@@ -33,16 +36,25 @@ from congrasp.learner.run_directory import (
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.ops.lifetime import on_signal
+from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch
 from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import Launch, Plan, train
+from congrasp.services.train.processes import Launch, Plan, ProcessDied, train
+from congrasp.services.train.start import (
+    Folder,
+    can_resume,
+    check_config,
+    kept_log,
+    removed_without_checkpoint,
+)
 from congrasp.services.viz.render import episode_sheet
 from congrasp.services.viz.sheets import save_png
 
 EPISODE = "episode.png"
+RUNS = "runs"
+"""Folder of runs without --run-dir."""
 _EVALUATION_OBJECTS = 12
 _LINE_SECONDS = 10.0
 _SPACE = 64 << 10  # bytes below which a disk counts as full
@@ -51,7 +63,7 @@ console = Console(highlight=False, soft_wrap=True)
 
 def run_training(
     config: RunConfig,
-    run_dir: pathlib.Path,
+    run_dir: pathlib.Path | None,
     launch: Launch,
     *,
     resume: bool,
@@ -68,35 +80,78 @@ def run_training(
         failed permanently.
     """
     imported()
+    if run_dir is None:
+        raise CongraspError("--resume needs the folder of a run.", _folders_to_resume())
     plan = launch.planned(config)
-    _prepare(run_dir, config, initial, resume=resume)
-    _announce(config, run_dir, plan)
-    with on_signal() as stop:
+    before = Folder.of(run_dir)
+    config = _prepare(run_dir, config, initial, resume=resume)
+    with contextlib.ExitStack() as stack:
+        if not resume:
+            stack.enter_context(removed_without_checkpoint(before))
+        stop = stack.enter_context(on_signal())
+        _announce(config, run_dir, plan)
         began = time.monotonic()
         with _Progress(config) as progress:
-            if plan.in_process:
-                learn(
-                    run_dir,
-                    config,
-                    wire=None,
-                    inside=plan.physics,
-                    stop=stop,
-                    writers=launch.metric_writers,
-                    watch=Watch(metrics_port=launch.metrics_port),
-                    on_update=progress.update,
-                    on_event=lambda level, text: _warn(text) if level == "error" else None,
-                )
-            else:
-                with _full_disk_named(run_dir):
-                    train(run_dir, config, plan, stop=stop, report=progress.show, notify=_warn)
+            _train(run_dir, config, plan, stop, progress)
+        minutes = (time.monotonic() - began) / 60
         if stop.is_set():
-            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}")
+            console.print(_stopped(run_dir, stop), markup=False)
             return stop.exit_code
-        console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
+        console.print(f"Trained for {minutes:.1f} min.")
         if evaluation:
             _show(run_dir, config, evaluation)
         _next_steps(run_dir)
+        console.print(f"\nThe training ends: all {config.updates} updates are done.")
     return 0
+
+
+def _train(
+    run_dir: pathlib.Path, config: RunConfig, plan: Plan, stop: Stop, progress: "_Progress"
+) -> None:
+    """Trains in this process, or with one process for each role."""
+    if plan.in_process:
+        learn(
+            run_dir,
+            config,
+            wire=None,
+            inside=plan.physics,
+            stop=stop,
+            writers=plan.launch.metric_writers,
+            watch=Watch(metrics_port=plan.launch.metrics_port),
+            on_update=progress.update,
+            on_event=lambda level, text: _warn(text) if level == "error" else None,
+        )
+        return
+    with _full_disk_named(run_dir):
+        try:
+            train(run_dir, config, plan, stop=stop, report=progress.show, notify=_warn)
+        except ProcessDied as error:
+            if can_resume(run_dir):
+                resume = _resume_command(run_dir)
+                raise CongraspError(str(error), f"To resume: {resume}") from None
+            log = kept_log(run_dir, error.log)
+            raise ProcessDied(error.what, log) from None
+
+
+def _stopped(run_dir: pathlib.Path, stop: Stop) -> str:
+    """The last line of a training that was stopped."""
+    if can_resume(run_dir):
+        return f"The training was {stop.reason}. To resume: {_resume_command(run_dir)}"
+    return f"The training was {stop.reason} before its first checkpoint; nothing is left of it."
+
+
+def _resume_command(run_dir: pathlib.Path) -> str:
+    """Command line that resumes a run."""
+    return shlex.join([*_command(), "train", "--resume", "--run-dir", str(run_dir)])
+
+
+def _folders_to_resume() -> str:
+    """Remedy for a resume without a folder: the newest run of the default folder."""
+    runs = [path.parent for path in pathlib.Path(RUNS).glob(f"*/{CONFIG_FILE}")]
+    if not runs:
+        return "Pass --run-dir FOLDER."
+    newest = max(runs, key=lambda run: run.stat().st_mtime)
+    return f"Pass --run-dir FOLDER, such as {shlex.quote(str(newest))}, the newest one here."
 
 
 def _warn(text: str) -> None:
@@ -106,10 +161,10 @@ def _warn(text: str) -> None:
 
 def _prepare(
     run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool
-) -> None:
-    """Creates the run's directory, or opens the existing one."""
+) -> RunConfig:
+    """Creates the run's directory, or opens the existing one; returns the run's configuration."""
     if resume:
-        continue_run(run_dir, config)
+        config = continue_run(run_dir, config, initial)
         if not has_checkpoints(run_dir):
             raise CongraspError(
                 f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir."
@@ -117,18 +172,19 @@ def _prepare(
         Checkpoints(run_dir / CHECKPOINTS).find(
             lambda level, text: console.print(text, markup=False)
         )
-        return
+        return config
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
             f"{run_dir} is not empty and is not a run.", "Choose another --run-dir."
         )
-    _check(config)
+    check_config(config)
     policy = None if initial is None else bundles.load(initial)
+    config = identified(config, initial)
     create_run(run_dir, config, policy)
-    if policy is None or initial is None:
-        return
-    for note in initial_notes(policy, config, initial):
-        console.print(note, markup=False)
+    if policy is not None and initial is not None:
+        for note in initial_notes(policy, config, initial):
+            console.print(note, markup=False)
+    return config
 
 
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
@@ -138,24 +194,13 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {steps} steps, "
         f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on "
-        f"'{plan.physics}' in "
-        f"{run_dir}"
+        f"'{plan.physics}' in {escape(str(run_dir))}"
     )
     simplifications = easier(config)
     if simplifications:
         console.print(
             f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset "
             f"{FULL}, for a GPU."
-        )
-
-
-def _check(config: RunConfig) -> None:
-    """Raises a `CongraspError` for settings with which the run's processes would end at once."""
-    make_algorithm(policy_spec(config.task, config.network), config)
-    load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
-    if config.environments < 1 or config.rollout_steps < 1:
-        raise CongraspError(
-            f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty."
         )
 
 
@@ -169,9 +214,14 @@ def _full_disk_named(run_dir: pathlib.Path) -> Iterator[None]:
     except CongraspError:
         if shutil.disk_usage(run_dir).free >= _SPACE:
             raise
+        remedy = "Free space and start again."
+        if can_resume(run_dir):
+            remedy = (
+                f"Files written before are intact. Free space; to resume: "
+                f"{_resume_command(run_dir)}"
+            )
         raise CongraspError(
-            f"The disk of {run_dir} is full, and the run has ended.",
-            f"Files written before are intact. Free space and pass --resume --run-dir {run_dir}.",
+            f"The disk of {run_dir} is full, and the run has ended.", remedy
         ) from None
 
 
@@ -243,7 +293,7 @@ class _Progress:
     def _print(self) -> None:
         """Prints the line if it has changed."""
         if self._line != self._printed:
-            console.print(f"  {self._line}")
+            console.print(f"  {self._line}", markup=False)
             self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
@@ -317,29 +367,31 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
 def _next_steps(run_dir: pathlib.Path) -> None:
     """Prints the location of the results and commands to inspect them."""
     congrasp = _command()
-    rows = (
-        [(str(run_dir / EPISODE), "an episode of the trained policy")]
-        if (run_dir / EPISODE).exists()
-        else []
-    )
+    folder = str(run_dir)
+    policy = str(run_dir / POLICY_FILE)
+    rows: list[tuple[str, str]] = []
+    if (run_dir / EPISODE).exists():
+        rows.append((str(run_dir / EPISODE), "an episode of the trained policy"))
     rows += [
         (
-            f"{congrasp} grasp mug:0 --video",
+            shlex.join([*congrasp, "grasp", "mug:0", "--video"]),
             "a grasp by the pretrained policy of the full task; or your own mesh",
         ),
-        (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
-        (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
-        (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),
-        (f"{congrasp} train --resume --run-dir {run_dir}", "continue training"),
+        (shlex.join([*congrasp, "plot", folder]), "learning curves and reward terms"),
+        (
+            f"{shlex.quote(str(run_dir / LOGS))}/*.mcap",
+            "open in Foxglove or Rerun: plots, hand and object in 3-D",
+        ),
+        (shlex.join([*congrasp, "evaluate", "--policy", policy]), "the paper's protocol"),
+        (_resume_command(run_dir), "continue training"),
     ]
     console.print("\n[bold]Next[/]")
     for what, why in rows:
-        console.print(f"  {what}\n      {why}")
+        console.print(f"  {what}\n      {why}", markup=False)
 
 
-def _command() -> str:
+def _command() -> list[str]:
     """Command line of this installation."""
     script = pathlib.Path(sys.executable).with_name("congrasp")
-    return (
-        "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)
-    )
+    on_path = shutil.which("congrasp") or not script.exists()
+    return ["congrasp" if on_path else os.path.relpath(script)]

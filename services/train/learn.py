@@ -49,6 +49,7 @@ def learn(  # noqa: PLR0913
     on_event: Callable[[str, str], None] = lambda level, text: None,
     writers: Sequence[MetricWriter] = (),
     watch: Watch = Watch(),  # noqa: B008
+    audit: bool = True,
     grace: float = GRACE,
 ) -> None:
     """Runs a learner from the newest checkpoint, if there is one, until it is finished or stopped.
@@ -64,6 +65,7 @@ def learn(  # noqa: PLR0913
       stop: ends training.
       writers: metric writers of rank 0.
       watch: endpoint of the metrics.
+      audit: writes the journal, unless an actor inside keeps its rollouts on the device.
       grace: deadline for the end of the actor inside, s.
     """
     rank, transport = 0 if ranks is None else ranks.rank, wire
@@ -93,7 +95,8 @@ def learn(  # noqa: PLR0913
             stop_event=stop,
             resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
-            audit=inside is None,
+            audit=audit,
+            on_host=inside is None,
             recorder=recorded(transport, config, run_dir, run_dir / LOGS, writers)
             if rank == 0
             else None,

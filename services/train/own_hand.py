@@ -199,7 +199,7 @@ def _run(
         why = (
             f"was ended after {_PATIENCE / 60:.0f} min"
             if code is None
-            else f"failed: {child.last_line()}"
+            else f"failed: {child.cause()}"
         )
         raise CongraspError(
             f"The {name} of '{request.hand.name}' {why}", f"Its log is {child.log}."

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import shlex
 import shutil
 import subprocess
 import sys
@@ -30,16 +31,26 @@ from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import stage
 from congrasp.common.transport import urls
-from congrasp.common.transport.base import Transport
-from congrasp.common.transport.keys import Keys
-from congrasp.common.transport.ports import LEARNER_URL, local_url, rank_url, reachable_url
+from congrasp.common.transport.base import Subscription, Transport
+from congrasp.common.transport.keys import FLOWS, Keys
+from congrasp.common.transport.ports import (
+    LEARNER_URL,
+    check_ports,
+    local_url,
+    rank_url,
+    reachable_url,
+)
 from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
 from congrasp.learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, has_checkpoints
 from congrasp.services.ops.lifetime import CHILD_GRACE, Child, command, end_all, run_child, wait_for
 
 MAX_RESTARTS = 5
+"""Restarts of a process without an update of the run between them."""
 _BAD_INPUT = 2
-_START_SECONDS, _POLL = 120.0, 0.25
+_START_SECONDS = 120.0
+_POLL = 0.25
+_LONGEST_PAUSE = 15.0
+"""Longest time before a restart, s."""
 Report = Callable[[dict[str, Any]], None]
 """Called several times a second with the learner's newest metrics, if any, and the number of live
 actors.
@@ -69,6 +80,8 @@ class Launch:
     there, for `wandb sync`), wandb (needs an account); without a name, none."""
     metrics_port: int = 0
     """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none."""
+    audit: bool = True
+    """Journals of all rollouts in the run's folder, for 'congrasp audit'."""
 
     def planned(self, config: RunConfig) -> "Plan":
         """Chooses engine and number of actors; on a GPU one process does everything unless others
@@ -92,7 +105,8 @@ class Launch:
         physics = engine_of(config.physics, gpus)
         # Two actors on two cores would compile the same programs at the same time.
         default = 0 if ENGINES[physics].on_device and not joined else min(2, max(1, cores() // 2))
-        return Plan(self, default if self.actors is None else self.actors, physics, gpus)
+        actors = default if self.actors is None else self.actors
+        return Plan(self, actors, physics, gpus)
 
     def _check_connections(self, run: str) -> None:
         """Raises a `CongraspError` if the learner may not listen as requested, or only some roles
@@ -105,12 +119,29 @@ class Launch:
             )
         credentials = urls.find_credentials(self.certs, "learner", run)
         check_exposure(self.listen or LEARNER_URL, credentials, insecure=self.insecure)
+        if self.listen:
+            check_ports(self.listen, self.ranks * len(FLOWS))
         for role in ("actor", "observer"):
             urls.find_credentials(self.certs, role, run)
         if self.actors == 0:
             raise CongraspError(
                 "With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors."
             )
+
+
+class ProcessDied(CongraspError):
+    """A process of the run failed permanently.
+
+    Attributes:
+      what: its end and the cause, without the place of its log.
+      log: its log.
+    """
+
+    def __init__(self, what: str, log: pathlib.Path):
+        """Creates the error."""
+        super().__init__(what, f"Its log is {log}.")
+        self.what = what
+        self.log = log
 
 
 class Plan(NamedTuple):
@@ -191,7 +222,8 @@ def train(
     of both.
 
     A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS`
-    times each. If one of several ranks dies, the others end as well, and all are restarted.
+    times each without an update of the run between them. If one of several ranks dies, the others
+    end as well, and all are restarted.
 
     Args:
       run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from
@@ -212,17 +244,15 @@ def train(
     endpoint = launch.listen or local_url(launch.ranks + 1)
     logs = run_dir / LOGS
     logs.mkdir(exist_ok=True)
-    learners, actors = (
-        _learners(run_dir, plan, endpoint),
-        _actors(run_dir, plan, config.name, endpoint),
-    )
+    learners = _learners(run_dir, plan, endpoint)
+    actors = _actors(run_dir, plan, config.name, endpoint)
     try:
         with stage("start of the learner's process"):
             for child in (*learners, *actors):
                 child.start()
             transport = _connect(reachable_url(endpoint), learners[0], stop, launch.certs)
         if transport is not None:
-            shown = " ".join(command("congrasp", "view", run_dir, certs=launch.certs))
+            shown = shlex.join(command("congrasp", "view", run_dir, certs=launch.certs))
             notify(f"Watch it in the browser with: {shown}")
             with transport:
                 _supervise(learners, actors, transport, config.name, stop, report, notify)
@@ -232,14 +262,16 @@ def train(
 
 def _learners(run_dir: pathlib.Path, plan: Plan, endpoint: str) -> list[Child]:
     """Returns the learner processes; rank 0 listens at the endpoint, and has the metrics."""
-    launch, inside, found = plan.launch, not plan.actors, []
+    launch = plan.launch
+    learners: list[Child] = []
     coordinator = rank_url(reachable_url(endpoint), launch.ranks).partition("/")[2]
     for rank in range(launch.ranks):
         name = f"rank-{rank}" if launch.ranks > 1 else "learner"
         arguments = command(
             "learner", run_dir=run_dir, resume=True, listen=endpoint, certs=launch.certs
         )
-        arguments += command(insecure=launch.insecure, inside=inside)
+        arguments += command(insecure=launch.insecure, inside=not plan.actors)
+        arguments += command(no_audit=not launch.audit)
         if launch.ranks > 1:
             arguments += command(rank=rank, ranks=launch.ranks, coordinator=coordinator)
         if rank == 0:
@@ -247,27 +279,27 @@ def _learners(run_dir: pathlib.Path, plan: Plan, endpoint: str) -> list[Child]:
                 metrics_port=launch.metrics_port, metric_writers=launch.metric_writers
             )
         environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if plan.gpus else {}
-        found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log", environment))
-    return found
+        learners.append(Child(name, arguments, run_dir / LOGS / f"{name}.log", environment))
+    return learners
 
 
 def _actors(run_dir: pathlib.Path, plan: Plan, run: str, endpoint: str) -> list[Child]:
     """Returns the actor processes of all ranks; rank 0 listens at the endpoint."""
-    launch, found = plan.launch, []
+    launch = plan.launch
+    actors: list[Child] = []
     threads = max(1, cores() // max(1, launch.ranks * plan.actors))
-    patience = 60 if launch.ranks == 1 else 300
     for number in range(launch.ranks * plan.actors):
-        name, url = f"actor-{number}", rank_url(reachable_url(endpoint), number // plan.actors)
-        kept = {
-            "audit": run_dir / AUDIT / f"{name}.jsonl",
-            "references": references_file(run_dir, name),
-        }
-        arguments = command(
-            "actor", connect=url, certs=launch.certs, run=run, id=name, physics=plan.physics, **kept
-        )
-        arguments += command(threads=threads, patience=patience)
-        found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log"))
-    return found
+        name = f"actor-{number}"
+        url = rank_url(reachable_url(endpoint), number // plan.actors)
+        arguments = command("actor", connect=url, certs=launch.certs, run=run, id=name)
+        arguments += command(physics=plan.physics, threads=threads)
+        arguments += command(references=references_file(run_dir, name))
+        if launch.audit:
+            arguments += command(audit=run_dir / AUDIT / f"{name}.jsonl")
+        else:
+            arguments += command(no_audit=True)
+        actors.append(Child(name, arguments, run_dir / LOGS / f"{name}.log"))
+    return actors
 
 
 def _gpu(rank: int) -> str:
@@ -289,9 +321,7 @@ def _connect(
                 break
     if stop.is_set():
         return None
-    raise CongraspError(
-        f"The learner did not start: {learner.last_line()}", f"Its log is {learner.log}."
-    )
+    raise ProcessDied(f"The learner did not start: {learner.cause()}", learner.log)
 
 
 def _supervise(
@@ -311,24 +341,41 @@ def _supervise(
     while not stop.is_set():
         if learners[0].code == 0:
             return
+        latest = _latest(metrics)
+        if latest:
+            # A resumed learner writes a checkpoint after its first update, which the next one keeps
+            for child in (*learners, *actors):
+                child.deaths = 0
         if any(child.code for child in learners):
             _restart_learners(learners, stop, notify)
         for child in actors:
-            if code := child.code:
-                _check_can_restart(child, code)
-                if child.again_at == 0.0:
-                    notify(f"{child.death()} Restarting it.")
-                    child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
-                if time.monotonic() >= child.again_at:
-                    child.restarts += 1
-                    child.again_at = 0.0
-                    child.start()
+            if child.code:
+                _restart_actor(child, notify)
         while event := events.receive(0.0):
             if event[1].meta.get("level") == "error":
                 notify(str(event[1].meta.get("text")))
-        received = metrics.receive(_POLL)
         alive = sum(child.code is None for child in actors) or len(learners)
-        report({**(received[1].meta if received else {}), "actors": alive})
+        report({**latest, "actors": alive})
+
+
+def _latest(metrics: Subscription) -> dict[str, Any]:
+    """Waits a moment for metrics of the learner; returns the newest ones, empty if there are
+    none.
+    """
+    newest = metrics.receive(_POLL)
+    while newer := metrics.receive(0.0):
+        newest = newer
+    return dict(newest[1].meta) if newest else {}
+
+
+def _restart_actor(child: Child, notify: Callable[[str], None]) -> None:
+    """Restarts an actor that died, later each time."""
+    if child.again_at == 0.0:
+        _check_can_restart(child)
+        notify(f"{child.death()} Restarting it.")
+        child.again_at = time.monotonic() + _pause(child)
+    if time.monotonic() >= child.again_at:
+        _restart(child)
 
 
 def _restart_learners(
@@ -337,26 +384,42 @@ def _restart_learners(
     """Restarts all ranks after one died; the others notice and end, or are terminated."""
     first = next(child for child in learners if child.code)
     wait_for([child.process for child in learners if child.process], CHILD_GRACE)
-    # A rank that lost another one says no more than that.
+    # A rank that lost another one reports no more than that.
     dead = [
         child for child in learners if child.code and child.code != TransportError.exit_code
     ] or [first]
     died = " ".join(child.death() for child in dead)
     end_all(learners)
     for child in (*dead, *learners):
-        _check_can_restart(child, child.code or 0)
+        _check_can_restart(child)
     notify(f"{died} Restarting {'it' if len(learners) == 1 else 'all ranks'}.")
-    stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
+    stop.wait(_pause(learners[0]))
     for child in learners:
-        child.restarts += 1
         if not stop.is_set():
-            child.start()
+            _restart(child)
 
 
-def _check_can_restart(child: Child, code: int) -> None:
-    """Raises a `CongraspError` if a restart would end in the same way."""
-    if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
-        raise CongraspError(child.death(), f"Its log is {child.log}.")
+def _pause(child: Child) -> float:
+    """Seconds before the next restart of a process: 0, 1, 3, 7, then 14."""
+    return min(2.0**child.deaths, _LONGEST_PAUSE) - 1.0
+
+
+def _restart(child: Child) -> None:
+    """Starts a process that died again."""
+    child.deaths += 1
+    child.restarts += 1
+    child.again_at = 0.0
+    child.start()
+
+
+def _check_can_restart(child: Child) -> None:
+    """Raises a `ProcessDied` if a restart would end in the same way."""
+    if child.code == _BAD_INPUT:
+        raise ProcessDied(child.death(), child.log)
+    if child.deaths >= MAX_RESTARTS:
+        times = f" It died {child.deaths + 1} times without an update of the run between."
+        repeated = times if child.deaths else ""
+        raise ProcessDied(f"{child.death()}{repeated}", child.log)
 
 
 _TRAINED = "trained.json"
@@ -400,7 +463,7 @@ def train_in_background(
         )
     if code or not (run_dir / POLICY_FILE).exists():
         raise CongraspError(
-            f"The training of {name} failed: {child.last_line()}", f"Its log is {child.log}."
+            f"The training of {name} failed: {child.cause()}", f"Its log is {child.log}."
         )
     write_atomically(
         run_dir / _TRAINED, json.dumps({"seconds": round(time.monotonic() - began, 1)}).encode()

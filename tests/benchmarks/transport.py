@@ -293,7 +293,11 @@ def _processes(
 @contextlib.contextmanager
 def _link(endpoint: str, folder: pathlib.Path, number: int) -> Iterator[ActorLink]:
     """An actor's link to the learner."""
-    journal = Journal(folder / AUDIT / f"a{number}.jsonl")
+    path = folder / AUDIT / f"a{number}.jsonl"
+
+    def journal(run_id: str) -> Journal:
+        return Journal(path)
+
     with (
         urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, _RUN, f"a{number}", window=2, journal=journal) as link,

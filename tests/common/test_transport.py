@@ -279,9 +279,7 @@ def test_busy_port_is_named():
     base = free_port()
     with (
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]),
-        pytest.raises(
-            CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.* or use another"
-        ),
+        pytest.raises(CongraspError, match=f"port of tcp/127.0.0.1:{base} is in use.*--listen"),
     ):
         ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"])
     with ZenohTransport(listen=[f"tcp/127.0.0.1:{base}"]):
@@ -300,8 +298,21 @@ def test_busy_port_of_a_later_flow_frees_the_earlier_ones():
 
 
 @pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("tcp/127.0.0.1:65535", "four ports"),
+        ("tcp/::1:7447", r"brackets.*tcp/\[::1\]:7447"),
+        ("tcp/no-such-host.invalid:7447", "host name 'no-such-host.invalid'"),
+    ],
+)
+def test_unusable_endpoint_names_its_fault(endpoint, words):
+    with pytest.raises(CongraspError, match=words):
+        ZenohTransport(connect=[endpoint], wait=0.1)
+
+
+@pytest.mark.parametrize(
     "endpoint",
-    ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "", "tcp/127.0.0.1:65535"],
+    ["127.0.0.1:7447", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", ""],
 )
 def test_malformed_endpoint_is_named(endpoint):
     with pytest.raises(CongraspError, match=r"is not an endpoint.*Write it like tcp/"):

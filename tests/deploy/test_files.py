@@ -225,7 +225,15 @@ def test_scripts_pass_shellcheck(script):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
+@pytest.mark.parametrize(
+    ("variables", "port"),
+    [
+        ({"SLURM_JOB_ID": "1"}, 15010),
+        ({"SLURM_JOB_ID": "2"}, 15020),
+        ({"SLURM_JOB_ID": "2", "CONGRASP_PORT": "9000"}, 9000),
+    ],
+)
+def test_slurm_tasks_are_ranks_of_one_run(tmp_path, variables, port):
     """With stand-ins for Slurm's commands, the script starts the learner's ranks with arguments
     that it understands.
     """
@@ -241,6 +249,7 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
         (tmp_path / name).chmod(0o755)
     environment = {
         "SLURM_NTASKS": "2",
+        **variables,
         "SLURM_JOB_NODELIST": "node-[7-8]",
         "OUT": str(tmp_path),
         "HOME": str(tmp_path),
@@ -260,7 +269,8 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
         given = load(arguments[0])(arguments[1:]).keywords
         options = given["options"]
-        assert (options.rank, options.ranks, options.coordinator) == (rank, 2, "node-7:7440")
+        assert (options.rank, options.ranks, options.coordinator) == (rank, 2, f"node-7:{port}")
+        assert options.listen == f"tcp/127.0.0.1:{port + 2}"
         assert (
             options.run_dir == tmp_path / "a run"
             and given["config"].updates == 9
@@ -272,8 +282,8 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
     ("rank", "learner", "words"),
     [
         (0, "", ["learner", "--inside"]),
-        (1, "", ["actor", "--patience"]),
-        (0, "10.0.0.5", ["actor", "--patience"]),
+        (1, "", ["actor", "--certs"]),
+        (0, "10.0.0.5", ["actor", "--certs"]),
     ],
 )
 def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, words):

@@ -49,7 +49,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     create_run(run_dir, config)
     hub = MemoryHub()
     journal = tmp_path / "actor.jsonl"
-    actor = MadeUpActor(MemoryTransport(hub), journal=Journal(journal))
+    actor = MadeUpActor(MemoryTransport(hub), journal=lambda run_id: Journal(journal))
     said, complaints, filler, warnings = [], [], [], []
     with MemoryTransport(hub) as transport:
         recorder = Recorder(transport, config.name, run_dir / LOGS, warn=complaints.append)

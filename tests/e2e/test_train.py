@@ -145,6 +145,22 @@ def test_with_two_actors_the_other_one_continues_alone_and_the_run_completes(sta
 
 
 @pytest.mark.slow
+def test_twenty_kills_of_the_learner_with_updates_between_do_not_end_a_run(start):
+    run = start(1, 10**6)
+    for _ in range(20):
+        updates(run, 2)
+        (learner,) = run.children("learner")
+        learner.kill()
+        learner.wait()
+    updates(run, 2)
+    run.process.terminate()
+    run.process.communicate(timeout=20)
+    assert run.process.returncode == 128 + signal.SIGTERM
+    report = audit(run.run_dir)
+    assert report.exit_code == 0 and report.lag_max <= report.max_staleness
+
+
+@pytest.mark.slow
 def test_sigterm_ends_a_run_as_ctrl_c_does(start):
     run = start(1, 10**6)
     updates(run, 5)

@@ -121,10 +121,10 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
 
 
 def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, act):
-    """As where they stay on a device: `audit=False`."""
+    """As where they stay on a device."""
     create_run(tmp_path, CONFIG)
     act()
-    assert learn(tmp_path, hub, audit=False).version == 3
+    assert learn(tmp_path, hub, on_host=False).version == 3
     assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
 
 

@@ -11,11 +11,12 @@ from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
+from congrasp.learner.run_directory import create_run
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
 from congrasp.services.train.command import EPISODE, _next_steps, _Progress
 from congrasp.services.train.presets import get_preset
-from congrasp.services.train.processes import Launch
+from congrasp.services.train.processes import Launch, ProcessDied
 
 LAUNCH = Launch(actors=1)
 # 40 steps an update
@@ -130,6 +131,9 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
 )
 def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, free, words):
     def die(*args, **options):
+        checkpoint = tmp_path / "checkpoints" / "checkpoint_000000001.safetensors"
+        checkpoint.parent.mkdir()
+        checkpoint.touch()
         raise CongraspError("The learner failed: its log is empty")  # its log is on the same disk
 
     monkeypatch.setattr(command, "train", die)
@@ -152,6 +156,46 @@ def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, ch
         config = dataclasses.replace(CONFIG, **change)
         command.run_training(config, tmp_path / "run", LAUNCH, resume=False, evaluation=0)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("existed", [False, True])
+def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existed):
+    run_dir = tmp_path / "new" / "run"
+    if existed:
+        run_dir.mkdir(parents=True)
+
+    def die(folder, *args, **options):
+        log = folder / "logs" / "learner.log"
+        log.write_text("out of memory")
+        raise ProcessDied("The learner did not start.", log)
+
+    monkeypatch.setattr(command, "train", die)
+    with pytest.raises(CongraspError, match=r"did not start.*run\.failed\.log"):
+        command.run_training(CONFIG, run_dir, LAUNCH, resume=False, evaluation=0)
+    assert run_dir.exists() == existed and not (existed and any(run_dir.iterdir()))
+    assert run_dir.with_name("run.failed.log").read_text() == "out of memory"
+
+
+def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch, tmp_path):
+    def stopped(folder, *args, stop, **options):
+        stop.set()
+        if folder.name == "with checkpoint":
+            (folder / "checkpoints").mkdir()
+            (folder / "checkpoints" / "checkpoint_000000000.safetensors").touch()
+
+    monkeypatch.setattr(command, "train", stopped)
+    for name in ("with checkpoint", "without"):
+        command.run_training(CONFIG, tmp_path / name, LAUNCH, resume=False, evaluation=0)
+    kept, removed = (line for line in said() if "was stopped" in line)
+    assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in kept
+    assert "--resume" not in removed and not (tmp_path / "without").exists()
+
+
+def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    create_run(tmp_path / "runs" / "mine", CONFIG)
+    with pytest.raises(CongraspError, match=r"--resume needs .*runs/mine"):
+        command.run_training(CONFIG, None, LAUNCH, resume=True, evaluation=0)
 
 
 def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):

@@ -8,7 +8,9 @@ import threading
 import pytest
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
 from congrasp.services.cli import main
 from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
@@ -16,7 +18,7 @@ from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.reproduce.run import Request, train_all
 from congrasp.services.train import processes
 from congrasp.services.train.presets import get_preset
-from congrasp.services.train.processes import Child
+from congrasp.services.train.processes import MAX_RESTARTS, Child
 
 WAITS = "import time; time.sleep(60)"
 
@@ -117,6 +119,58 @@ def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
         CongraspError, match=r"The rank-1 died \(exit code 2\): The port is in use\. Its log is"
     ):
         supervise([follows], [complains])
+
+
+DIES = "raise SystemExit(9)"
+
+
+@pytest.fixture
+def storm(tmp_path, monkeypatch):
+    """Supervises a learner and an actor, one of which dies; progress is published or not."""
+    monkeypatch.setattr(processes, "_LONGEST_PAUSE", 1.0)
+    children: list[Script] = []
+
+    def run(role: str, deaths: int, *, progress: bool) -> list[str]:
+        lives = [DIES] * deaths
+        last = WAITS if role == "actor" else "pass"
+        learner = Script("learner", [WAITS], tmp_path / "learner.log")
+        actor = Script("actor", [WAITS], tmp_path / "actor.log")
+        dying = learner if role == "learner" else actor
+        dying.arguments = [*lives, last]
+        children.extend([learner, actor])
+        for child in children:
+            child.start()
+        hub = MemoryHub()
+        stop = threading.Event()
+        notes: list[str] = []
+        with MemoryTransport(hub) as transport, MemoryTransport(hub) as updates:
+
+            def note(text: str) -> None:
+                notes.append(text)
+                if progress:
+                    key = Keys("run").log("metrics", "learner", "0")
+                    updates.publish(key, Message(meta={"update": len(notes)}))
+                if role == "actor" and len(notes) == deaths:
+                    stop.set()
+
+            processes._supervise(
+                [learner], [actor], transport, "run", stop, lambda status: None, note
+            )
+        return notes
+
+    yield run
+    processes.end_all(children)
+
+
+@pytest.mark.parametrize("role", ["actor", "learner"])
+def test_twenty_deaths_with_progress_between_do_not_end_a_run(storm, role):
+    assert len(storm(role, 20, progress=True)) == 20
+
+
+@pytest.mark.parametrize("role", ["actor", "learner"])
+def test_deaths_without_progress_end_a_run(storm, role):
+    with pytest.raises(CongraspError, match=rf"{role} died .*{MAX_RESTARTS + 1} times"):
+        storm(role, 20, progress=False)
 
 
 @pytest.mark.parametrize(("visible", "names"), [("", ["0", "1"]), ("4,GPU-7", ["4", "GPU-7"])])

@@ -1,0 +1,191 @@
+"""Causes of a process's end, from its log, its exit code and the limits of this machine.
+
+A lack of memory has many symptoms: a broken pipe of a helper, SIGABRT of the C++ runtime, a thread
+that does not start. The first fatal error in the log is the cause, later ones are its consequences.
+"""
+
+import os
+import pathlib
+import re
+import resource
+import signal
+from typing import NamedTuple
+
+from congrasp.common.errors import printable
+
+_READ = 1 << 20
+"""Bytes at the end of a log in which a cause is looked for."""
+_LONGEST = 300
+"""Characters of a quoted line."""
+_OUR_ERROR = "congrasp: error: "
+_PREFIX = re.compile(r"^(?:[EWFI]\d{4} [\d:.]+ +\d+ \S+\] |(?:error|fatal|warning|info): )+")
+_HARMLESS = re.compile(r"not a failure|performance gains|retrying", re.IGNORECASE)
+"""Lines about memory after which the allocator of a GPU tries again."""
+_TRACE = "Traceback (most recent call last):"
+_EXCEPTION = re.compile(r"^[A-Za-z_][\w.]*(?:: .*)?$")
+_CONSEQUENCES = re.compile(
+    r"^(?:[\w.]*\.)?(?:BrokenPipeError|ConnectionResetError|ConnectionAbortedError|EOFError"
+    r"|BrokenProcessPool|BrokenExecutor|KeyboardInterrupt|SystemExit)\b"
+)
+"""Exceptions of a process that lost another one, or was asked to end."""
+_CRASH = re.compile(r"Fatal Python error|terminate called|panicked at|Check failed|LLVM ERROR")
+_ABORTS = (signal.SIGABRT, signal.SIGSEGV, signal.SIGBUS, signal.SIGTRAP, signal.SIGILL)
+"""Signals by which native code ends a process, for instance when it gets no memory."""
+
+
+_DRIVER = pathlib.Path("/dev/nvidiactl")
+
+
+class Shortage(NamedTuple):
+    """A resource that a process can lack, and its symptoms."""
+
+    phrase: str
+    words: re.Pattern[str]
+
+
+_SHORTAGES = (
+    Shortage(
+        "out of GPU memory",
+        re.compile(
+            r"CUDA_ERROR_OUT_OF_MEMORY|cudaErrorMemoryAllocation|CUDA out of memory"
+            r"|CUDA error 2: out of memory|\bGPU\b.*out of memory|out of memory.*\bGPU\b",
+            re.IGNORECASE,
+        ),
+    ),
+    Shortage(
+        "out of device memory",
+        re.compile(r"RESOURCE_EXHAUSTED|The device's memory does not suffice"),
+    ),
+    Shortage(
+        "out of memory",
+        re.compile(
+            r"\bMemoryError\b|\bbad_alloc\b|cannot allocate memory|out of memory|\boom.kill"
+            r"|memory allocation of \d+ bytes failed|unable to allocate|failed to map segment"
+            r"|failed to allocate|can't allocate memory|not enough memory",
+            re.IGNORECASE,
+        ),
+    ),
+    Shortage(
+        "out of threads or memory",
+        re.compile(
+            r"can't start new thread|failed to spawn thread|pthread_create failed"
+            r"|Resource temporarily unavailable"
+        ),
+    ),
+)
+
+
+def read_end(path: pathlib.Path, begin: int) -> str:
+    """Returns the end of a log from byte `begin` on, at most a mebibyte; empty if it is missing."""
+    try:
+        with path.open("rb") as log:
+            size = log.seek(0, 2)
+            log.seek(max(begin, size - _READ))
+            return log.read().decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def cause_in(text: str) -> str:
+    """Returns the cause of a process's end that its log shows, in one line; empty if it shows none.
+
+    In this order: the first line about a lack of memory or threads, the error with which a command
+    ended, the last exception that is not the consequence of another one, and the last crash of
+    native code.
+    """
+    lines = text.splitlines()
+    for line in lines:
+        shortage = _shortage(line)
+        if shortage:
+            return f"{_phrase(shortage, text)} ({_quoted(line)})"
+    errors = [line for line in lines if line.startswith(_OUR_ERROR)]
+    if errors:
+        return _quoted(errors[-1].removeprefix(_OUR_ERROR))
+    exceptions = _exceptions(lines)
+    causes = [line for line in exceptions if not _CONSEQUENCES.match(line)]
+    if causes or exceptions:
+        return _quoted((causes or exceptions)[-1])
+    crashes = [line for line in lines if _CRASH.search(line)]
+    return _quoted(crashes[-1]) if crashes else ""
+
+
+def last_line(text: str) -> str:
+    """Returns the last line of a log that is not empty."""
+    lines = text.strip().splitlines()
+    return lines[-1].removeprefix(_OUR_ERROR) if lines else ""
+
+
+def end_of(name: str, code: int, log: str, *, kernel_killed: bool = False) -> str:
+    """Describes the end of a process in a sentence with its cause.
+
+    Args:
+      name: name of the process, such as `learner`.
+      code: its exit code; a negative one is the signal that killed it.
+      log: its log, or the end of it.
+      kernel_killed: True if the kernel killed a process for lack of memory meanwhile.
+    """
+    cause = cause_in(log)
+    if code >= 0:
+        reason = cause or last_line(log) or "its log is empty"
+        return f"The {name} died (exit code {code}): {reason.rstrip('. ')}.{_limit(cause)}"
+    number = signal.Signals(-code)
+    if not cause and number == signal.SIGKILL and kernel_killed:
+        cause = "out of memory (killed by the kernel)"
+    if not cause and number in _ABORTS and _address_space():
+        cause = "probably out of memory"
+    if not cause:
+        return f"The {name} was killed by {number.name}."
+    return f"The {name} was killed by {number.name}: {cause.rstrip('. ')}.{_limit(cause)}"
+
+
+def _shortage(line: str) -> Shortage | None:
+    """The resource whose lack a line reports."""
+    if _HARMLESS.search(line):
+        return None
+    return next((each for each in _SHORTAGES if each.words.search(line)), None)
+
+
+def _phrase(shortage: Shortage, text: str) -> str:
+    """Phrase of a shortage: memory of a device is that of a GPU if the log names one."""
+    if shortage.phrase == "out of device memory":
+        is_gpu = re.search(r"\bGPU|CUDA|\bgpu\b", text) or _uses_gpu()
+        return "out of GPU memory" if is_gpu else "out of memory"
+    return shortage.phrase
+
+
+def _uses_gpu() -> bool:
+    """True if this machine has an NVIDIA GPU and JAX may use it."""
+    return _DRIVER.exists() and os.environ.get("JAX_PLATFORMS") != "cpu"
+
+
+def _exceptions(lines: list[str]) -> list[str]:
+    """The line of the exception after each trace."""
+    found: list[str] = []
+    in_trace = False
+    for line in lines:
+        if line.startswith(_TRACE):
+            in_trace = True
+        elif in_trace and _EXCEPTION.match(line):
+            found.append(line)
+            in_trace = False
+    return found
+
+
+def _quoted(line: str) -> str:
+    """A line of a log without its level, time and place."""
+    text = printable(_PREFIX.sub("", line.strip()).removeprefix(_OUR_ERROR)).strip().rstrip(". ")
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
+
+
+def _limit(cause: str) -> str:
+    """A sentence about the limit of the address space, if there is one and memory is the cause."""
+    limit = _address_space()
+    if "memory" not in cause or not limit:
+        return ""
+    return f" Its address space is limited to {limit / 1e9:.1f} GB (ulimit -v)."
+
+
+def _address_space() -> int:
+    """Limit of the address space of this process and its children in bytes; 0 for none."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return 0 if soft == resource.RLIM_INFINITY else soft

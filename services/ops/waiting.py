@@ -1,0 +1,101 @@
+"""Waits of actors and policy servers for a learner that is not there yet, or not any more."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from congrasp.common.errors import RefusedError, TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.services.ops.lifetime import Stop
+from congrasp.services.ops.logs import log
+
+T = TypeVar("T")
+_NOTICED = 2.0
+"""Seconds until the first line."""
+_EVERY = 60.0
+"""Seconds between two lines."""
+_ATTEMPT = 1.0
+"""Seconds of one attempt, after which a signal is noticed."""
+
+
+def connect_when_up(
+    url: str,
+    role: urls.Peer,
+    *,
+    certs: urls.Certs,
+    run: str,
+    patience: float | None,
+    stop: Stop,
+) -> Transport | None:
+    """Connects to a learner and waits for it; reports the wait after two seconds, then once a
+    minute.
+
+    Args:
+      url: address of the learner.
+      role: role of this process.
+      certs: folder of its certificate.
+      run: name of the run.
+      patience: seconds after which it gives up; None waits without end.
+      stop: ends the wait.
+
+    Returns:
+      The transport; None if the wait was stopped.
+
+    Raises:
+      TransportError: the learner did not respond in time.
+      CongraspError: see `urls.connect`.
+    """
+
+    def connect() -> Transport:
+        return urls.connect(url, role, certs=certs, wait=_ATTEMPT, run=run)
+
+    return when_up(connect, f"the learner at {url}", patience=patience, stop=stop)
+
+
+def when_up(
+    attempt: Callable[[], T | None], what: str, *, patience: float | None, stop: Stop
+) -> T | None:
+    """Repeats an attempt until it succeeds; reports the wait after two seconds, then once a minute.
+
+    Args:
+      attempt: returns a result, None for none yet, or raises a TransportError.
+      what: name of the awaited thing.
+      patience: seconds after which it gives up; None waits without end.
+      stop: ends the wait.
+
+    Returns:
+      The result; None if the wait was stopped.
+
+    Raises:
+      TransportError: the attempts did not succeed in time.
+      RefusedError: the peer refuses this process.
+    """
+    began = time.monotonic()
+    limit = math.inf if patience is None else patience
+    next_line = began + _NOTICED
+    while not stop.is_set():
+        attempted = time.monotonic()
+        try:
+            result = attempt()
+        except RefusedError:
+            raise
+        except TransportError as error:
+            reason = str(error)
+        else:
+            if result is not None:
+                return result
+            reason = "There is no policy yet."
+        now = time.monotonic()
+        if now - began >= limit:
+            raise TransportError(
+                f"No response from {what} for {limit:g} s: {reason}",
+                "Start it, or pass a longer --patience.",
+            )
+        if now >= next_line:
+            ends = "" if patience is None else f", up to {limit:g} s"
+            log("info", f"Waiting for {what}, {now - began:.0f} s so far{ends}. {reason}")
+            next_line = now + _EVERY
+        stop.wait(min(max(0.0, attempted + _ATTEMPT - now), began + limit - now))
+    return None
