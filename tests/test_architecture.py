@@ -4,13 +4,11 @@ English in its texts.
 
 import ast
 import functools
-import io
 import itertools
 import pathlib
 import re
 import subprocess
 import sys
-import tokenize
 from collections.abc import Iterator, Sequence
 
 import pytest
@@ -133,45 +131,6 @@ def test_constraints_are_used_by_their_hooks():
         for t in targets
     }
     assert {target for target in used if target.startswith(folder)} <= shared
-
-
-LAYOUT = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENDMARKER,
-}
-
-
-def lines_of_code(text: str, tree: ast.AST) -> int:
-    """Lines without blanks, comments and docstrings."""
-    strings = (
-        n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)
-    )
-    documented = {line for n in strings for line in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
-    tokens = (
-        t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type not in LAYOUT
-    )
-    return len({line for t in tokens for line in range(t.start[0], t.end[0] + 1)} - documented)
-
-
-def test_modules_and_functions_are_short():
-    """A module has at most 400 lines of code; a function's body, without its docstring, at most 60
-    lines.
-    """
-    long = []
-    for path, tree in trees(*FOLDERS).items():
-        text = path.read_text()
-        if text.count("\n") > 400 and lines_of_code(text, tree) > 400:
-            long.append(f"{path}: {lines_of_code(text, tree)} lines of code")
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                body = node.body[1:] if ast.get_docstring(node) else node.body
-                if body and (node.end_lineno or 0) - body[0].lineno >= 60:
-                    long.append(f"{path}:{node.lineno}: {node.name}")
-    assert not long
 
 
 RUNS_DATA = re.compile(

@@ -31,6 +31,7 @@ from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import symbol_sizes
 from congrasp.common.task.features import scene_of
+from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields
 from congrasp.common.task.observation import observe
 from congrasp.common.task.privileged import Parameters, observe_for_teacher
@@ -189,6 +190,7 @@ _FLAGS = ("success", "held", DIVERGED)
 _LARGEST = 1e6  # limit of an error or a force, in its unit
 _ACTION = 1e3
 _MASS = 1e3  # kg
+_FEATHER = 1e-3  # N
 
 
 @functools.lru_cache(maxsize=8)
@@ -242,6 +244,11 @@ def _evaluate(
     """
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
+    # An object that every contact carries, for the terms that depend on its weight.
+    load = ObjectLoad(
+        weight=jnp.full(scene.state.time.shape, _FEATHER), friction=parameters.friction
+    )
+    scene = scene._replace(load=load)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
     own = scene._replace(task=task, readings=readings, cloud=surface)

@@ -42,10 +42,11 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     where `infos["_metrics"]` is true.
 
     The start of the next episode depends on the autoreset mode, as in Gymnasium:
-      SAME_STEP: in the same step. `infos["final_obs"]` (num_envs, D) holds the last observations
-        where `infos["_final_obs"]` is true, and `infos["final_info"]` the metrics again.
-      NEXT_STEP: in the next step, which ignores the action and has reward 0.
-      DISABLED: with a call of `reset`, by `options={"reset_mask": ended}` for some environments.
+
+    * `SAME_STEP`: in the same step. `infos["final_obs"]` (num_envs, D) holds the last observations
+      where `infos["_final_obs"]` is true, and `infos["final_info"]` the metrics again.
+    * `NEXT_STEP`: in the next step, which ignores the action and has reward 0.
+    * `DISABLED`: with a call of `reset`, by `options={"reset_mask": ended}` for some environments.
     """
 
     @compiling_entry

@@ -2,6 +2,8 @@
 check.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.metrics import episode_fields
+from congrasp.common.task.reward import terms
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import RECORDED
 from congrasp.learner.hub.admission import Admission, task_ranges
@@ -80,3 +83,12 @@ def test_names_and_bounds_follow_from_the_task(ranges):
 def test_a_curriculum_widens_the_reward_by_its_weights(ranges):
     heavy = CurriculumConfig(ramp=(0, 10), reward=RewardWeights(contact=11.0))
     assert task_ranges(TASK, heavy).reward == pytest.approx(ranges.reward + 2.0 * 10.0, rel=1e-3)
+
+
+def test_every_weighted_term_has_a_range():
+    names = [field.name for field in dataclasses.fields(RewardWeights)]
+    weights = RewardWeights(**{**dict.fromkeys(names, 1.0), "force_max": 5.0})
+    task = dataclasses.replace(TASK, reward=weights)
+    ranges = task_ranges(task, CurriculumConfig(ramp=(0, 0))).episodes
+    unreachable = [name for name in terms(task) if not ranges[f"term/{name}"][1] > 0.0]
+    assert unreachable == []
