@@ -29,6 +29,7 @@ from congrasp.services.evaluate.table import (
     Columns,
     Table,
     paper_rate,
+    posture_columns,
     percent,
     row_title,
 )
@@ -138,6 +139,7 @@ def plausibility(results: Results) -> list[str]:
         *dict(PLAUSIBILITY[5:]),
     )
     columns = [(head, cell) for head, (_, cell) in zip(heads, PLAUSIBILITY, strict=True)]
+    columns += posture_columns(results.rows)
     return Table.of("", results.rows, columns).markdown()
 
 

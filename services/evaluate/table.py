@@ -213,6 +213,12 @@ def _peak(name: str) -> Callable[[Row], str]:
     return lambda row: NONE if (peak := row.plausibility.get(name)) is None else f"{peak:.3g}"
 
 
+def _posture(row: Row) -> str:
+    """Deviation from natural postures in degrees."""
+    deviation = row.plausibility.get("posture_rad")
+    return NONE if deviation is None else f"{np.degrees(deviation):.1f}"
+
+
 def _survived(name: str) -> Callable[[Row], str]:
     """Cell of a rate of plausibility."""
     return lambda row: percent(row.plausibility.get(name))
@@ -265,6 +271,9 @@ PLAUSIBILITY: Columns[Row] = (
 """Plausibility: deepest penetrations (mean, 95th percentile), also of the hand's meshes into the
 object if it has some; peak speed and acceleration of the wrist; rates. A push stands for six in a
 row (`actors.stress.Protocol`)."""
+POSTURE: Columns[Row] = (("posture off, °", lambda row: _posture(row)),)
+"""Deviation of the fingers from natural postures (`common.task.posture`); files of earlier versions
+have none."""
 FORCES: Columns[Row] = (
     ("constraint", row_title),
     ("link, N", lambda row: measured(row, "link_force")),
@@ -292,12 +301,23 @@ def tables_of(
     who: Columns[Row] = ()
     if missing or len({(row.hand, row.method) for row in rows}) > 1:
         who = (("hand", lambda row: row.hand), ("method", lambda row: row.method))
-    titled = {title: RATES, "Plausibility of all episodes": PLAUSIBILITY, FORCES_TITLE: FORCES}
+    titled = {
+        title: RATES,
+        "Plausibility of all episodes": (*PLAUSIBILITY, *posture_columns(rows)),
+        FORCES_TITLE: FORCES,
+    }
     rates, *others = (
         Table.of(name, rows, (*own[:1], *who, *own[1:])) for name, own in titled.items()
     )
     absent = [(reason, hand, method, *[""] * (len(RATES) - 1)) for hand, method, reason in missing]
     return [dataclasses.replace(rates, rows=[*rates.rows, *absent]), *others]
+
+
+def posture_columns(rows: Sequence[Row]) -> Columns[Row]:
+    """Returns `POSTURE` if one of the rows has the measure, and no column otherwise."""
+    if any(row.plausibility.get("posture_rad") is not None for row in rows):
+        return POSTURE
+    return ()
 
 
 def object_table(rows: Sequence[Row]) -> Table:
