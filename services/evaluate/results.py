@@ -29,8 +29,8 @@ from congrasp.services.evaluate.table import (
     Columns,
     Table,
     paper_rate,
-    posture_columns,
     percent,
+    posture_columns,
     row_title,
 )
 from congrasp.services.evaluate.tables import HeadingRules
