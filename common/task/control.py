@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import known
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import wrist_to_joints
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import ControlConfig, TaskSettings
 from congrasp.common.task.types import Action, Array, SceneState
 

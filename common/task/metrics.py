@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 
 from congrasp.common.task.constraints import blocks, error_specs, known
-from congrasp.common.task.constraints.base import ErrorSpec, Scene
+from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import terms
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import blocks, known
-from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.geometry import flat, squash
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array

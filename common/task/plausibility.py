@@ -22,8 +22,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.objects.spec import Piece
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.posture import unnatural
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}

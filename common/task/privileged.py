@@ -24,8 +24,9 @@ import jax.numpy as jnp
 from congrasp.common.hands.motors import motor_positions, tip_forces
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import observation
-from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.control import Guided, guided, wrist_lead
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.sensing import Sensors
 from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array

@@ -16,7 +16,6 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional
-from congrasp.common.task.sampling.build import clear_of_table
 from congrasp.common.task.sampling.headings import (
     INWARD,
     above,
@@ -24,6 +23,7 @@ from congrasp.common.task.sampling.headings import (
     sample_headings,
     within_reach,
 )
+from congrasp.common.task.sampling.table import clear_of_table
 from congrasp.common.task.types import Surface
 
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)

@@ -21,8 +21,8 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.rotations import continuous
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.constraints.base import Option, Part
 from congrasp.common.task.constraints.heading import ABOVE
+from congrasp.common.task.constraints.specs import Option, Part
 from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints.base import (
-    Constraint,
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.markers import Polyline
+from congrasp.common.task.constraints.specs import (
     ErrorSpec,
     GoalArray,
     ObservationField,
     Option,
-    Polyline,
     Weight,
 )
 from tests.children import python
@@ -63,7 +63,7 @@ class Level(Constraint):
         return {"upper": jnp.mean(height > height.mean(-1, keepdims=True), -1)}
 
     def sample(self, hand, draw, uniform):
-        return LevelGoal(uniform < draw.own("level")["upper"][:, None])
+        return LevelGoal(uniform < draw.columns("level")["upper"][:, None])
 
     def labels(self, hand):
         return {"wrist": ("wrist",)}

@@ -13,8 +13,8 @@ from congrasp.common.hands.motors import tip_forces
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.privileged import Parameters
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import SceneState
 
 HAND = get_hand("human")

@@ -74,7 +74,7 @@ def _rotation(q: np.ndarray) -> Rotation:
 def test_features_against_numpy():
     state, surface, goal = scene(7)
     geometry = FEATURES(state, surface, goal)
-    avoided = geometry.of["affordance"]
+    avoided = geometry.by_constraint["affordance"]
     b = 2
     wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
     origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
@@ -111,9 +111,9 @@ def test_features_against_numpy():
 
 def test_without_an_avoid_region_there_is_nothing_to_avoid():
     state, surface, goal = scene(8)
-    geometry = FEATURES(state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal).of[
-        "affordance"
-    ]
+    geometry = FEATURES(
+        state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal
+    ).by_constraint["affordance"]
     assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
     assert not np.any(geometry.nearest) and not np.any(geometry.touching)
 
@@ -187,7 +187,7 @@ def test_reward_terms_against_numpy(near):  # noqa: PLR0915
     state, surface, goal = scene(11)
     goal = near_targets(state, goal, 12) if near else goal
     geometry = FEATURES(state, surface, goal)
-    avoided = geometry.of["affordance"]
+    avoided = geometry.by_constraint["affordance"]
     paid = {name: np.asarray(value) for name, value in REWARD(state, surface, goal, UNIT).items()}
     b = 3
     d = np.linalg.norm(np.asarray(geometry.nearest)[b], axis=-1)
@@ -468,7 +468,7 @@ def test_metrics_against_numpy():
     hinges = _joint_differences(turn, state.u[b, 3:])
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
     np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
-    links = np.sum(np.asarray(geometry.of["affordance"].touching)[b])
+    links = np.sum(np.asarray(geometry.by_constraint["affordance"].touching)[b])
     np.testing.assert_allclose(found["affordance_ratio"][b], links)
     np.testing.assert_allclose(
         weights.pop("affordance_ratio")[b], np.sum(np.asarray(geometry.touching)[b])

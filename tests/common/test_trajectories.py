@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.task.constraints.pose import (
+from congrasp.common.task.constraints.disturbance import (
     CLOSURE,
     JITTER,
     JOINTS,
