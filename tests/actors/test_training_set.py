@@ -22,7 +22,8 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import cache
 from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.object_headings import headings_of
-from congrasp.common.task.sampling.sets import load, load_for, make_sets, save
+from congrasp.common.task.sampling.set_file import load, load_for, save
+from congrasp.common.task.sampling.sets import make_sets
 from congrasp.common.wire.codec import Message
 from tests import task as suite
 from tests.task import HAND, OBJECTS, TASK

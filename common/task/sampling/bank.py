@@ -159,3 +159,15 @@ def _repeated(array: np.ndarray, axes: str, lengths: Mapping[str, int]) -> np.nd
             index = np.resize(np.arange(array.shape[place]), lengths[axis])
             array = np.take(array, index, place)
     return array
+
+
+def feasible_indices(feasible: np.ndarray) -> np.ndarray:
+    """Indices (V, R, H) of the true entries of masks (V, R, H), repeated to fill each row; zeros
+    without any.
+    """
+    index = np.zeros(feasible.shape, int)
+    for region, rest in np.ndindex(feasible.shape[:2]):
+        entries = np.flatnonzero(feasible[region, rest])
+        if len(entries):
+            index[region, rest] = np.resize(entries, feasible.shape[-1])
+    return index

@@ -117,7 +117,9 @@ def _bank_of(
     """Bank of objects with the rows of `headings_of` and the references of `make`."""
     most_rests = max(len(row["rest"]) for row in rows)
     padded = [_with_rests(row, most_rests) for row in rows]
-    columns = {name: np.stack([row[name] for row in padded]) for name in padded[0]}
+    columns = {}
+    for name in padded[0]:
+        columns[name] = np.stack([row[name] for row in padded])
     headings = Headings(*[columns.pop(f"chosen_{name}") for name in Headings._fields])
     grasped = Grasped(
         points=np.stack([obj.points for obj in objects]).astype(np.float32),

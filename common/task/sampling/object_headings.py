@@ -9,14 +9,10 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import CENTER, Outline
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.headings import (
-    INWARD,
-    Headings,
-    above,
-    max_width,
-    sample_headings,
-    within_reach,
-)
+from congrasp.common.task.sampling.bank import feasible_indices
+from congrasp.common.task.sampling.heading_sampler import HeadingOptions, sample_headings
+from congrasp.common.task.sampling.headings import INWARD, Headings, max_width
+from congrasp.common.task.sampling.reach import above, within_reach
 
 HEADINGS = 256
 """H, headings of an object and region."""
@@ -101,7 +97,7 @@ def headings_of(
     references = _reference_headings(rng, regions.both(), positions, reachable)
     points = rng.permutation(SURFACE_POINTS)[: task.surface_points]
     avoid_labels = obj.non_graspable_points[points]
-    index = _feasible_indices(reachable)
+    index = feasible_indices(reachable)
     has_affordance = reachable[1].any(-1) & avoid_labels.any() & (regions.graspable is not None)
     return {
         "points": obj.points[points].astype(np.float32),
@@ -137,22 +133,14 @@ def _sampled(
     opposed: bool,
 ) -> _Regions:
     """Samples the headings of both regions, see `headings_of`."""
-    inward = scale * INWARD
-    width = max_width(hand_outline, scale)
-
-    def sample(use_affordance: bool) -> Headings | None:
-        return sample_headings(
-            obj,
-            rng,
-            count=HEADINGS,
-            use_affordance=use_affordance,
-            inward=inward,
-            max_width=width,
-            opposed=opposed,
-        )
-
-    whole = sample(use_affordance=False)
-    graspable = sample(use_affordance=True)
+    options = HeadingOptions(
+        count=HEADINGS,
+        inward=scale * INWARD,
+        max_width=max_width(hand_outline, scale),
+        opposed=opposed,
+    )
+    whole = sample_headings(obj, rng, use_affordance=False, options=options)
+    graspable = sample_headings(obj, rng, use_affordance=True, options=options)
     assert whole is not None, "only the graspable region may be unreachable"
     return _Regions(whole, graspable)
 
@@ -219,16 +207,6 @@ def _distances_back(regions: _Regions, positions: np.ndarray, index: np.ndarray)
     before = np.array([headings.position for headings in regions.both()])
     back = np.linalg.norm(positions - before[:, None], axis=-1)
     return np.take_along_axis(back, index, -1).astype(np.float32)
-
-
-def _feasible_indices(reachable: np.ndarray) -> np.ndarray:
-    """Indices (V, R, H) of the true entries of masks (V, R, H), repeated; zeros without any."""
-    index = np.zeros(reachable.shape, int)
-    for region, rest in np.ndindex(reachable.shape[:2]):
-        entries = np.flatnonzero(reachable[region, rest])
-        if len(entries):
-            index[region, rest] = np.resize(entries, HEADINGS)
-    return index
 
 
 def _reference_headings(
