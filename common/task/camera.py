@@ -267,6 +267,7 @@ def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     product = functools.partial(
         jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST
     )
+    # Letters as in the source, with s along the ray and t along the axis.
     a = jnp.sum(ray * ray, -1)[:, :, None]
     e = jnp.maximum(jnp.sum(axis * axis, -1), 1e-12)[:, None]
     f = jnp.sum(axis * away, -1)[:, None]

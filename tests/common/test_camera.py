@@ -242,7 +242,7 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
         assert difference(loaded, tmp_path / kind) <= 3e-6
 
 
-def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
+def test_student_learns_from_its_cloud(tmp_path):
     """A teacher of the full state acts by where the object is; the student's one informative input
     is the cloud.
     """

@@ -178,7 +178,7 @@ def test_few_headings_are_repeated():
     )
 
 
-def test_what_is_wider_than_the_hand_opens_has_no_heading():
+def test_object_wider_than_the_hand_is_refused():
     with pytest.raises(
         TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* but the hand opens to 5\.0 cm"
     ):
@@ -202,7 +202,7 @@ def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
         ) is held
 
 
-def test_a_part_that_cannot_be_held_alone_is_approached_if_that_is_wished():
+def test_lenient_option_approaches_small_parts():
     block = generate(0, "box")
     # One face: fingers meet the sides
     outer = np.flatnonzero(block.points[:, 2] > block.points[:, 2].max() - 0.004)
@@ -312,7 +312,7 @@ def test_a_hand_needs_room_below_its_centre():
     assert feasible(cleared, FLAT, bar)[0]
 
 
-def test_a_hand_may_close_on_its_way_to_the_table_as_far_as_the_object_lets_it():
+def test_clearance_of_partly_closed_hands():
     """Open it reaches 5 cm down, closed 1 cm; its centre is 3 cm high."""
     hand = Outline(
         np.array([[[0, 0, -0.04]], [[0, 0, 0.0]]]), np.array([0.01]), np.array([0.1, 0.05])
@@ -344,7 +344,7 @@ def test_the_width_is_that_of_the_slab_where_fingers_close():
     np.testing.assert_array_equal(local_width(far, points)[:1], 0)
 
 
-def test_a_heading_moves_back_no_further_than_its_grasp_can_bear():
+def test_distance_back_is_limited():
     """At heights of 0 and -10 mm a centre that needs 1 cm moves 1 and 2 cm: the latter only where
     there is no other.
     """
@@ -376,7 +376,7 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
     np.testing.assert_allclose(depth_below(outline(hand), up)[opened], -lowest.min(-1), atol=1e-6)
 
 
-def test_a_card_is_approached_as_well_as_it_goes():
+def test_card_is_approached_with_the_centre_clear():
     card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
     # Fingers reach 6 cm beyond the centre
     tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]), ANY)
@@ -387,7 +387,7 @@ def test_a_card_is_approached_as_well_as_it_goes():
     np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)
 
 
-def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
+def test_opposing_surfaces_of_corner_and_strip():
     """Two edges from the origin along x and y, and a strip 4 cm wide a metre away; along the
     diagonal, turned by 5 degrees, one edge's normal is at 50 degrees to the cross-finger axis."""
     t = np.linspace(0.002, 0.06, 30)[:, None]
@@ -405,7 +405,7 @@ def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
 
 
 @pytest.mark.parametrize(("thick", "over"), [(0.03, True), (0.05, False)])
-def test_where_a_hand_has_no_room_its_fingers_still_close_over_the_table(thick, over):
+def test_closed_fingers_stay_over_the_table(thick, over):
     """3 cm over the table: fingers 12 mm thick that close vertically on 3 cm reach 27 mm down, on 5
     cm 37 mm.
 

@@ -102,7 +102,7 @@ def height(scene, earning):
     return jnp.clip(rise, 0.0, 0.2)
 
 
-def test_nothing_else_must_be_changed():
+def test_outside_constraint_and_term_work():
     done = python("-m", "tests.common.test_outside", timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [

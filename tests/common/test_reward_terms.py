@@ -110,7 +110,7 @@ def base():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_quantity_changes_its_term_alone(name, base):
+def test_quantity_changes_only_its_term(name, base):
     found, before = base
     after = evaluated(reward_terms, replaced(found, *CASES[name]), RewardWeights())
     assert {other for other, value in after.items() if np.any(value != before[other])} == {name}

@@ -139,10 +139,10 @@ def _sampled(
         max_width=max_width(hand_outline, scale),
         opposed=opposed,
     )
-    whole = sample_headings(obj, rng, use_affordance=False, options=options)
+    all_surface = sample_headings(obj, rng, use_affordance=False, options=options)
     graspable = sample_headings(obj, rng, use_affordance=True, options=options)
-    assert whole is not None, "only the graspable region may be unreachable"
-    return _Regions(whole, graspable)
+    assert all_surface is not None, "only the graspable region may be unreachable"
+    return _Regions(all_surface, graspable)
 
 
 def _reach(
