@@ -63,8 +63,8 @@ class HeadingOptions:
     opposed: bool = True
     """Requires opposing surfaces to press on; False applies only the paper's rules."""
     lenient: bool = False
-    """If fingers that close on the graspable region always meet the other one, as on a small
-    handle, accepts candidates whose approach clears the avoid region.
+    """Accepts candidates whose approach clears the avoid region, if fingers that close on the
+    graspable region always meet the other one, as on a small handle.
     """
 
 
