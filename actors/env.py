@@ -24,12 +24,12 @@ from congrasp.common.task import metrics, privileged, sensing
 from congrasp.common.task.camera import Camera
 from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import blocks
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load
 from congrasp.common.task.features import features
 from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from congrasp.common.task.reward import fallen, reward_terms, terms
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.sensing import Readings, Tracker
 from congrasp.common.task.settings import GRAVITY
 from congrasp.common.task.types import Action, Array, Features, Goal, SceneState, Surface

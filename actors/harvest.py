@@ -23,10 +23,10 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import read_kept, write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import make_references, reference_columns
 from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.sampling.references import make_references, reference_columns
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message, encode
 

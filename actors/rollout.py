@@ -21,10 +21,10 @@ from congrasp.actors.stress import Frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import metrics
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
 from congrasp.common.task.privileged import observe_for_teacher
 from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import Action, Array
 
 ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]

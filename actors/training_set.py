@@ -16,7 +16,8 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
 from congrasp.common.task.sampling.build import bank_form, build_bank, with_columns
-from congrasp.common.task.sampling.sets import bank_of, load_for
+from congrasp.common.task.sampling.set_bank import bank_of
+from congrasp.common.task.sampling.set_file import load_for
 from congrasp.common.wire.codec import Message
 
 

@@ -20,7 +20,7 @@ from congrasp.common.hands.mano import VARIABLE as MANO_VARIABLE
 from congrasp.common.io.inputs import open_file
 from congrasp.common.objects.store import SUFFIX as OBJECT_SUFFIX
 from congrasp.common.policy.pretrained import named_policy
-from congrasp.common.task.sampling.sets import SUFFIX as SET_SUFFIX
+from congrasp.common.task.sampling.set_file import SUFFIX as SET_SUFFIX
 
 OBJECTS = "objects"
 CONSTRAINTS = "constraints"

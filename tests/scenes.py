@@ -16,13 +16,13 @@ from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transf
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.affordance import AffordanceGoal
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.constraints.fingers import FingersGoal
 from congrasp.common.task.constraints.force import ForceGoal
 from congrasp.common.task.constraints.heading import HeadingGoal
 from congrasp.common.task.constraints.pose import PoseGoal
 from congrasp.common.task.constraints.trajectory import TrajectoryGoal
 from congrasp.common.task.features import features
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")

@@ -26,8 +26,9 @@ from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling import build
+from congrasp.common.task.sampling import cache
 from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import Array
 from congrasp.services.train.command import untrained
 
@@ -46,9 +47,9 @@ def bank() -> ConstraintBank:
     folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
     with (
         mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
-        mock.patch.object(build, "LEAST_OBJECTS", 1),
+        mock.patch.object(cache, "LEAST_OBJECTS", 1),
     ):
-        return build.build_bank(HAND, TASK, OBJECTS, 0)
+        return build_bank(HAND, TASK, OBJECTS, 0)
 
 
 def bank_of(index: int, points: int) -> ConstraintBank:

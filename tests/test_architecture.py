@@ -123,7 +123,10 @@ def test_constraints_are_used_by_their_hooks():
     has.
     """
     folder = "congrasp.common.task.constraints"
-    shared = {folder, *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority"))}
+    shared = {
+        folder,
+        *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority", "specs")),
+    }
     used = {
         t
         for m, targets in graph(everything=True).items()

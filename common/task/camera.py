@@ -24,8 +24,10 @@ from congrasp.common.task.sensing import Sensors, arrival
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
 
-_TOGETHER = 512
+IMAGES_TOGETHER = 512
 """Images that are taken together: few of a batch are due in one control step."""
+_LEAST_DEPTH = 1e-6
+"""Distance and width that a division may have at least, m."""
 
 
 class Camera(NamedTuple):
@@ -53,6 +55,17 @@ class Capsules(NamedTuple):
     """(C,) m."""
 
 
+class Images(NamedTuple):
+    """Images of B cameras."""
+
+    time: Array
+    """(B,) int control steps since the start of the episodes."""
+    pose: Array
+    """(B, 7) poses of the objects in the images."""
+    surface: Surface
+    """Labelled surface points of the objects, object frame."""
+
+
 def begin(
     task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal
 ) -> Camera:
@@ -66,21 +79,26 @@ def begin(
       surface: their labelled surface points, object frame.
       goal: goals, object frame.
     """
+    batch = len(pose)
     origin = pose[:, :3]
     position = origin + sensors.position_bias
-    quaternion = rotations.multiply(
-        rotations.from_rotation_vector(sensors.rotation_bias), pose[:, 3:]
-    )
-    empty = Surface(
-        jnp.broadcast_to(position[:, None], surface.points.shape), jnp.zeros_like(surface.avoid)
+    turn = rotations.from_rotation_vector(sensors.rotation_bias)
+    quaternion = rotations.multiply(turn, pose[:, 3:])
+    empty_cloud = Surface(
+        points=jnp.broadcast_to(position[:, None], surface.points.shape),
+        avoid=jnp.zeros_like(surface.avoid),
     )
     if surface.normals is not None:
-        empty = empty._replace(normals=jnp.zeros_like(surface.normals))
-    poses = jnp.broadcast_to(pose[:, None], (len(pose), steps, 7))
-    camera = Camera(sensors, origin, poses, goal_in_world(task, goal, position, quaternion), empty)
-    return _image(
-        camera, jnp.zeros(len(pose), jnp.int32), jnp.ones(len(pose), bool), pose, surface, None
+        empty_cloud = empty_cloud._replace(normals=jnp.zeros_like(surface.normals))
+    camera = Camera(
+        sensors=sensors,
+        origin=origin,
+        poses=jnp.broadcast_to(pose[:, None], (batch, steps, 7)),
+        goal=goal_in_world(task, goal, position, quaternion),
+        cloud=empty_cloud,
     )
+    images = Images(time=jnp.zeros(batch, jnp.int32), pose=pose, surface=surface)
+    return with_images(camera, images, jnp.ones(batch, bool), None)
 
 
 def look(
@@ -103,12 +121,15 @@ def look(
     pose = jnp.concatenate([state.object_position, state.object_quaternion], -1)
     poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)
     turn = rotations.euler_to_quaternion(state.u[:, 3:])
-    wrist = rotations.compose_pose(start.base_position, start.base_quaternion, state.u[:, :3], turn)
+    position, quaternion = rotations.compose_pose(
+        start.base_position, start.base_quaternion, state.u[:, :3], turn
+    )
 
     def capsules(rows: Array) -> Capsules:
-        return hand_capsules(hand, *(each[rows] for each in (state.q, *wrist)))
+        return hand_capsules(hand, state.q[rows], position[rows], quaternion[rows])
 
-    return _image(camera._replace(poses=poses), time, due, arrived, surface, capsules)
+    images = Images(time=time, pose=arrived, surface=surface)
+    return with_images(camera._replace(poses=poses), images, due, capsules)
 
 
 def world(batch: int) -> Array:
@@ -121,16 +142,14 @@ def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> C
     turn, shift = kinematics.link_transforms(hand, q)
     links = hand.capsule_links
     ends = rotations.apply(turn[:, links], jnp.asarray(hand.capsules)) + shift[:, links, None]
-    flat = rotations.transform(position, quaternion, ends.reshape(len(q), -1, 3))
-    return Capsules(flat.reshape(ends.shape), jnp.asarray(hand.capsule_radii))
+    in_world = rotations.transform(position, quaternion, ends.reshape(len(q), -1, 3))
+    return Capsules(in_world.reshape(ends.shape), jnp.asarray(hand.capsule_radii))
 
 
-def _image(
+def with_images(
     camera: Camera,
-    time: Array,
+    images: Images,
     due: Array,
-    pose: Array,
-    surface: Surface,
     hand: Callable[[Array], Capsules] | None,
 ) -> Camera:
     """Replaces the clouds of cameras with a due image (B,) in which any point is visible, a small
@@ -138,69 +157,74 @@ def _image(
 
     Args:
       camera: the cameras.
-      time: (B,) int control steps since the start of the episodes.
+      images: images of all B cameras, of which the due ones are taken.
       due: (B,) bool.
-      pose: (B, 7) poses of the objects in the images.
-      surface: labelled surface points, object frame.
       hand: returns the capsules of these environments' hands; None if the hands hide nothing.
     """
-    # For traced rows
-    camera, time, pose, surface = jax.tree.map(jnp.asarray, (camera, time, pose, surface))
+    # Rows of NumPy arrays cannot be selected by traced indices.
+    camera, images = jax.tree.map(jnp.asarray, (camera, images))
     batch = len(due)
-    together = min(batch, _TOGETHER)
+    together = min(batch, IMAGES_TOGETHER)
 
-    def some(carry: tuple[Surface, Array]) -> tuple[Surface, Array]:
+    def take_some(carry: tuple[Surface, Array]) -> tuple[Surface, Array]:
+        """Takes a batch of the images that are left; returns the clouds and which are left."""
         cloud, left = carry
         rows = jnp.nonzero(left, size=together, fill_value=batch)[0]
-        seen = camera.sensors, camera.origin, time, pose, surface
-        visible, fresh = _taken(hand and hand(rows), *jax.tree.map(lambda x: x[rows], seen))
+        capsules = None if hand is None else hand(rows)
+        inputs = camera.sensors, camera.origin, images
+        sensors, origin, selected = jax.tree.map(lambda array: array[rows], inputs)
+        visible, fresh = _taken(capsules, sensors, origin, selected)
         replaced = jnp.where(jnp.any(visible, -1), rows, batch)
-        cloud = jax.tree.map(lambda x, new: x.at[replaced].set(new, mode="drop"), cloud, fresh)
+        cloud = jax.tree.map(
+            lambda array, new: array.at[replaced].set(new, mode="drop"), cloud, fresh
+        )
         return cloud, left.at[rows].set(False, mode="drop")
 
-    return camera._replace(
-        cloud=jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (camera.cloud, due))[0]
-    )
+    def is_any_left(carry: tuple[Surface, Array]) -> Array:
+        _, left = carry
+        return jnp.any(left)
+
+    cloud, _ = jax.lax.while_loop(is_any_left, take_some, (camera.cloud, due))
+    return camera._replace(cloud=cloud)
 
 
 def _taken(
-    hand: Capsules | None,
-    sensors: Sensors,
-    origin: Array,
-    time: Array,
-    pose: Array,
-    surface: Surface,
+    hand: Capsules | None, sensors: Sensors, origin: Array, images: Images
 ) -> tuple[Array, Surface]:
     """Returns which points (B, N) are visible, and the clouds of B images, world frame."""
-    count = surface.points.shape[1]
-
-    def errors(key: Array, time: Array) -> tuple[Array, Array]:
-        noise, loss = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time))
-        return jax.random.normal(noise, (count,)), jax.random.uniform(loss, (count,))
-
-    noise, luck = jax.vmap(errors)(sensors.key, time)
+    surface = images.surface
+    pose = images.pose
+    depth_noise, luck = _image_noise(sensors.key, images.time, surface.points.shape[1])
     eye = origin + sensors.eye
     points = rotations.transform(pose[:, :3], pose[:, 3:], surface.points)
     visible = facing(eye, points) & (luck >= sensors.dropout[:, None])
     if hand is not None:
         visible &= ~behind(eye, points, hand)
     ray = points - eye[:, None]
-    ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), 1e-6)
-    measured = points + (sensors.position_noise[:, None] * noise)[..., None] * ray
-    shift, turn = (
-        origin + sensors.position_bias,
-        rotations.from_rotation_vector(sensors.rotation_bias),
-    )
+    ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), _LEAST_DEPTH)
+    measured = points + (sensors.position_noise[:, None] * depth_noise)[..., None] * ray
+    shift = origin + sensors.position_bias
+    turn = rotations.from_rotation_vector(sensors.rotation_bias)
     measured = rotations.transform(shift, turn, measured - origin[:, None])
     index = _filled(visible)
     cloud = Surface(
-        jnp.take_along_axis(measured, index[..., None], 1),
-        jnp.take_along_axis(surface.avoid, index, 1),
+        points=jnp.take_along_axis(measured, index[..., None], 1),
+        avoid=jnp.take_along_axis(surface.avoid, index, 1),
     )
     if surface.normals is not None:
-        shown = rotations.transform(shift, turn, sensors.eye[:, None])[:, 0]
-        cloud = cloud._replace(normals=estimated_normals(cloud.points, shown))
+        biased_eye = rotations.transform(shift, turn, sensors.eye[:, None])[:, 0]
+        cloud = cloud._replace(normals=estimated_normals(cloud.points, biased_eye))
     return visible, cloud
+
+
+def _image_noise(keys: Array, time: Array, count: int) -> tuple[Array, Array]:
+    """Normal numbers and uniform ones (B, N) for the N points of an image."""
+
+    def of_image(key: Array, time: Array) -> tuple[Array, Array]:
+        noise, loss = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time))
+        return jax.random.normal(noise, (count,)), jax.random.uniform(loss, (count,))
+
+    return jax.vmap(of_image)(keys, time)
 
 
 def facing(eye: Array, points: Array) -> Array:
@@ -214,18 +238,20 @@ def facing(eye: Array, points: Array) -> Array:
     quaternion = rotations.frame_from_axes(middle - eye, jnp.array((0.0, 0.0, 1.0)))
     depth, *across = jnp.moveaxis(rotations.inverse_transform(eye, quaternion, points), -1, 0)
     cells = max(int(points.shape[1] ** 0.5 / 2), 1)
-    place, sides = jnp.zeros(depth.shape, jnp.int32), []
-    for tangent in (each / depth for each in across):
+    cell = jnp.zeros(depth.shape, jnp.int32)
+    sides = []
+    for coordinate in across:
+        tangent = coordinate / depth
         low = jnp.min(tangent, -1, keepdims=True)
-        side = jnp.maximum(jnp.max(tangent, -1, keepdims=True) - low, 1e-6) / cells
-        place = place * cells + jnp.clip(jnp.floor((tangent - low) / side), 0, cells - 1).astype(
-            jnp.int32
-        )
+        extent = jnp.maximum(jnp.max(tangent, -1, keepdims=True) - low, _LEAST_DEPTH)
+        side = extent / cells
+        column = jnp.clip(jnp.floor((tangent - low) / side), 0, cells - 1).astype(jnp.int32)
+        cell = cell * cells + column
         sides.append(side)
     row = jnp.arange(len(points))[:, None]
-    nearest = jnp.full((len(points), cells**2), jnp.inf).at[row, place].min(depth)
-    thick = jnp.maximum(*sides) * jnp.linalg.norm(middle - eye, axis=-1, keepdims=True)
-    return depth <= jnp.take_along_axis(nearest, place, 1) + thick
+    nearest = jnp.full((len(points), cells**2), jnp.inf).at[row, cell].min(depth)
+    tolerance = jnp.maximum(*sides) * jnp.linalg.norm(middle - eye, axis=-1, keepdims=True)
+    return depth <= jnp.take_along_axis(nearest, cell, 1) + tolerance
 
 
 def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
@@ -234,15 +260,19 @@ def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     The least distance between ray and axis follows Ericson 2005, Real-Time Collision Detection,
     section 5.1.9.
     """
-    ray, axis = points - eye[:, None], capsules.ends[:, :, 1] - capsules.ends[:, :, 0]
-    away = eye[:, None] - capsules.ends[:, :, 0]
+    start = capsules.ends[:, :, 0]
+    ray = points - eye[:, None]
+    axis = capsules.ends[:, :, 1] - start
+    away = eye[:, None] - start
     product = functools.partial(
         jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST
     )
+    # Letters as in the source, with s along the ray and t along the axis.
     a = jnp.sum(ray * ray, -1)[:, :, None]
     e = jnp.maximum(jnp.sum(axis * axis, -1), 1e-12)[:, None]
     f = jnp.sum(axis * away, -1)[:, None]
-    b, c = product(axis), product(away)
+    b = product(axis)
+    c = product(away)
     s = jnp.clip((b * f - c * e) / jnp.maximum(a * e - b * b, 1e-12), 0.0, 1.0)
     t = jnp.clip((b * s + f) / e, 0.0, 1.0)
     s = jnp.clip((b * t - c) / a, 0.0, 1.0)
@@ -254,24 +284,26 @@ def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     return jnp.any(squared <= capsules.radii**2, -1)
 
 
-def _filled(which: Array) -> Array:
+def _filled(flags: Array) -> Array:
     """Indices (B, N) of the true flags (B, N), repeated evenly until there are N; zeros if there is
     none.
     """
-    size, row = which.shape[1], jnp.arange(len(which))[:, None]
-    rank = jnp.where(which, jnp.cumsum(which, -1) - 1, size)
-    numbers = jnp.broadcast_to(jnp.arange(size), which.shape)
-    found = jnp.zeros(which.shape, jnp.int32).at[row, rank].set(numbers, mode="drop")
-    return jnp.take_along_axis(
-        found, jnp.arange(size) * jnp.sum(which, -1, keepdims=True) // size, 1
-    )
+    size = flags.shape[1]
+    row = jnp.arange(len(flags))[:, None]
+    rank = jnp.where(flags, jnp.cumsum(flags, -1) - 1, size)
+    numbers = jnp.broadcast_to(jnp.arange(size), flags.shape)
+    true_first = jnp.zeros(flags.shape, jnp.int32).at[row, rank].set(numbers, mode="drop")
+    spread = jnp.arange(size) * jnp.sum(flags, -1, keepdims=True) // size
+    return jnp.take_along_axis(true_first, spread, 1)
 
 
 def goal_in_world(task: TaskSettings, goal: Goal, position: Array, quaternion: Array) -> Goal:
     """Returns goals of the object frame in the world frame, for objects at (B, 3), (B, 4)."""
 
     def turned(value: Array, turn: Callable[[Array, Array], Array]) -> Array:
-        return turn(jnp.broadcast_to(_rows(quaternion, value), (*value.shape[:-1], 4)), value)
+        """Applies a rotation function to the objects' orientations and a goal array."""
+        orientation = jnp.broadcast_to(_rows(quaternion, value), (*value.shape[:-1], 4))
+        return turn(orientation, value)
 
     for constraint in known(task):
         moved = {}

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import known
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import wrist_to_joints
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import ControlConfig, TaskSettings
 from congrasp.common.task.types import Action, Array, SceneState
 
@@ -40,12 +40,16 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
     for constraint in known(scene.task):
         if not constraint.guides:
             continue
-        own = constraint.guidance(scene, current=control.follow_object)
+        position, quaternion = constraint.guidance(scene, current=control.follow_object)
         if pose is None:
-            pose = own
-        else:
-            active = scene.goal.active[constraint.guides][:, None]
-            pose = jnp.where(active, own[0], pose[0]), jnp.where(active, own[1], pose[1])
+            pose = position, quaternion
+            continue
+        weaker_position, weaker_quaternion = pose
+        active = scene.goal.active[constraint.guides][:, None]
+        pose = (
+            jnp.where(active, position, weaker_position),
+            jnp.where(active, quaternion, weaker_quaternion),
+        )
     assert pose is not None, "the heading guides if nothing else does"
     return pose
 
@@ -58,13 +62,14 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     acceleration (`_lead`). After the table is removed, u_tgt also compensates the load
     (`wrist_load`), and the limits apply relative to that.
     """
-    hand, state = scene.hand, scene.state
-    fingers = len(hand.motors)
-    motors = motor_positions(hand, state.q_target) + control.finger_scale * action[..., :fingers]
+    hand = scene.hand
+    state = scene.state
+    count = len(hand.motors)
+    motors = motor_positions(hand, state.q_target) + control.finger_scale * action[..., :count]
     if control.finger_guidance:
         motors += _finger_guidance(scene, control.finger_guidance)
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
-    lead = wrist_lead(hand, control, guided(scene, control), action[..., fingers:])
+    lead = wrist_lead(hand, control, guided(scene, control), action[..., count:])
     return Action(q_target, state.u + lead + carried_lead(hand, state))
 
 
@@ -76,11 +81,11 @@ def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     from the object to `approach_position_limit` at twice that.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
-    slow, fast = control.closing_position_limit, control.approach_position_limit
+    slow = control.closing_position_limit
+    fast = control.approach_position_limit
     share = jnp.clip(gap / control.closing_distance - 1.0, 0.0, 1.0)
-    return jnp.where(
-        scene.state.table, slow + share * (fast - slow), control.guidance_position_limit
-    )
+    approach_limit = slow + share * (fast - slow)
+    return jnp.where(scene.state.table, approach_limit, control.guidance_position_limit)
 
 
 class Guided(NamedTuple):
@@ -98,9 +103,8 @@ class Guided(NamedTuple):
     def bounded(self, control: ControlConfig) -> Array:
         """Returns the lead (..., 6) of the guidance alone, before the limits of acceleration."""
         slides = _limit(self.ahead[..., :3], self.limit[..., None])
-        return jnp.concatenate(
-            [slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1
-        )
+        hinges = _limit(self.ahead[..., 3:], control.guidance_rotation_limit)
+        return jnp.concatenate([slides, hinges], -1)
 
 
 def guided(scene: Scene, control: ControlConfig) -> Guided:
@@ -110,43 +114,45 @@ def guided(scene: Scene, control: ControlConfig) -> Guided:
     return Guided(ahead, _position_limit(scene, control), state.u_velocity, state.table)
 
 
-def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Array) -> Array:
+def wrist_lead(hand: Hand, control: ControlConfig, wrist: Guided, residual: Array) -> Array:
     """Returns u_tgt - u (..., 6) without the part that carries the load, see `decode`.
 
     Args:
       hand: the hand, for its servos.
       control: limits and scales.
-      given: guidance and state of the wrist.
+      wrist: guidance and state of the wrist.
       residual: (..., 6) wrist part of the action.
     """
-    share = jnp.where(given.table, 1.0, control.hold_acceleration)
-    leads = []
-    for part, scale, farthest, hardest in (
-        (
-            slice(0, 3),
-            control.wrist_position_scale,
-            given.limit[..., None],
-            control.wrist_acceleration,
-        ),
-        (
-            slice(3, 6),
-            control.wrist_rotation_scale,
-            control.guidance_rotation_limit,
-            control.wrist_angular_acceleration,
-        ),
-    ):
-        stiffness, damping = hand.wrist_servos[:, part.start]
-        servo = _Servo(stiffness, damping, farthest, hardest)
-        leads.append(
-            _lead(
-                servo,
-                given.ahead[..., part],
-                scale * residual[..., part],
-                given.velocity[..., part],
-                share,
-            )
-        )
-    return jnp.concatenate(leads, -1)
+    slide_stiffness, slide_damping = hand.wrist_servos[:, 0]
+    hinge_stiffness, hinge_damping = hand.wrist_servos[:, 3]
+    slide_servo = _Servo(
+        stiffness=slide_stiffness,
+        damping=slide_damping,
+        max_lead=wrist.limit[..., None],
+        max_acceleration=control.wrist_acceleration,
+    )
+    hinge_servo = _Servo(
+        stiffness=hinge_stiffness,
+        damping=hinge_damping,
+        max_lead=control.guidance_rotation_limit,
+        max_acceleration=control.wrist_angular_acceleration,
+    )
+    share = jnp.where(wrist.table, 1.0, control.hold_acceleration)
+    slides = _lead(
+        slide_servo,
+        wrist.ahead[..., :3],
+        control.wrist_position_scale * residual[..., :3],
+        wrist.velocity[..., :3],
+        share,
+    )
+    hinges = _lead(
+        hinge_servo,
+        wrist.ahead[..., 3:6],
+        control.wrist_rotation_scale * residual[..., 3:6],
+        wrist.velocity[..., 3:6],
+        share,
+    )
+    return jnp.concatenate([slides, hinges], -1)
 
 
 def carried_lead(hand: Hand, state: SceneState) -> Array:
@@ -179,9 +185,8 @@ def track_load(
     """
     stiffness, _ = hand.wrist_servos
     decay = task.control_dt * task.control.load_rate
-    gained = task.control_dt * stiffness * (u_target - u) + decay * _generalised_speed(
-        hand, task, u, u_velocity
-    )
+    speed = _generalised_speed(hand, task, u, u_velocity)
+    gained = task.control_dt * stiffness * (u_target - u) + decay * speed
     return (momentum + gained) / (1.0 + decay)
 
 
@@ -207,9 +212,9 @@ class _Servo(NamedTuple):
     """kp / m, 1/s^2."""
     damping: Array | float
     """kv / m, 1/s."""
-    farthest: Array | float
+    max_lead: Array | float
     """Greatest lead (..., 1) of the target over the joint, m or rad."""
-    hardest: float
+    max_acceleration: float
     """Greatest acceleration, m/s^2 or rad/s^2; 0 for no limit."""
 
 
@@ -227,21 +232,24 @@ def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: 
       velocity: (..., 3) speeds of the joints.
       share: (...,) share of the greatest acceleration, except for braking.
     """
-    rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
+    rate = servo.stiffness / servo.damping
+    max_acceleration = jnp.asarray(servo.max_acceleration)
     steady = velocity / rate
     slowing = rate * jnp.linalg.norm(velocity, axis=-1)
-    most = jnp.clip(slowing, share * hardest, hardest)[..., None] / servo.stiffness
-    wanted = _limit(_limit(ahead, servo.farthest) + residual, servo.farthest)
-    return steady + _limit(wanted - steady, jnp.where(hardest > 0, most, jnp.inf))
+    acceleration = jnp.clip(slowing, share * max_acceleration, max_acceleration)
+    max_change = acceleration[..., None] / servo.stiffness
+    target = _limit(_limit(ahead, servo.max_lead) + residual, servo.max_lead)
+    limited = jnp.where(max_acceleration > 0, max_change, jnp.inf)
+    return steady + _limit(target - steady, limited)
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
     """(B, M) rad by which motors move towards the closed hand, at most `rate`, from the middle of
     the approach on.
     """
-    begun = 2.0 * scene.state.time >= scene.task.approach_steps
+    closing = 2.0 * scene.state.time >= scene.task.approach_steps
     ahead = motor_positions(scene.hand, jnp.array(scene.hand.q_closed) - scene.state.q_target)
-    return begun[:, None] * jnp.clip(ahead, -rate, rate)
+    return closing[:, None] * jnp.clip(ahead, -rate, rate)
 
 
 def _limit(vector: Array, length: Array | float) -> Array:

@@ -22,13 +22,16 @@ def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Arra
       points: (B, P, 3) keypoints of the hand.
       fingers: (B, G) bool, selected fingers, thumb first; all by default.
     """
-    whole = kinematics.hand_center(hand, points)
+    of_all_fingers = kinematics.hand_center(hand, points)
     if fingers is None:
-        return whole
-    tips, counted = points[..., len(hand.links) :, :], fingers[..., 1:, None].astype(jnp.float32)
+        return of_all_fingers
+    tips = points[..., len(hand.links) :, :]
+    thumb = tips[..., 0, :]
+    counted = fingers[..., 1:, None].astype(jnp.float32)
     others = jnp.sum(tips[..., 1:, :] * counted, -2) / jnp.maximum(jnp.sum(counted, -2), 1.0)
     # If all fingers are selected, the result is bitwise the same as without a selection.
-    return jnp.where(jnp.all(fingers, -1, keepdims=True), whole, 0.5 * (tips[..., 0, :] + others))
+    are_all = jnp.all(fingers, -1, keepdims=True)
+    return jnp.where(are_all, of_all_fingers, 0.5 * (thumb + others))
 
 
 def wrist_pose(state: SceneState) -> tuple[Array, Array]:
@@ -82,22 +85,22 @@ def nearest_index(squared: Array) -> Array:
     Non-negative floats are ordered like their bits, and the last bits hold the index: one minimum
     along a vector's lanes, several times faster than `argmin`.
     """
-    n = squared.shape[-2]
-    room = (1 << (n - 1).bit_length()) - 1
-    key = jax.lax.bitcast_convert_type(squared, jnp.int32) & ~room | jnp.arange(n)[:, None]
-    return jnp.min(key, -2) & room
+    count = squared.shape[-2]
+    index_bits = (1 << (count - 1).bit_length()) - 1
+    distance_bits = jax.lax.bitcast_convert_type(squared, jnp.int32) & ~index_bits
+    key = distance_bits | jnp.arange(count)[:, None]
+    return jnp.min(key, -2) & index_bits
 
 
-def least_distance(points: Array, which: Array, target: Array) -> Array:
-    """Least distance (B,) from targets (B, 3) to the points (B, N, 3) selected by `which` (B, N);
-    inf if none is.
+def least_distance(points: Array, selected: Array, target: Array) -> Array:
+    """Least distance (B,) from targets (B, 3) to the `selected` (B, N) points (B, N, 3); inf if
+    none is.
     """
-    return jnp.min(
-        jnp.where(which, jnp.linalg.norm(points - target[:, None], axis=-1), jnp.inf), -1
-    )
+    distance = jnp.linalg.norm(points - target[:, None], axis=-1)
+    return jnp.min(jnp.where(selected, distance, jnp.inf), -1)
 
 
-def least_distance_to_segment(points: Array, which: Array, start: Array, end: Array) -> Array:
+def least_distance_to_segment(points: Array, selected: Array, start: Array, end: Array) -> Array:
     """Least distance (B,) from the selected points to segments from start to end (B, 3); inf if
     none is selected.
     """
@@ -105,7 +108,8 @@ def least_distance_to_segment(points: Array, which: Array, start: Array, end: Ar
     length = jnp.sum(along**2, -1)[:, None]
     t = jnp.clip(jnp.einsum("bni,bi->bn", points - start[:, None], along) / length, 0.0, 1.0)
     closest = start[:, None] + t[..., None] * along[:, None]
-    return jnp.min(jnp.where(which, jnp.linalg.norm(points - closest, axis=-1), jnp.inf), -1)
+    distance = jnp.linalg.norm(points - closest, axis=-1)
+    return jnp.min(jnp.where(selected, distance, jnp.inf), -1)
 
 
 def square(x: Array) -> Array:
@@ -118,11 +122,13 @@ def squash(force: Array) -> Array:
     return force / (jnp.linalg.norm(force, axis=-1, keepdims=True) + FORCE_SCALE)
 
 
-def share(part: Array, whole: Array) -> tuple[Array, Array]:
+def share(part: Array, total: Array) -> tuple[Array, Array]:
     """Numerator and denominator (B,) of a ratio error: numbers of true flags in a part (B, N) and
-    in the whole.
+    in total.
     """
-    return jnp.sum(part, -1).astype(jnp.float32), jnp.sum(whole, -1).astype(jnp.float32)
+    numerator = jnp.sum(part, -1).astype(jnp.float32)
+    denominator = jnp.sum(total, -1).astype(jnp.float32)
+    return numerator, denominator
 
 
 def flat(x: Array) -> Array:

@@ -14,7 +14,7 @@ from congrasp.common.config import CurriculumConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import TaskConfig
 
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
+_NO_CHANGES: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"
 """Method of policies with a robot's sensors; `congrasp train --teacher` distils them."""
 CAMERA = "camera"
@@ -28,17 +28,23 @@ hours.
 """
 
 
+def _unchanged(run: RunConfig) -> RunConfig:
+    """Returns the run with its own curriculum."""
+    return run
+
+
 class Method(NamedTuple):
     """Changes by a method, and its requirements."""
 
     meaning: str
-    task: Mapping[str, Any] = _NOTHING
+    """Description in help and tables."""
+    task: Mapping[str, Any] = _NO_CHANGES
     """Changed fields of `TaskConfig`."""
-    control: Mapping[str, Any] = _NOTHING
+    control: Mapping[str, Any] = _NO_CHANGES
     """Changed fields of `ControlConfig`."""
-    weights: Mapping[str, float] = _NOTHING
+    weights: Mapping[str, float] = _NO_CHANGES
     """Changed fields of `RewardWeights`, also at the end of the curriculum's ramp."""
-    schedule: Callable[[RunConfig], RunConfig] = lambda run: run
+    schedule: Callable[[RunConfig], RunConfig] = _unchanged
     """Changes the curriculum of a run."""
     needs: tuple[str, ...] = ()
     """Constraints of which every episode must have one; empty if the heading is enough."""
@@ -50,19 +56,21 @@ def _two_phases(run: RunConfig) -> RunConfig:
     """Stationary objects first, then free ones; the weights of the ramp's end apply from the change
     on.
     """
-    free, curriculum = max(round(STATIONARY_SHARE * run.updates), 1), run.curriculum
-    ramp = (free - 1, free) if curriculum.ramped else curriculum.ramp
-    return dataclasses.replace(
-        run, curriculum=dataclasses.replace(curriculum, stationary_updates=free, ramp=ramp)
+    stationary_updates = max(round(STATIONARY_SHARE * run.updates), 1)
+    ramp = run.curriculum.ramp
+    if run.curriculum.ramped:
+        ramp = (stationary_updates - 1, stationary_updates)
+    curriculum = dataclasses.replace(
+        run.curriculum, stationary_updates=stationary_updates, ramp=ramp
     )
+    return dataclasses.replace(run, curriculum=curriculum)
 
 
 def _single_stage(run: RunConfig) -> RunConfig:
     """Free objects and the weights of the ramp's end from the first update on."""
-    last = run.curriculum.reward if run.curriculum.ramped else run.task.reward
-    return dataclasses.replace(
-        run, curriculum=CurriculumConfig(), task=dataclasses.replace(run.task, reward=last)
-    )
+    weights = run.curriculum.reward if run.curriculum.ramped else run.task.reward
+    task = dataclasses.replace(run.task, reward=weights)
+    return dataclasses.replace(run, curriculum=CurriculumConfig(), task=task)
 
 
 METHODS = {
@@ -176,7 +184,9 @@ def evaluated_as(task: TaskConfig, name: str, source: str) -> TaskConfig:
 def takes(name: str, row: str) -> bool:
     """True if a method supports the constraints of a row, which are joined by `+`."""
     needs = get_method(name).needs
-    return not needs or not set(needs).isdisjoint(row.split("+"))
+    if not needs:
+        return True
+    return any(constraint in needs for constraint in row.split("+"))
 
 
 def _task(task: TaskConfig, name: str) -> TaskConfig:

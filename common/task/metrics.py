@@ -7,13 +7,16 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 
 from congrasp.common.task.constraints import blocks, error_specs, known
-from congrasp.common.task.constraints.base import ErrorSpec, Scene
+from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import terms
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
 FORCES = ("force_sum", "force_link_max")
+"""Metrics of the contact forces, N."""
 DIVERGED = "diverged"
+"""Metric of an episode whose simulation became unstable."""
 
 
 def metric_names(task: TaskSettings) -> tuple[str, ...]:
@@ -37,10 +40,9 @@ def metric_names(task: TaskSettings) -> tuple[str, ...]:
 
 def episode_fields(task: TaskSettings) -> tuple[str, ...]:
     """Wire names of an actor's report of a finished episode: metrics, then sums of reward terms."""
-    return (
-        *(f"episode/{name}" for name in metric_names(task)),
-        *(f"term/{name}" for name in terms(task)),
-    )
+    metrics = [f"episode/{name}" for name in metric_names(task)]
+    reward = [f"term/{name}" for name in terms(task)]
+    return (*metrics, *reward)
 
 
 def specs(task: TaskSettings) -> tuple[ErrorSpec, ...]:
@@ -52,15 +54,12 @@ def errors(scene: Scene) -> dict[str, tuple[Array, Array]]:
     """Numerator and denominator (B,) of every error in one step, whether or not its constraint is
     active.
     """
-    found = {
-        name: value
-        for constraint in known(scene.task)
-        for name, value in constraint.measure(scene).items()
-    }
     one = jnp.ones_like(scene.state.time)
-    return {
-        name: value if isinstance(value, tuple) else (value, one) for name, value in found.items()
-    }
+    ratios = {}
+    for constraint in known(scene.task):
+        for name, value in constraint.measure(scene).items():
+            ratios[name] = value if isinstance(value, tuple) else (value, one)
+    return ratios
 
 
 def accumulate(
@@ -81,16 +80,27 @@ def accumulate(
     """
     total = {}
     for spec in specs(task):
-        counts = (approach if spec.window == "approach" else hold).astype(jnp.float32)
-        for name, value in zip((spec.name, f"{spec.name}/of"), step[spec.name], strict=True):
-            total[name] = sums[name] + value * counts
+        in_window = approach if spec.window == "approach" else hold
+        counts = in_window.astype(jnp.float32)
+        numerator, denominator = step[spec.name]
+        total[spec.name] = sums[spec.name] + numerator * counts
+        total[_denominator(spec)] = sums[_denominator(spec)] + denominator * counts
     return total
 
 
 def empty_sums(task: TaskSettings, batch: int) -> dict[str, Array]:
     """Sums before the first step."""
     zero = jnp.zeros(batch)
-    return {name: zero for spec in specs(task) for name in (spec.name, f"{spec.name}/of")}
+    sums = {}
+    for spec in specs(task):
+        sums[spec.name] = zero
+        sums[_denominator(spec)] = zero
+    return sums
+
+
+def _denominator(spec: ErrorSpec) -> str:
+    """Name of the sum of an error's denominators."""
+    return f"{spec.name}/of"
 
 
 def episode_errors(task: TaskSettings, sums: Mapping[str, Array]) -> dict[str, Array]:
@@ -99,6 +109,6 @@ def episode_errors(task: TaskSettings, sums: Mapping[str, Array]) -> dict[str, A
     The value is zero if there were no steps, as for errors of the hold when the table stays.
     """
     return {
-        spec.name: sums[spec.name] / jnp.maximum(sums[f"{spec.name}/of"], 1.0)
+        spec.name: sums[spec.name] / jnp.maximum(sums[_denominator(spec)], 1.0)
         for spec in specs(task)
     }

@@ -20,17 +20,22 @@ import jax.numpy as jnp
 
 from congrasp.common.task.types import Array
 
-_PLANE = 6
+_PLANE_NEIGHBOURS = 6
 """Neighbours of a plane."""
-_NEAR, _AROUND = 10, 16
-"""Neighbours of the mean height, and of the paraboloid including the point."""
-_BETTER = 25.0
+_HEIGHT_NEIGHBOURS = 10
+"""Neighbours of the mean height."""
+_PARABOLOID_POINTS = 16
+"""Points of the paraboloid: neighbours and the point itself."""
+_BETTER_FIT = 25.0
 """Factor by which a neighbour's plane must fit better than a point's own."""
-_CONVEX, _SHEET = 3.0, 20.0
-"""Weights of the cues of height, relative to that of the field."""
-_COPLANAR = 0.15
+_CONVEX_WEIGHT = 3.0
+"""Weight of the mean height, relative to that of the field."""
+_PARABOLOID_WEIGHT = 20.0
+"""Weight of the height above the paraboloid, relative to that of the field."""
+_MAX_COPLANAR_SLOPE = 0.15
 """Largest height over distance of neighbours in one plane."""
 _SMALL = 1e-9
+"""Least divisor."""
 
 
 @jax.jit
@@ -51,11 +56,18 @@ def estimated_normals(points: Array, eye: Array | None = None) -> Array:
     if eye is None:
         normal = jax.vmap(_outward)(local)
     else:
-        ahead = (eye[:, None] - middle) / jnp.maximum(size, _SMALL) - local
-        normal = jax.vmap(lambda cloud: _planes(cloud, *_neighbours(cloud, _PLANE + 1)))(local)
-        normal = jnp.where(jnp.sum(normal * ahead, -1, keepdims=True) < 0.0, -normal, normal)
+        to_eye = (eye[:, None] - middle) / jnp.maximum(size, _SMALL) - local
+        normal = jax.vmap(_plane_normals)(local)
+        faces_away = jnp.sum(normal * to_eye, -1, keepdims=True) < 0.0
+        normal = jnp.where(faces_away, -normal, normal)
     first = jnp.argmax(jnp.all(points[:, :, None] == points[:, None], -1), -1)
     return jnp.take_along_axis(normal, first[..., None], 1)
+
+
+def _plane_normals(points: Array) -> Array:
+    """Unit normals (N, 3) of planes through the neighbours of points (N, 3), on either side."""
+    index, differs = _neighbours(points, _PLANE_NEIGHBOURS + 1)
+    return _planes(points, index, differs)
 
 
 def _neighbours(points: Array, count: int) -> tuple[Array, Array]:
@@ -85,7 +97,7 @@ def _planes(points: Array, index: Array, differs: Array) -> Array:
     misfit = jnp.where(differs, thickness[index] + above**2, jnp.inf)
     best = jnp.argmin(misfit, -1)
     other = jnp.take_along_axis(index, best[:, None], -1)[:, 0]
-    better = _BETTER * jnp.min(misfit, -1) < misfit[:, 0]
+    better = _BETTER_FIT * jnp.min(misfit, -1) < misfit[:, 0]
     return jnp.where(better[:, None], normal[other], normal)
 
 
@@ -116,23 +128,22 @@ def _outward(points: Array) -> Array:
     """Outward unit normals (N, 3) of one object's cloud (N, 3) with a root mean square radius of
     1.
     """
-    index, differs = _neighbours(points, _AROUND)
-    normal = _planes(points, index[:, : _PLANE + 1], differs[:, : _PLANE + 1])
+    index, differs = _neighbours(points, _PARABOLOID_POINTS)
+    in_plane = slice(_PLANE_NEIGHBOURS + 1)
+    normal = _planes(points, index[:, in_plane], differs[:, in_plane])
     weight = differs.astype(jnp.float32)
     offset = points[index] - points[:, None]
     height = jnp.sum(offset * normal[:, None], -1)
     distance = jnp.linalg.norm(offset, axis=-1)
-    near = slice(1, _NEAR + 1)
-    convex = -jnp.sum((height * weight)[:, near], -1) / jnp.maximum(
-        jnp.sum((distance * weight)[:, near], -1), _SMALL
-    )
-    vote = (
-        _field(points, normal)
-        + _CONVEX * convex
-        + _SHEET * _above_paraboloid(normal, offset, height, weight)
-    )
-    rise = jnp.maximum(jnp.abs(height), jnp.abs(jnp.sum(offset * normal[index], -1)))
-    agree = weight * (rise < _COPLANAR * distance) * jnp.sum(normal[:, None] * normal[index], -1)
+    near = slice(1, _HEIGHT_NEIGHBOURS + 1)
+    mean_distance = jnp.maximum(jnp.sum((distance * weight)[:, near], -1), _SMALL)
+    convex = -jnp.sum((height * weight)[:, near], -1) / mean_distance
+    above_paraboloid = _above_paraboloid(normal, offset, height, weight)
+    vote = _field(points, normal) + _CONVEX_WEIGHT * convex + _PARABOLOID_WEIGHT * above_paraboloid
+    neighbour_height = jnp.sum(offset * normal[index], -1)
+    rise = jnp.maximum(jnp.abs(height), jnp.abs(neighbour_height))
+    coplanar = rise < _MAX_COPLANAR_SLOPE * distance
+    agree = weight * coplanar * jnp.sum(normal[:, None] * normal[index], -1)
     vote = vote + jnp.sum(agree * jnp.clip(vote, -1.0, 1.0)[index], -1)
     return jnp.where(vote[:, None] < 0.0, -normal, normal)
 
@@ -162,18 +173,17 @@ def _above_paraboloid(normal: Array, offset: Array, height: Array, weight: Array
     along = jnp.cross(normal, jnp.eye(3)[jnp.argmin(jnp.abs(normal), -1)])
     along = along / jnp.linalg.norm(along, axis=-1, keepdims=True)
     across = jnp.cross(normal, along)
-    x, y = (jnp.sum(offset * axis[:, None], -1) for axis in (along, across))
-    radius = x * x + y * y
-    scale = jnp.sqrt(
-        jnp.sum(weight * radius, -1, keepdims=True) / jnp.sum(weight, -1, keepdims=True)
-    )
+    x = jnp.sum(offset * along[:, None], -1)
+    y = jnp.sum(offset * across[:, None], -1)
+    squared_radius = x * x + y * y
+    total_weight = jnp.sum(weight, -1, keepdims=True)
+    scale = jnp.sqrt(jnp.sum(weight * squared_radius, -1, keepdims=True) / total_weight)
     scale = jnp.maximum(scale, _SMALL)
-    basis = jnp.stack([jnp.ones_like(x), x / scale, y / scale, radius / scale**2], -1)
+    basis = jnp.stack([jnp.ones_like(x), x / scale, y / scale, squared_radius / scale**2], -1)
+    # Weighted least squares, by the normal equations with a ridge of 1e-4.
     highest = jax.lax.Precision.HIGHEST
-    matrix = jnp.einsum(
-        "nki,nkj,nk->nij", basis, basis, weight, precision=highest
-    ) + 1e-4 * jnp.eye(4)
-    found = jnp.linalg.solve(
-        matrix, jnp.einsum("nki,nk->ni", basis, height * weight, precision=highest)[..., None]
-    )
-    return -found[:, 0, 0] / scale[:, 0]
+    matrix = jnp.einsum("nki,nkj,nk->nij", basis, basis, weight, precision=highest)
+    matrix = matrix + 1e-4 * jnp.eye(4)
+    right_side = jnp.einsum("nki,nk->ni", basis, height * weight, precision=highest)
+    coefficients = jnp.linalg.solve(matrix, right_side[..., None])
+    return -coefficients[:, 0, 0] / scale[:, 0]

@@ -3,20 +3,20 @@ Space).
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.constraints import blocks, known
-from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.constraints import Constraint, blocks, known
+from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.geometry import flat, squash
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
-_OF_POSE = (
+_POSE_FIELDS = (
     "object_displacement",
     "object_rotation",
     "past object_position",
@@ -29,119 +29,197 @@ def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:
     """Names and sizes of the observation's blocks, in order: the state, those of the constraints,
     and the mask.
     """
-    return tuple(
-        (block, sum(field.size for field in content))
-        for block, content in fields(hand, task).items()
-    )
+    sizes = []
+    for block, block_fields in fields(hand, task).items():
+        sizes.append((block, sum(field.size for field in block_fields)))
+    return tuple(sizes)
 
 
 def fields(hand: Hand, task: TaskSettings) -> dict[str, tuple[ObservationField, ...]]:
     """Fields of every block, in order, restricted to those that the task's policy observes."""
-    mask = (
-        "1 for each active constraint in the order of 'masks'; the block of an inactive one is zero"
-    )
-    past = _past_fields(hand, task) if task.observation != "full" else ()
-    meaning = (
-        "m, points of the camera's cloud, wrist frame, each with 1 if an active affordance avoids "
-        "it, else 0"
-    )
-    cloud = (ObservationField("cloud", 4 * task.surface_points, meaning),)
-    return {
-        "state": tuple(
-            field for field in (*_state_fields(hand, task), *past) if _is_seen(task, field)
-        ),
-        **({"cloud": cloud} if task.observation == "camera" else {}),
-        **{
-            block: tuple(field for field in content if _is_seen(task, field))
-            for constraint in known(task)
-            for block, content in zip(
-                constraint.blocks or (constraint.name,), constraint.fields(hand, task), strict=True
-            )
-        },
-        "mask": (ObservationField("mask", len(blocks(task)), mask),),
-    }
+    state = _state_fields(hand, task)
+    if task.observation != "full":
+        state += _past_fields(hand, task)
+    described = {"state": _observed_fields(task, state)}
+    if task.observation == "camera":
+        described["cloud"] = (_cloud_field(task),)
+    for constraint in known(task):
+        names = constraint.blocks or (constraint.name,)
+        for block, block_fields in zip(names, constraint.fields(hand, task), strict=True):
+            described[block] = _observed_fields(task, block_fields)
+    described["mask"] = (_mask_field(task),)
+    return described
 
 
-def _is_seen(task: TaskSettings, field: ObservationField) -> bool:
+def observe(scene: Scene) -> Array:
+    """Observation (B, D), laid out like `fields`; blocks of inactive constraints are zero."""
+    hand = scene.hand
+    task = scene.task
+    parts = _observed_values(task, _state_values(scene), _state_fields(hand, task))
+    if task.observation != "full":
+        parts += _observed_values(task, _past_values(scene), _past_fields(hand, task))
+    if task.observation == "camera":
+        parts.append(_cloud_values(scene))
+    for constraint in known(task):
+        parts += _constraint_values(scene, constraint)
+    mask = [scene.gate(block) for block in blocks(task)]
+    if mask:
+        parts.append(jnp.stack(mask, -1))
+    return jnp.concatenate(parts, -1)
+
+
+def _is_observed(task: TaskSettings, field: ObservationField) -> bool:
     """True if a field is part of the task's observation."""
-    if task.observation == "camera" and field.name in _OF_POSE:
+    if task.observation == "camera" and field.name in _POSE_FIELDS:
         return False
     return task.observation == "full" or not field.privileged
 
 
+def _observed_fields(
+    task: TaskSettings, described: Sequence[ObservationField]
+) -> tuple[ObservationField, ...]:
+    """Selects the fields that are part of the task's observation."""
+    return tuple(field for field in described if _is_observed(task, field))
+
+
+def _observed_values(
+    task: TaskSettings, values: Sequence[Array], described: Sequence[ObservationField]
+) -> list[Array]:
+    """Selects the values (B, ...) of fields that are part of the task's observation."""
+    pairs = zip(values, described, strict=True)
+    return [value for value, field in pairs if _is_observed(task, field)]
+
+
 def _state_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
     """Fields of the state of hand and object in the current control step."""
-    f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
-    normals: tuple[tuple[Any, ...], ...] = (
-        ("normal", 3 * p, "outward unit normal at each of these surface points, wrist frame"),
-        (
-            "height",
-            p,
-            "m, signed height of each keypoint above the tangent plane at its surface point",
-        ),
-    )
-    state: tuple[tuple[Any, ...], ...] = (
-        ("q", f, "rad, finger joints in the order of 'joints'"),
-        (
+    joints = len(hand.joints)
+    links = len(hand.links)
+    keypoints = len(hand.keypoints)
+    return (
+        ObservationField("q", joints, "rad, finger joints in the order of 'joints'"),
+        ObservationField(
             "u",
             6,
             "m and rad, wrist joints in the order of 'wrist_joints', relative to the wrist's "
             "initial pose",
         ),
-        ("q_target - q", f, "rad, lead of the last finger targets over the joints"),
-        ("u_target - u", 6, "m and rad, lead of the last wrist targets over the joints"),
-        ("q_velocity", f, "rad/s", True),
-        ("u_velocity", 6, "m/s and rad/s", True),
-        ("touching", n, "1 if a link, in the order of 'links', touches the object, else 0", True),
-        (
-            "force",
-            3 * n,
-            "f / (|f| + force_scale) for the object's net force f on each link, N, wrist frame",
-            True,
+        ObservationField(
+            "q_target - q", joints, "rad, lead of the last finger targets over the joints"
         ),
-        ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
-        *(normals if task.surface_normals else ()),
-        ("object_velocity", 3, "m/s of the centre of mass, wrist frame", True),
-        ("object_angular_velocity", 3, "rad/s, wrist frame", True),
-        ("object_displacement", 3, "m since the start, wrist frame"),
-        (
+        ObservationField(
+            "u_target - u", 6, "m and rad, lead of the last wrist targets over the joints"
+        ),
+        ObservationField("q_velocity", joints, "rad/s", privileged=True),
+        ObservationField("u_velocity", 6, "m/s and rad/s", privileged=True),
+        ObservationField(
+            "touching",
+            links,
+            "1 if a link, in the order of 'links', touches the object, else 0",
+            privileged=True,
+        ),
+        ObservationField(
+            "force",
+            3 * links,
+            "f / (|f| + force_scale) for the object's net force f on each link, N, wrist frame",
+            privileged=True,
+        ),
+        ObservationField(
+            "nearest",
+            3 * keypoints,
+            "m, from each keypoint to the nearest surface point, wrist frame",
+        ),
+        *_normal_fields(hand, task),
+        ObservationField(
+            "object_velocity", 3, "m/s of the centre of mass, wrist frame", privileged=True
+        ),
+        ObservationField("object_angular_velocity", 3, "rad/s, wrist frame", privileged=True),
+        ObservationField("object_displacement", 3, "m since the start, wrist frame"),
+        ObservationField(
             "object_rotation",
             3,
             "twice the vector part of the rotation since the start (w >= 0), wrist frame",
         ),
         # It saturates: the length of a hold is hidden from the policy, which must hold
         # indefinitely, not until a deadline.
-        (
+        ObservationField(
             "time",
             1,
             "control steps over (approach_steps + hold_steps), at most 1; the remaining hold is "
             "hidden",
         ),
-        ("table", 1, "1 while the table is present"),
+        ObservationField("table", 1, "1 while the table is present"),
     )
-    return tuple(ObservationField(*field) for field in state)
 
 
-def _normals(scene: Scene) -> list[Array]:
-    """Arrays (B, ...) of the fields of `TaskSettings.surface_normals`."""
+def _state_values(scene: Scene) -> list[Array]:
+    """Arrays (B, ...) of `_state_fields`."""
+    task = scene.task
+    state = scene.state
+    features = scene.features
+    to_wrist = rotations.conjugate(features.wrist_quaternion)
+    displacement = state.object_position - state.object_position_initial
+    rotation = _rotation(state.object_quaternion_initial, state.object_quaternion)
+    horizon = task.approach_steps + task.hold_steps
+    return [
+        state.q,
+        state.u,
+        state.q_target - state.q,
+        state.u_target - state.u,
+        state.q_velocity,
+        state.u_velocity,
+        features.touching.astype(jnp.float32),
+        flat(squash(features.force)),
+        flat(features.nearest),
+        *_normal_values(scene),
+        rotations.rotate(to_wrist, state.object_velocity),
+        rotations.rotate(to_wrist, state.object_angular_velocity),
+        rotations.rotate(to_wrist, displacement),
+        rotations.rotate(to_wrist, rotation),
+        jnp.minimum(state.time / horizon, 1.0)[:, None],
+        state.table.astype(jnp.float32)[:, None],
+    ]
+
+
+def _normal_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
+    """Fields of `TaskSettings.surface_normals`."""
+    if not task.surface_normals:
+        return ()
+    keypoints = len(hand.keypoints)
+    return (
+        ObservationField(
+            "normal",
+            3 * keypoints,
+            "outward unit normal at each of these surface points, wrist frame",
+        ),
+        ObservationField(
+            "height",
+            keypoints,
+            "m, signed height of each keypoint above the tangent plane at its surface point",
+        ),
+    )
+
+
+def _normal_values(scene: Scene) -> list[Array]:
+    """Arrays (B, ...) of `_normal_fields`."""
     if not scene.task.surface_normals:
         return []
-    assert scene.features.normal is not None and scene.features.height is not None, (
-        "the surface has no normals"
-    )
-    return [flat(scene.features.normal), scene.features.height]
+    features = scene.features
+    assert features.normal is not None, "the surface has no normals"
+    assert features.height is not None, "the surface has no normals"
+    return [flat(features.normal), features.height]
 
 
 def _past_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
     """Fields of a robot's observation for earlier control steps."""
-    f, past = len(hand.joints), task.history - 1
+    joints = len(hand.joints)
+    past = task.history - 1
     order = f"for each of the last {past} control steps, newest first"
     return (
-        ObservationField("past q - q", past * f, f"rad, {order}, minus the current angles"),
+        ObservationField("past q - q", past * joints, f"rad, {order}, minus the current angles"),
         ObservationField(
             "past u - u", past * 6, f"m and rad, {order}, minus the current wrist joints"
         ),
-        ObservationField("past q_target - past q", past * f, f"rad, {order}"),
+        ObservationField("past q_target - past q", past * joints, f"rad, {order}"),
         ObservationField("past u_target - past u", past * 6, f"m and rad, {order}"),
         ObservationField(
             "past object_position",
@@ -156,90 +234,78 @@ def _past_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]
     )
 
 
-def _past(scene: Scene) -> list[Array]:
+def _past_values(scene: Scene) -> list[Array]:
     """Arrays (B, ...) of `_past_fields`."""
     assert scene.readings is not None, "a robot's observation needs readings"
-    now = Readings(*(field[:, :1] for field in scene.readings))
-    past = Readings(*(field[:, 1:] for field in scene.readings))
+    now = Readings(*[field[:, :1] for field in scene.readings])
+    past = Readings(*[field[:, 1:] for field in scene.readings])
     to_wrist = rotations.conjugate(scene.features.wrist_quaternion)[:, None]
+    rotation = _rotation(past.object_quaternion, now.object_quaternion)
     return [
         flat(past.q - now.q),
         flat(past.u - now.u),
         flat(past.q_target - past.q),
         flat(past.u_target - past.u),
         flat(rotations.rotate(to_wrist, past.object_position - now.object_position)),
-        flat(rotations.rotate(to_wrist, _turn(past.object_quaternion, now.object_quaternion))),
+        flat(rotations.rotate(to_wrist, rotation)),
     ]
 
 
-def _cloud(scene: Scene) -> Array:
+def _cloud_field(task: TaskSettings) -> ObservationField:
+    """Field of the camera's cloud."""
+    return ObservationField(
+        "cloud",
+        4 * task.surface_points,
+        "m, points of the camera's cloud, wrist frame, each with 1 if an active affordance avoids "
+        "it, else 0",
+    )
+
+
+def _cloud_values(scene: Scene) -> Array:
     """Points of the cloud in the wrist frame, each followed by its label: (B, 4 N)."""
     assert scene.cloud is not None, "a camera observation needs a cloud"
-    features, cloud = scene.features, scene.cloud
+    features = scene.features
     points = rotations.inverse_transform(
-        features.wrist_position, features.wrist_quaternion, cloud.points
+        features.wrist_position, features.wrist_quaternion, scene.cloud.points
     )
-    labels = jnp.zeros(cloud.avoid.shape)
+    labels = jnp.zeros(scene.cloud.avoid.shape)
     for constraint in known(scene.task):
-        if (own := constraint.cloud_labels(scene)) is not None:
-            labels = jnp.maximum(labels, own)
+        constraint_labels = constraint.cloud_labels(scene)
+        if constraint_labels is not None:
+            labels = jnp.maximum(labels, constraint_labels)
     return flat(jnp.concatenate([points, labels[..., None]], -1))
 
 
-def _turn(start: Array, end: Array) -> Array:
+def _constraint_values(scene: Scene, constraint: Constraint) -> list[Array]:
+    """Arrays (B, ...) of the blocks of a constraint, zero where it is inactive."""
+    task = scene.task
+    blocks_of_constraint = zip(
+        constraint.observe(scene), constraint.fields(scene.hand, task), strict=True
+    )
+    observed = [_observed_values(task, *block) for block in blocks_of_constraint]
+    if not constraint.optional:
+        (values,) = observed
+        return values
+    gated = []
+    for block, values in zip(constraint.blocks, observed, strict=True):
+        active = scene.goal.active[block][:, None]
+        gated.append(jnp.where(active, jnp.concatenate(values, -1), 0.0))
+    return gated
+
+
+def _mask_field(task: TaskSettings) -> ObservationField:
+    """Field of the flags of active constraints."""
+    return ObservationField(
+        "mask",
+        len(blocks(task)),
+        "1 for each active constraint in the order of 'masks'; the block of an inactive one is "
+        "zero",
+    )
+
+
+def _rotation(start: Array, end: Array) -> Array:
     """Twice the vector part (..., 3) of the rotation from one quaternion to another, with positive
     w.
     """
     turned = rotations.multiply(end, rotations.conjugate(start))
     return 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0, -1.0, 1.0)
-
-
-def observe(scene: Scene) -> Array:
-    """Observation (B, D), laid out like `fields`; blocks of inactive constraints are zero."""
-    hand, task, state, features = scene.hand, scene.task, scene.state, scene.features
-    to_wrist = rotations.conjugate(features.wrist_quaternion)
-    horizon = task.approach_steps + task.hold_steps
-    values = [
-        state.q,
-        state.u,
-        state.q_target - state.q,
-        state.u_target - state.u,
-        state.q_velocity,
-        state.u_velocity,
-        features.touching.astype(jnp.float32),
-        flat(squash(features.force)),
-        flat(features.nearest),
-        *_normals(scene),
-        rotations.rotate(to_wrist, state.object_velocity),
-        rotations.rotate(to_wrist, state.object_angular_velocity),
-        rotations.rotate(to_wrist, state.object_position - state.object_position_initial),
-        rotations.rotate(to_wrist, _turn(state.object_quaternion_initial, state.object_quaternion)),
-        jnp.minimum(state.time / horizon, 1.0)[:, None],
-        state.table.astype(jnp.float32)[:, None],
-    ]
-    parts = _seen(task, values, _state_fields(hand, task))
-    if task.observation != "full":
-        parts += _seen(task, _past(scene), _past_fields(hand, task))
-    if task.observation == "camera":
-        parts.append(_cloud(scene))
-    for constraint in known(task):
-        described = constraint.fields(hand, task)
-        observed = [
-            _seen(task, *block) for block in zip(constraint.observe(scene), described, strict=True)
-        ]
-        if not constraint.optional:
-            parts += observed[0]
-            continue
-        for block, values in zip(constraint.blocks, observed, strict=True):
-            parts.append(
-                jnp.where(scene.goal.active[block][:, None], jnp.concatenate(values, -1), 0.0)
-            )
-    mask = [scene.gate(block) for block in blocks(task)]
-    return jnp.concatenate([*parts, *([jnp.stack(mask, -1)] if mask else [])], -1)
-
-
-def _seen(
-    task: TaskSettings, values: Sequence[Array], content: Sequence[ObservationField]
-) -> list[Array]:
-    """Selects the values (B, ...) of fields that are part of the task's observation."""
-    return [value for value, field in zip(values, content, strict=True) if _is_seen(task, field)]

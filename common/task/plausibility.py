@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
@@ -22,8 +21,9 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.objects.spec import Piece
-from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.mesh_points import points_on_meshes
 from congrasp.common.task.posture import unnatural
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
@@ -32,17 +32,24 @@ with meshes.
 """
 MEASURES = (
     *CLEAN_MM,
-    *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
+    "wrist_speed",
+    "wrist_speed_mean",
+    "wrist_speed_p95",
+    "wrist_acceleration",
+    "wrist_acceleration_mean",
+    "wrist_acceleration_p95",
     "posture_rad",
-    *("finger_jerk", "link_force", "link_force_peak", "torque_share", "torque_share_peak"),
+    "finger_jerk",
+    "link_force",
+    "link_force_peak",
+    "torque_share",
+    "torque_share_peak",
 )
 """Names of the `measures` of an episode."""
-_SPACING = 0.004
+_AXIS_SPACING = 0.004
 """Spacing of points on a capsule's axis, m: a sharp edge 7 mm from the axis appears at most 0.3 mm
 farther away.
 """
-_CELL, _MOST = 0.004, 2048
-"""Spacing of points on a hand's meshes, m, and their greatest number."""
 
 
 class Sample(NamedTuple):
@@ -76,15 +83,17 @@ class Sample(NamedTuple):
     """(B, 4) object frame to wrist frame."""
 
 
-class _Capsules(NamedTuple):
-    """Pairs of capsules that must not overlap, and points on axes or on solids, in the wrist frame
-    at zero.
-    """
+class _LinkPoints(NamedTuple):
+    """P points fixed to links, in the wrist frame at zero."""
 
-    pairs: np.ndarray  # (2, Q) capsules that must not overlap
-    links: np.ndarray  # (P,) link of each point
-    points: np.ndarray  # (P, 3)
-    radii: np.ndarray  # (P,) radius, 0 on solids
+    links: np.ndarray
+    """(P,) link of each point."""
+    points: np.ndarray
+    """(P, 3) m."""
+    radii: np.ndarray
+    """(P,) radius of the link around the point, m: that of the capsule on an axis, 0 on a
+    solid.
+    """
 
 
 def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
@@ -95,16 +104,18 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
       index: (B,) int, rows of the objects in `field`.
       field: signed distances from the objects' surfaces.
     """
-    hand, state, features = scene.hand, scene.state, scene.features
+    hand = scene.hand
+    state = scene.state
+    features = scene.features
     transforms = kinematics.link_transforms(hand, state.q)
-    wrist = features.wrist_position, features.wrist_quaternion
-    seen = features.object_position, features.object_quaternion, index, field
+    wrist_pose = features.wrist_position, features.wrist_quaternion
+    placed_object = features.object_position, features.object_quaternion, index, field
     half = jnp.float16  # precision of the quantities that are averaged
     return Sample(
         hand_hand=hand_hand(hand, transforms),
-        hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist), 0.0),
-        hand_object=hand_object(hand, transforms, *seen),
-        hand_mesh=hand_mesh(hand, transforms, *seen),
+        hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist_pose), 0.0),
+        hand_object=hand_object(hand, transforms, *placed_object),
+        hand_mesh=hand_mesh(hand, transforms, *placed_object),
         wrist_velocity=state.u_velocity[..., :3],
         finger_velocity=state.q_velocity,
         link_force=jnp.linalg.norm(features.force, axis=-1).astype(half),
@@ -132,8 +143,9 @@ def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
       hand: the hand.
       transforms: result of `common.hands.kinematics.link_transforms`.
     """
-    radii, ends = hand.capsule_radii, kinematics.capsules(hand, transforms)
-    first, second = _capsules(hand).pairs
+    radii = hand.capsule_radii
+    ends = kinematics.capsules(hand, transforms)
+    first, second = _colliding_pairs(hand)
     apart = segment_distance(
         ends[..., first, 0, :],
         ends[..., first, 1, :],
@@ -184,10 +196,10 @@ def hand_object(
       index: (B,) int, rows of the objects in `field`.
       field: signed distances from the objects' surfaces.
     """
-    capsules = _capsules(hand)
-    points = _moved(transforms, capsules.links, capsules.points)
+    fixed = _inner_points(hand)
+    points = _moved(transforms, fixed.links, fixed.points)
     local = rotations.inverse_transform(object_position, object_quaternion, points)
-    return jnp.maximum(jnp.max(capsules.radii - field.at(index, local), -1), 0.0)
+    return jnp.maximum(jnp.max(fixed.radii - field.at(index, local), -1), 0.0)
 
 
 def hand_mesh(
@@ -204,12 +216,11 @@ def hand_mesh(
     Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's
     thickness.
     """
-    links, points = _surface(hand)
+    links, points = mesh_points(hand)
     if not len(points):
         return jnp.full(len(index), jnp.nan)
-    local = rotations.inverse_transform(
-        object_position, object_quaternion, _moved(transforms, links, points)
-    )
+    moved = _moved(transforms, links, points)
+    local = rotations.inverse_transform(object_position, object_quaternion, moved)
     return jnp.maximum(jnp.max(-field.at(index, local), -1), 0.0)
 
 
@@ -217,13 +228,15 @@ def torque_share(scene: Scene) -> Array:
     """(B, M) |clip(kp (m_target - m) - kv m_velocity, limit)| / limit: torques of the fingers'
     motors at m.
     """
-    hand, state = scene.hand, scene.state
-    gains = np.array(
-        [(motor.kp, motor.kv, motor.torque_limit) for motor in hand.motors], np.float32
-    )
-    ahead, speed = (motor_positions(hand, x) for x in (state.q_target - state.q, state.q_velocity))
-    torque = gains[:, 0] * ahead - gains[:, 1] * speed
-    return jnp.minimum(jnp.abs(torque) / gains[:, 2], 1.0)
+    hand = scene.hand
+    state = scene.state
+    kp = np.array([motor.kp for motor in hand.motors], np.float32)
+    kv = np.array([motor.kv for motor in hand.motors], np.float32)
+    limit = np.array([motor.torque_limit for motor in hand.motors], np.float32)
+    lead = motor_positions(hand, state.q_target - state.q)
+    velocity = motor_positions(hand, state.q_velocity)
+    torque = kp * lead - kv * velocity
+    return jnp.minimum(jnp.abs(torque) / limit, 1.0)
 
 
 def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
@@ -231,13 +244,17 @@ def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
 
     Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
     """
-    u, v, w = b - a, d - c, a - c
-    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
-    uw, vw = _dot(u, w), _dot(v, w)
+    u = b - a
+    v = d - c
+    w = a - c
+    uu = _dot(u, u)
+    vv = _dot(v, v)
+    uv = _dot(u, v)
+    uw = _dot(u, w)
+    vw = _dot(v, w)
     across = uu * vv - uv * uv
-    s = jnp.where(
-        across > 1e-14, jnp.clip((uv * vw - uw * vv) / jnp.maximum(across, 1e-14), 0.0, 1.0), 0.0
-    )
+    s = jnp.clip((uv * vw - uw * vv) / jnp.maximum(across, 1e-14), 0.0, 1.0)
+    s = jnp.where(across > 1e-14, s, 0.0)
     t = jnp.clip((uv * s + vw) / jnp.maximum(vv, 1e-14), 0.0, 1.0)
     s = jnp.clip((uv * t - uw) / jnp.maximum(uu, 1e-14), 0.0, 1.0)
     return jnp.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
@@ -263,49 +280,63 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
         over motors and steps. `posture_rad`: mean deviation from natural postures over the steps
         in which the hand touches the object (0 if it never does).
     """
-    wrist, fingers = (
-        np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity)
-    )
-    force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
+    wrist = np.asarray(samples.wrist_velocity, np.float32)
+    fingers = np.asarray(samples.finger_velocity, np.float32)
+    force = np.asarray(samples.link_force, np.float32)
+    torque = np.asarray(samples.torque_share, np.float32)
     acceleration = np.diff(wrist, axis=0, prepend=0 * wrist[:1]) / control_dt
     jerk = np.diff(fingers, n=2, axis=0, prepend=np.zeros_like(fingers[:2])) / control_dt**2
-    depths = {
-        name: getattr(samples, name)
-        for name in ("hand_hand", "hand_table", "hand_object", "hand_mesh")
-    }
-    if np.isnan(samples.hand_mesh).all():
-        del depths["hand_mesh"]
-    found = {f"{name}_mm": 1e3 * np.max(depth, 0) for name, depth in depths.items()}
-    for name, vectors in (("wrist_speed", wrist), ("wrist_acceleration", acceleration)):
-        size = np.linalg.norm(vectors, axis=-1)
-        found |= {
-            name: size.max(0),
-            f"{name}_mean": size.mean(0),
-            f"{name}_p95": np.percentile(size, 95, axis=0),
-        }
     touching = (force > 0).any(-1)
     posture = np.asarray(samples.posture, np.float32)
-    return found | {
+    contacts = np.maximum((force > 0).sum((0, 2)), 1)
+    return {
+        **_deepest_mm(samples),
+        **_magnitudes("wrist_speed", wrist),
+        **_magnitudes("wrist_acceleration", acceleration),
         "posture_rad": (posture * touching).sum(0) / np.maximum(touching.sum(0), 1),
         "finger_jerk": np.sqrt((jerk**2).mean((0, 2))),
-        "link_force": force.sum((0, 2)) / np.maximum((force > 0).sum((0, 2)), 1),
+        "link_force": force.sum((0, 2)) / contacts,
         "link_force_peak": force.max((0, 2)),
         "torque_share": torque.mean((0, 2)),
         "torque_share_peak": torque.max((0, 2)),
     }
 
 
-def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
+def _deepest_mm(samples: Sample) -> dict[str, np.ndarray]:
+    """Deepest penetrations (B,) in mm, without `hand_mesh_mm` for hands without meshes."""
+    depths = {
+        "hand_hand_mm": samples.hand_hand,
+        "hand_table_mm": samples.hand_table,
+        "hand_object_mm": samples.hand_object,
+    }
+    if not np.isnan(samples.hand_mesh).all():
+        depths["hand_mesh_mm"] = samples.hand_mesh
+    return {name: 1e3 * np.max(depth, 0) for name, depth in depths.items()}
+
+
+def _magnitudes(name: str, vectors: np.ndarray) -> dict[str, np.ndarray]:
+    """Peak, mean and 95th percentile (B,) of the lengths of vectors (T, B, 3), by name."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return {
+        name: length.max(0),
+        f"{name}_mean": length.mean(0),
+        f"{name}_p95": np.percentile(length, 95, axis=0),
+    }
+
+
+def is_clean(held: np.ndarray, measured: Mapping[str, np.ndarray]) -> np.ndarray:
     """(B,) bool: the object was held for two seconds without the table, and every penetration is
     below `CLEAN_MM`.
 
     Args:
       held: (B,) bool, True if the object was held.
-      found: result of `measures`.
+      measured: result of `measures`.
     """
-    return np.all(
-        [held, *(found[name] < limit for name, limit in CLEAN_MM.items() if name in found)], 0
-    )
+    clean = held
+    for name, limit in CLEAN_MM.items():
+        if name in measured:
+            clean = clean & (measured[name] < limit)
+    return clean
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -321,76 +352,63 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 
 @functools.cache
-def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+def mesh_points(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
     """Links (P,) of the points on the hand's meshes, and the points (P, 3) in the wrist frame at
     zero.
     """
     names = [link.name for link in hand.links]
-    return _spread({names.index(name): mesh for name, mesh in own_meshes(hand).items()})
-
-
-def _spread(meshes: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Links (P,) of points on meshes, and the points (P, 3).
-
-    In each cell of a grid the point farthest from its link's centre is kept, so that corners are
-    preserved. Cells are `_CELL` wide, or wider if more than `_MOST` points would remain. The
-    initial spacing sqrt(area / `_MOST`) bounds the number of samples.
-    """
-    area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
-    cell = max(_CELL, float(np.sqrt(area / _MOST)))
-    while True:
-        parts = {link: _thinned(*mesh, cell) for link, mesh in meshes.items()}
-        if sum(map(len, parts.values())) <= _MOST:
-            break
-        cell *= 1.2
-    links = np.repeat(np.array([*parts], int), [len(part) for part in parts.values()])
-    return links, np.concatenate([np.zeros((0, 3)), *parts.values()]).astype(np.float32)
-
-
-def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray:
-    """Points (P, 3) on a mesh, one in each cell of a grid: the farthest from the centre."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    samples = trimesh.sample.sample_surface(mesh, max(1, int(8 * mesh.area / cell**2)), seed=0)[0]
-    points = np.concatenate([vertices[np.unique(faces)], samples])
-    farthest = np.argsort(-np.linalg.norm(points - points.mean(0), axis=-1), kind="stable")
-    return points[farthest][
-        np.unique(np.floor(points[farthest] / cell), axis=0, return_index=True)[1]
-    ]
+    meshes = {names.index(name): mesh for name, mesh in own_meshes(hand).items()}
+    return points_on_meshes(meshes)
 
 
 @functools.cache
-def _capsules(hand: Hand) -> _Capsules:
-    """Pairs of the hand's capsules that must not overlap, and points on the axes of colliding ones
-    or on solids.
-    """
-    links, radii = hand.capsule_links, hand.capsule_radii
+def _colliding_pairs(hand: Hand) -> np.ndarray:
+    """(2, Q) capsules that must not overlap, see `overlaps`."""
+    links = hand.capsule_links
     names = [link.name for link in hand.links]
-    nested = {
-        frozenset(pair)
-        for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))
-    }
+    nested = {frozenset(pair) for pair in overlapping(hand)}
+    nested |= {frozenset((link.name, link.parent)) for link in hand.links}
     first, second = np.triu_indices(len(links), 1)
-    apart = [
-        a != b and frozenset((names[a], names[b])) not in nested
-        for a, b in zip(links[first], links[second], strict=True)
-    ]
-    solid = {
-        i: mesh_of([Piece(x.kind, x.size, x.position, x.quaternion) for x in link.solids])
-        for i, link in enumerate(hand.links)
-        if link.solids
-    }
-    axes = {
-        k: np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / _SPACING)).astype(
-            np.float32
-        )
-        for k, (start, end) in enumerate(hand.capsules)
-        if links[k] not in solid
-    }
-    round_ones = np.repeat(np.array([*axes], int), [len(points) for points in axes.values()])
-    solid_links, solid_points = _spread(solid)
-    return _Capsules(
-        np.stack([first, second])[:, apart],
-        np.concatenate([links[round_ones], solid_links]),
-        np.concatenate([*axes.values(), solid_points]),
-        np.concatenate([radii[round_ones], np.zeros(len(solid_links), np.float32)]),
+    collides = []
+    for a, b in zip(links[first], links[second], strict=True):
+        collides.append(a != b and frozenset((names[a], names[b])) not in nested)
+    return np.stack([first, second])[:, collides]
+
+
+@functools.cache
+def _inner_points(hand: Hand) -> _LinkPoints:
+    """Points on the axes of a hand's capsules, and on the solids of links that have some."""
+    solids = {}
+    for link, description in enumerate(hand.links):
+        if description.solids:
+            pieces = [
+                Piece(solid.kind, solid.size, solid.position, solid.quaternion)
+                for solid in description.solids
+            ]
+            solids[link] = mesh_of(pieces)
+    solid_links, solid_points = points_on_meshes(solids)
+    links = []
+    points = []
+    radii = []
+    for link, radius, ends in zip(
+        hand.capsule_links, hand.capsule_radii, hand.capsules, strict=True
+    ):
+        if link in solids:
+            continue
+        axis = _points_on_axis(*ends)
+        points.append(axis)
+        links += [link] * len(axis)
+        radii += [radius] * len(axis)
+    links += [*solid_links]
+    radii += [0.0] * len(solid_links)
+    return _LinkPoints(
+        links=np.array(links, int),
+        points=np.concatenate([*points, solid_points]),
+        radii=np.array(radii, np.float32),
     )
+
+
+def _points_on_axis(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Points (n, 3) on the axis of a capsule, float32."""
+    count = 2 + int(np.linalg.norm(end - start) / _AXIS_SPACING)
+    return np.linspace(start, end, count).astype(np.float32)

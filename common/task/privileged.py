@@ -24,15 +24,16 @@ import jax.numpy as jnp
 from congrasp.common.hands.motors import motor_positions, tip_forces
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import observation
-from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.control import Guided, guided, wrist_lead
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.sensing import Sensors
 from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array
 
 MOST_LOAD = 10.0
 """Upper bound of `load`."""
-_WRIST = (6, 7, 13, 14, 20)
+_WRIST_ENDS = (6, 7, 13, 14, 20)
 """Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance
 alone.
 """
@@ -104,8 +105,8 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
       scene: the true control step, with the task of the policy.
       parameters: parameters of the episodes.
     """
-    hand, task = scene.hand, scene.task
-    strength = jnp.maximum(parameters.friction * float(tip_forces(hand).sum()), 1e-6)
+    task = scene.task
+    strength = jnp.maximum(parameters.friction * float(tip_forces(scene.hand).sum()), 1e-6)
     remaining = jnp.minimum(
         task.approach_steps + parameters.hold - scene.state.time, parameters.hold
     )
@@ -129,7 +130,8 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
     numbers = jnp.stack([jnp.asarray(value, jnp.float32) for value in values], -1)
     if not task.sensed:
         return numbers
-    return jnp.concatenate([numbers, observation.observe(scene._replace(task=_full(task)))], -1)
+    full_observation = observation.observe(scene._replace(task=_full(task)))
+    return jnp.concatenate([numbers, full_observation], -1)
 
 
 def _full(task: TaskSettings) -> TaskSettings:
@@ -141,7 +143,7 @@ def extra(hand: Hand) -> int:
     """Numbers after the observation: the wrist's, and the lag (M) of the motors' followed targets,
     rad.
     """
-    return _WRIST[-1] + len(hand.motors)
+    return _WRIST_ENDS[-1] + len(hand.motors)
 
 
 def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Array:
@@ -153,12 +155,18 @@ def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Arr
       control: limits and scales.
     """
     teacher = guided(true, control)
-    limit, table = teacher.limit[:, None], jnp.asarray(teacher.table, teacher.ahead.dtype)[:, None]
-    own = guided(seen, control).bounded(control)
+    student_lead = guided(seen, control).bounded(control)
     lag = motor_positions(true.hand, true.state.q_target - seen.state.q_target)
-    return jnp.concatenate(
-        [observation.observe(true), teacher.ahead, limit, teacher.velocity, table, own, lag], -1
-    )
+    parts = [
+        observation.observe(true),
+        teacher.ahead,
+        teacher.limit[:, None],
+        teacher.velocity,
+        jnp.asarray(teacher.table, teacher.ahead.dtype)[:, None],
+        student_lead,
+        lag,
+    ]
+    return jnp.concatenate(parts, -1)
 
 
 def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Array) -> Array:
@@ -171,10 +179,9 @@ def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Arra
       action: (..., M + 6) action of the teacher.
     """
     numbers = rows[..., -extra(hand) :].astype(action.dtype)
-    ahead, limit, velocity, table, own, lag = jnp.split(numbers, _WRIST, -1)
-    teacher = Guided(ahead, limit[..., 0], velocity, table[..., 0] > 0.5)
+    ahead, limit, velocity, table, student_lead, lag = jnp.split(numbers, _WRIST_ENDS, -1)
+    teacher = Guided(ahead=ahead, limit=limit[..., 0], velocity=velocity, table=table[..., 0] > 0.5)
     lead = wrist_lead(hand, control, teacher, action[..., -6:])
     scale = jnp.repeat(jnp.stack([control.wrist_position_scale, control.wrist_rotation_scale]), 3)
-    return jnp.concatenate(
-        [action[..., :-6] + lag / control.finger_scale, (lead - own) / scale], -1
-    )
+    fingers = action[..., :-6] + lag / control.finger_scale
+    return jnp.concatenate([fingers, (lead - student_lead) / scale], -1)

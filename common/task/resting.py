@@ -25,11 +25,10 @@ def resting_mean(
     """
     away = reading[..., :3] - mean[..., :3]
     still = (count > 0) & table & (xp.sqrt((away * away).sum(-1)) <= settle)
-    same = (mean[..., 3:] * reading[..., 3:]).sum(-1)[
-        ..., None
-    ] >= 0.0  # a quaternion and its negative are one turn
-    turn = count[..., None] * mean[..., 3:] + xp.where(same, 1.0, -1.0) * reading[..., 3:]
+    # A quaternion and its negative are one rotation.
+    same_sign = (mean[..., 3:] * reading[..., 3:]).sum(-1)[..., None] >= 0.0
+    turn = count[..., None] * mean[..., 3:] + xp.where(same_sign, 1.0, -1.0) * reading[..., 3:]
     length = xp.sqrt((turn * turn).sum(-1))[..., None]
-    place = mean[..., :3] + away / (count[..., None] + 1)
-    found = xp.concatenate([place, turn / xp.maximum(length, 1e-9)], -1)
-    return xp.where(still[..., None], found, mean), xp.where(still, count + 1, 0)
+    position = mean[..., :3] + away / (count[..., None] + 1)
+    updated = xp.concatenate([position, turn / xp.maximum(length, 1e-9)], -1)
+    return xp.where(still[..., None], updated, mean), xp.where(still, count + 1, 0)

@@ -10,12 +10,21 @@ import jax.numpy as jnp
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import center_fingers, known
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import FAR, square
 from congrasp.common.task.grip import resistance
 from congrasp.common.task.posture import finger_deviations
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, SceneState
+
+_MAX_EXCESS = 50.0
+"""Force above f_max at which the cost of a link saturates, N."""
+_MAX_SQUARED_DISPLACEMENT = 0.04
+"""Squared displacement of the object at which its cost saturates, m^2."""
+_MAX_SQUARED_ROTATION = 1.0
+"""Squared rotation of the object at which its cost saturates, rad^2."""
+_MAX_SQUARED_VELOCITY = 100.0
+"""Squared velocity of the wrist joints at which its cost saturates, m^2/s^2 and rad^2/s^2."""
 
 
 class Earning(NamedTuple):
@@ -44,18 +53,19 @@ class Term(NamedTuple):
     """
 
 
-def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
+def keypoint_weights(hand: Hand, fingers: Array | None) -> Array:
     """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of
     `center_fingers`.
 
     Keypoints of other fingers get no weight; those of the set and the palm share it.
     """
     weights = jnp.array(hand.keypoint_weights)
-    if chosen is None:
+    if fingers is None:
         return weights
-    owner = hand.link_fingers[hand.keypoint_links]
-    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
-    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
+    finger_of_keypoint = hand.link_fingers[hand.keypoint_links]
+    counts = (finger_of_keypoint < 0) | fingers[:, finger_of_keypoint]
+    selected = jnp.where(counts, weights, 0.0)
+    return selected * (jnp.sum(weights) / jnp.sum(selected, -1, keepdims=True))
 
 
 def _distance(scene: Scene, earning: Earning) -> Array:
@@ -72,15 +82,17 @@ def _contact(scene: Scene, earning: Earning) -> Array:
 
 def _force(scene: Scene, earning: Earning) -> Array:
     """Weighted forces of the links in contact, as shares of f_max."""
-    most, weights = earning.force_max, jnp.array(scene.hand.contact_weights)
-    pressed = jnp.minimum(jnp.linalg.norm(earning.force, axis=-1), most)
-    return jnp.sum(weights * earning.touching * pressed / most, -1)
+    force_max = earning.force_max
+    weights = jnp.array(scene.hand.contact_weights)
+    force = jnp.minimum(jnp.linalg.norm(earning.force, axis=-1), force_max)
+    return jnp.sum(weights * earning.touching * force / force_max, -1)
 
 
 def _force_excess(scene: Scene, earning: Earning) -> Array:
-    """Newtons beyond f_max, summed over all links, also where a contact earns nothing."""
-    total = jnp.linalg.norm(scene.features.force, axis=-1)
-    return -jnp.sum(jnp.clip(total - earning.force_max, 0.0, 50.0), -1)
+    """Force above f_max summed over links (N), including masked contacts."""
+    force = jnp.linalg.norm(scene.features.force, axis=-1)
+    excess = jnp.clip(force - earning.force_max, 0.0, _MAX_EXCESS)
+    return -jnp.sum(excess, -1)
 
 
 def _grip(scene: Scene, earning: Earning) -> Array:
@@ -98,19 +110,28 @@ def _posture(scene: Scene, earning: Earning) -> Array:
 
 def _object_position(scene: Scene, earning: Earning) -> Array:
     """Squared displacement of the object since the start."""
-    return -jnp.minimum(
-        square(scene.state.object_position - scene.state.object_position_initial), 0.04
-    )
+    displacement = scene.state.object_position - scene.state.object_position_initial
+    return -jnp.minimum(square(displacement), _MAX_SQUARED_DISPLACEMENT)
 
 
 def _object_rotation(scene: Scene, earning: Earning) -> Array:
     """Squared rotation of the object since the start."""
-    turned = rotations.angle(scene.state.object_quaternion, scene.state.object_quaternion_initial)
-    return -jnp.minimum(turned**2, 1.0)
+    angle = rotations.angle(scene.state.object_quaternion, scene.state.object_quaternion_initial)
+    return -jnp.minimum(angle**2, _MAX_SQUARED_ROTATION)
+
+
+def _wrist_velocity(scene: Scene, earning: Earning) -> Array:
+    """Squared velocity of the six wrist joints."""
+    return -jnp.minimum(square(scene.state.u_velocity), _MAX_SQUARED_VELOCITY)
+
+
+def _finger_deviation(scene: Scene, earning: Earning) -> Array:
+    """Squared deviation of the fingers from their initial pose."""
+    return -square(scene.state.q - scene.state.q_initial)
 
 
 def _drop(scene: Scene, earning: Earning) -> Array:
-    """I_drop."""
+    """Indicator that the object has fallen (I_drop)."""
     return -fallen(scene.task, scene.state).astype(jnp.float32)
 
 
@@ -174,27 +195,27 @@ GRASP: tuple[Term, ...] = (
         "wrist_velocity",
         0.01,
         "w_u: per squared velocity of the six wrist joints (m/s and rad/s).",
-        lambda scene, earning: -jnp.minimum(square(scene.state.u_velocity), 100.0),
+        _wrist_velocity,
     ),
     Term(
         "finger_deviation",
         0.002,
         "w_q of the regulariser: per squared radian from the initial finger pose.",
-        lambda scene, earning: -square(scene.state.q - scene.state.q_initial),
+        _finger_deviation,
     ),
     Term("drop", 1.0, "w_drop: per step with the object fallen.", _drop),
 )
-"""Terms of r^grasp; `RewardWeights` (`common.task.config`) and the names of all terms derive from
-them.
-"""
+"""Terms of r^grasp. `RewardWeights` (`common.task.config`) has a field for each."""
 
 
 def terms(task: TaskSettings) -> tuple[str, ...]:
     """Names of the terms, which are those of their weights: the grasp's, then those of the
     constraints.
     """
-    grasp = (term.name for term in GRASP if term.value is not None)
-    return (*grasp, *(weight.name for constraint in known(task) for weight in constraint.weights))
+    names = [term.name for term in GRASP if term.value is not None]
+    for constraint in known(task):
+        names += [weight.name for weight in constraint.weights]
+    return tuple(names)
 
 
 def fallen(task: TaskSettings, state: SceneState) -> Array:
@@ -206,16 +227,21 @@ def reward_terms(scene: Scene, weights: Any) -> dict[str, Array]:
     """Weighted terms (B,) by the names in `terms`; the reward is their sum. `weights` are
     `RewardWeights`.
     """
+    earning = _earning_contacts(scene, weights)
+    values = {term.name: term.value(scene, earning) for term in GRASP if term.value is not None}
+    for constraint in known(scene.task):
+        values |= constraint.reward(scene)
+    return {name: getattr(weights, name) * value for name, value in values.items()}
+
+
+def _earning_contacts(scene: Scene, weights: Any) -> Earning:
+    """Contacts that the active constraints let earn reward, and the greatest force that earns."""
     touching = scene.features.touching
     force = scene.features.force
-    most = weights.force_max
+    force_max = weights.force_max
     if scene.load is not None:
-        most = most + weights.force_per_weight * scene.load.weight[:, None]
+        force_max = force_max + weights.force_per_weight * scene.load.weight[:, None]
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)
-        most = constraint.force_max(scene, most)
-    earning = Earning(touching, force, most)
-    found = {term.name: term.value(scene, earning) for term in GRASP if term.value is not None}
-    for constraint in known(scene.task):
-        found |= constraint.reward(scene)
-    return {name: getattr(weights, name) * value for name, value in found.items()}
+        force_max = constraint.force_max(scene, force_max)
+    return Earning(touching, force, force_max)

@@ -21,17 +21,19 @@ from congrasp.common.task.types import Array, SceneState
 
 # In the order of their random numbers; the ranges are those of `SensingConfig`, or 0 to 1
 _DRAWN = (
-    *(
-        "period",
-        "phase",
-        "delay",
-        "position_noise",
-        "rotation_noise",
-        "dropout",
-        "position_bias",
-        "rotation_bias",
-    ),
-    *("latency", "camera_distance", "camera_elevation", "camera_azimuth", "once"),
+    "period",
+    "phase",
+    "delay",
+    "position_noise",
+    "rotation_noise",
+    "dropout",
+    "position_bias",
+    "rotation_bias",
+    "latency",
+    "camera_distance",
+    "camera_elevation",
+    "camera_azimuth",
+    "once",
 )
 NEVER = 20_000.0
 """Period in control steps that no episode reaches."""
@@ -113,14 +115,11 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
     ranges = {name: getattr(config, name, (0.0, 1.0)) for name in _DRAWN}
     numbers = chance.uniforms(key, {"ranges": len(ranges), "biases": 6}, batch)
     low, high = np.array([*ranges.values()], np.float32).T
-    drawn = dict(zip(ranges, (low + (high - low) * numbers["ranges"]).T, strict=True))
+    values = low + (high - low) * numbers["ranges"]
+    drawn = dict(zip(ranges, values.T, strict=True))
     position_bias, rotation_bias = jnp.split(chance.normal(numbers["biases"]), 2, -1)
-    once, up, around = (
-        drawn["once"] < config.single_image,
-        drawn["camera_elevation"],
-        drawn["camera_azimuth"],
-    )
-    way = jnp.stack([jnp.cos(up) * jnp.cos(around), jnp.cos(up) * jnp.sin(around), jnp.sin(up)], -1)
+    once = drawn["once"] < config.single_image
+    to_camera = _direction(drawn["camera_elevation"], drawn["camera_azimuth"])
     return Sensors(
         key=jax.random.key_data(jax.random.split(key, batch)),
         period=jnp.where(once, NEVER, jnp.maximum(drawn["period"] / control_dt, 1.0)),
@@ -132,8 +131,15 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
         position_bias=drawn["position_bias"][:, None] * position_bias,
         rotation_bias=drawn["rotation_bias"][:, None] * rotation_bias,
         latency=jnp.round(drawn["latency"] / control_dt).astype(jnp.int32),
-        eye=drawn["camera_distance"][:, None] * way,
+        eye=drawn["camera_distance"][:, None] * to_camera,
     )
+
+
+def _direction(elevation: Array, azimuth: Array) -> Array:
+    """Unit vectors (B, 3) at these angles (B,) in rad, azimuth from the x axis."""
+    x = jnp.cos(elevation) * jnp.cos(azimuth)
+    y = jnp.cos(elevation) * jnp.sin(azimuth)
+    return jnp.stack([x, y, jnp.sin(elevation)], -1)
 
 
 def longest(config: SensingConfig, control_dt: float) -> int:
@@ -146,10 +152,14 @@ def begin(sensors: Sensors, steps: int, position: Array, quaternion: Array) -> T
     samples in transit.
     """
     pose = jnp.concatenate([position, quaternion], -1)
-    shown = _sampled(sensors, jnp.zeros(pose.shape[0], jnp.int32), pose)[0]
-    rested = jnp.ones(len(pose), jnp.int32)
+    batch = len(pose)
+    first, _ = _sampled(sensors, jnp.zeros(batch, jnp.int32), pose)
     return Tracker(
-        sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, rested, shown
+        sensors=sensors,
+        poses=jnp.broadcast_to(pose[:, None], (batch, steps, 7)),
+        first=first,
+        rested=jnp.ones(batch, jnp.int32),
+        shown=first,
     )
 
 
@@ -174,9 +184,8 @@ def track(
       table: (B,) bool: the table is present.
       settle: see `SensingConfig`.
     """
-    poses, arrived, due = arrival(
-        tracker.sensors, tracker.poses, time, jnp.concatenate([position, quaternion], -1)
-    )
+    pose = jnp.concatenate([position, quaternion], -1)
+    poses, arrived, due = arrival(tracker.sensors, tracker.poses, time, pose)
     sample, lost = _sampled(tracker.sensors, time, arrived)
     shown = jnp.where((due & ~lost)[:, None], sample, tracker.shown)
     if settle:
@@ -198,13 +207,11 @@ def arrival(sensors: Sensors, poses: Array, time: Array, pose: Array) -> tuple[A
       pose: (B, 7) true poses after the step.
     """
     poses = jnp.concatenate([pose[:, None], poses[:, :-1]], 1)
+    arrived = jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0]
     taken = time - sensors.delay
-    periods = [jnp.floor(n / sensors.period + sensors.phase) for n in (taken - 1, taken)]
-    return (
-        poses,
-        jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0],
-        periods[1] > periods[0],
-    )
+    period_before = jnp.floor((taken - 1) / sensors.period + sensors.phase)
+    period = jnp.floor(taken / sensors.period + sensors.phase)
+    return poses, arrived, period > period_before
 
 
 def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
@@ -218,24 +225,21 @@ def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
     position = pose[:, :3] + sensors.position_bias + sensors.position_noise[:, None] * errors[:, :3]
     noise_turn = rotations.from_rotation_vector(sensors.rotation_noise[:, None] * errors[:, 3:])
     turn = rotations.multiply(noise_turn, rotations.from_rotation_vector(sensors.rotation_bias))
-    return jnp.concatenate(
-        [position, rotations.multiply(turn, pose[:, 3:])], -1
-    ), luck < sensors.dropout
+    sample = jnp.concatenate([position, rotations.multiply(turn, pose[:, 3:])], -1)
+    return sample, luck < sensors.dropout
 
 
 def still(reading: Readings, steps: int) -> Readings:
     """Readings at the start of an episode: the same (B, ...) in all H `steps`."""
-    return Readings(*(jnp.repeat(field[:, None], steps, 1) for field in reading))
+    return Readings(*[jnp.repeat(field[:, None], steps, 1) for field in reading])
 
 
 def push(readings: Readings, newest: Readings) -> Readings:
     """Prepends the newest readings (B, ...) and drops the oldest."""
-    return Readings(
-        *(
-            jnp.concatenate([new[:, None], old[:, :-1]], 1)
-            for new, old in zip(newest, readings, strict=True)
-        )
-    )
+    fields = []
+    for new, old in zip(newest, readings, strict=True):
+        fields.append(jnp.concatenate([new[:, None], old[:, :-1]], 1))
+    return Readings(*fields)
 
 
 def seen_by(task: TaskSettings, state: SceneState, readings: Readings) -> SceneState:
@@ -251,19 +255,21 @@ def seen_by(task: TaskSettings, state: SceneState, readings: Readings) -> SceneS
         the tracker.
       readings: the last control steps.
     """
-    newest = ("q_target", "u_target", "object_position", "object_quaternion")
-    state = state._replace(**{name: getattr(readings, name)[:, 0] for name in newest})
+    state = state._replace(
+        q_target=readings.q_target[:, 0],
+        u_target=readings.u_target[:, 0],
+        object_position=readings.object_position[:, 0],
+        object_quaternion=readings.object_quaternion[:, 0],
+    )
     if task.observation == "full":
         return state
-    blind = (
-        "q_velocity",
-        "object_velocity",
-        "object_angular_velocity",
-        "contact_force",
-        "contact_position",
-    )
-    state = state._replace(**{name: jnp.zeros_like(getattr(state, name)) for name in blind})
     moved = readings.u[:, 0] - readings.u[:, 1]
     return state._replace(
-        contact_found=jnp.zeros_like(state.contact_found), u_velocity=moved / task.control_dt
+        q_velocity=jnp.zeros_like(state.q_velocity),
+        u_velocity=moved / task.control_dt,
+        object_velocity=jnp.zeros_like(state.object_velocity),
+        object_angular_velocity=jnp.zeros_like(state.object_angular_velocity),
+        contact_force=jnp.zeros_like(state.contact_force),
+        contact_position=jnp.zeros_like(state.contact_position),
+        contact_found=jnp.zeros_like(state.contact_found),
     )

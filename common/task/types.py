@@ -101,26 +101,25 @@ class Goal:
 
     def replace(self, constraint: str, **arrays: Array) -> "Goal":
         """Returns the goal with other arrays of one constraint."""
-        return dataclasses.replace(
-            self, values={**self.values, constraint: self.values[constraint]._replace(**arrays)}
-        )
+        values = {**self.values, constraint: self.values[constraint]._replace(**arrays)}
+        return dataclasses.replace(self, values=values)
 
     def where(self, mask: Array, constraint: str, **arrays: Array) -> "Goal":
         """Returns the goal with other arrays of one constraint in the masked environments (B,)."""
-        own = self.values[constraint]
-        chosen = {
-            name: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, getattr(own, name))
-            for name, new in arrays.items()
-        }
+        previous = self.values[constraint]
+        chosen = {}
+        for name, array in arrays.items():
+            rows = mask.reshape(-1, *[1] * (array.ndim - 1))
+            chosen[name] = jnp.where(rows, array, getattr(previous, name))
         return self.replace(constraint, **chosen)
 
     def flat(self) -> dict[str, Array]:
         """All goal arrays by their names in messages: `heading_direction`, `pose_q` and so on."""
-        return {
-            f"{constraint}_{name}": array
-            for constraint, arrays in self.values.items()
-            for name, array in arrays._asdict().items()
-        }
+        flat = {}
+        for constraint, arrays in self.values.items():
+            for name, array in arrays._asdict().items():
+                flat[f"{constraint}_{name}"] = array
+        return flat
 
     def row(self, index: int) -> "Goal":
         """Returns the goal of one environment, without the batch axis, as NumPy arrays."""
@@ -166,7 +165,7 @@ class Features(NamedTuple):
     """(B, L, 3) f: net contact force on each link, N."""
     touching: Array
     """(B, L) bool b: the link touches the object."""
-    of: dict[str, Any]
+    by_constraint: dict[str, Any]
     """Features of the constraints, by their names (`Constraint.features`)."""
 
 

@@ -82,7 +82,8 @@ class Generate:
         """Generates the sets, and prints where they are."""
         from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
-        from congrasp.common.task.sampling.sets import make_sets, save
+        from congrasp.common.task.sampling.set_file import save
+        from congrasp.common.task.sampling.sets import make_sets
         from congrasp.services.assets.objects.named import located, objects_of
 
         if not self.objects and self.count < 1:
@@ -195,7 +196,7 @@ class Import:
 
     def __call__(self) -> int:
         """Imports the sets, and prints what was dropped."""
-        from congrasp.common.task.sampling.sets import save
+        from congrasp.common.task.sampling.set_file import save
         from congrasp.services.assets.captures.build import Options, import_sets
         from congrasp.services.assets.captures.sequence import Meshes
 
@@ -330,7 +331,8 @@ def show(
       congrasp constraints show sets/mug_7.constraints.safetensors
       congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
-    from congrasp.common.task.sampling.sets import describe, load
+    from congrasp.common.task.sampling.set_description import describe
+    from congrasp.common.task.sampling.set_file import load
 
     constraints = load(file)
     in_range(0, len(constraints.arrays["rest"]), rest=rest)

@@ -11,7 +11,7 @@ from typing_extensions import Doc
 
 from congrasp.common.errors import CongraspError, printable
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.constraints.base import Option
+from congrasp.common.task.constraints.specs import Option
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.console import bars, in_range, report_error, say

@@ -195,7 +195,7 @@ def show(
       congrasp objects show mug:7 --png mug.png
       congrasp objects show mug_7 --folder my-objects
     """
-    from congrasp.common.task.sampling.headings import sample_headings
+    from congrasp.common.task.sampling.heading_sampler import sample_headings
     from congrasp.services.assets.objects.named import find_object
 
     obj = find_object(object, folder)
@@ -275,7 +275,7 @@ def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = Fa
     each resting pose.
     """
     from congrasp.common.hands.closure import outline
-    from congrasp.common.task.sampling.headings import above, within_reach
+    from congrasp.common.task.sampling.reach import above, within_reach
 
     if headings is None:
         return ["none"] * len(obj.rest_poses)

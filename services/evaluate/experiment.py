@@ -118,8 +118,8 @@ class Experiment:
     objects: Sequence[GraspObject]
     """N objects, before they are scaled for the hand."""
     constraints: ConstraintBank | None = None
-    """Constraints of these objects in this order (`common.task.sampling.sets.bank_of`); sampled if
-    None, with references of the reference policy (`services.evaluate.references`)."""
+    """Constraints of these objects in this order (`common.task.sampling.set_bank.bank_of`); sampled
+    if None, with references of the reference policy (`services.evaluate.references`)."""
     episodes: int = 1000
     """Least number of episodes of a row."""
     physics: PhysicsName = "native"

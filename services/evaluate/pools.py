@@ -31,7 +31,7 @@ from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.build import headings_of
+from congrasp.common.task.sampling.object_headings import headings_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions

@@ -30,8 +30,9 @@ from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import POSES, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.sampling.object_headings import POSES
+from congrasp.common.task.sampling.references import make_references
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.plan import RowPlan, batches, protocol

@@ -24,8 +24,10 @@ from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.methods import takes
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.headings import Headings, feasible, opposed_at
-from congrasp.common.task.sampling.sets import bank_of, load_for
+from congrasp.common.task.sampling.headings import Headings, opposed_at
+from congrasp.common.task.sampling.reach import feasible
+from congrasp.common.task.sampling.set_bank import bank_of
+from congrasp.common.task.sampling.set_file import load_for
 from congrasp.services.evaluate.episodes import identity
 from congrasp.services.evaluate.experiment import Experiment, Result, Variation
 from congrasp.services.evaluate.paper import CAPTURED_SETS, CENTER_GROUP

@@ -16,14 +16,10 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional
-from congrasp.common.task.sampling.build import clear_of_table
-from congrasp.common.task.sampling.headings import (
-    INWARD,
-    above,
-    max_width,
-    sample_headings,
-    within_reach,
-)
+from congrasp.common.task.sampling.heading_sampler import HeadingOptions, sample_headings
+from congrasp.common.task.sampling.headings import INWARD, max_width
+from congrasp.common.task.sampling.reach import above, within_reach
+from congrasp.common.task.sampling.table import clear_of_table
 from congrasp.common.task.types import Surface
 
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)
@@ -117,18 +113,17 @@ def headings(
     )
     restricted = request.avoid is not None
     own = outline(hand)
-    sample = functools.partial(
-        sample_headings,
-        rng=rng,
-        use_affordance=restricted,
+    heading_options = HeadingOptions(
         inward=hand.object_scale * INWARD,
         max_width=max_width(own, hand.object_scale),
         along=direction,
         at=position,
     )
+    lenient_options = dataclasses.replace(heading_options, lenient=True)
+    sample = functools.partial(sample_headings, rng=rng, use_affordance=restricted)
     if restricted:
         obj = _balanced(obj)
-    found = sample(obj) or sample(obj, lenient=True)
+    found = sample(obj, options=heading_options) or sample(obj, options=lenient_options)
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",

@@ -21,9 +21,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.rotations import continuous
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.constraints.base import Option, Part
 from congrasp.common.task.constraints.heading import ABOVE
-from congrasp.common.task.sampling import sets as constraint_sets
+from congrasp.common.task.constraints.specs import Option, Part
+from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach
 from congrasp.services.assets.captures.references import followed
@@ -204,7 +204,7 @@ def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
             "position": position[last],
             "quaternion": quaternion[last],
         }
-    if path.name.endswith(constraint_sets.SUFFIX):
+    if path.name.endswith(set_file.SUFFIX):
         arrays = _set_of(path, target, index).arrays
         return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
     given, hand = _json(path, ("joints", "position", "quaternion")), target.hand
@@ -240,7 +240,7 @@ def _path(text: str, target: Target) -> dict[str, np.ndarray]:
             values[first : last + 1] for values in _wrist_on_object(motion, first)
         )
         return _resampled(position, quaternion, target.waypoints, path)
-    if path.name.endswith(constraint_sets.SUFFIX):
+    if path.name.endswith(set_file.SUFFIX):
         arrays = _set_of(path, target, index).arrays
         position, quaternion = (
             arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion")
@@ -320,7 +320,7 @@ def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
     """The constraint set in a file; raises a CongraspError for another hand or object, or without
     this number.
     """
-    constraints, hand, obj = constraint_sets.load(path), target.hand, target.obj
+    constraints, hand, obj = set_file.load(path), target.hand, target.obj
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(
             f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'."

@@ -16,7 +16,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import check_arrays
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.constraints.base import Marker
+from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.wire.codec import Message
 
 _LATEST = 1e4  # s

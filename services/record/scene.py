@@ -33,7 +33,7 @@ from congrasp.common.hands.spec import Hand, Link, capsule_ends
 from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.spec import Colours
 from congrasp.common.objects.store import LARGEST
-from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
+from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
 from congrasp.services.record.episode import MovedArm, arm_of_episode, markers

@@ -23,7 +23,8 @@ from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, get_constraint, known
-from congrasp.common.task.constraints.base import ErrorSpec, Ghost, Marker
+from congrasp.common.task.constraints.markers import Ghost, Marker
+from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message

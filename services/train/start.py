@@ -14,8 +14,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.pool import load_pool
 from congrasp.common.policy.bundle import policy_spec
-from congrasp.common.task.sampling.sets import SUFFIX as SET_SUFFIX
-from congrasp.common.task.sampling.sets import load
+from congrasp.common.task.sampling.set_file import SUFFIX as SET_SUFFIX
+from congrasp.common.task.sampling.set_file import load
 from congrasp.common.transport.keys import Keys
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints

@@ -18,7 +18,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import Colours, GraspObject
-from congrasp.common.task.sampling.headings import INWARD, Headings, within_reach
+from congrasp.common.task.sampling.headings import INWARD, Headings
+from congrasp.common.task.sampling.reach import within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.meshes import Source

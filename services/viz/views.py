@@ -15,7 +15,7 @@ from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import numbers_in
 from congrasp.common.objects.spec import Colours
-from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
+from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import markers
 from congrasp.services.record.palette import HEADING, WAYPOINT, region_colours

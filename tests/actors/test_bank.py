@@ -15,8 +15,10 @@ from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.kinematics import capsules, link_transforms
 from congrasp.common.task.sampling.bank import SHARED, surface_of
-from congrasp.common.task.sampling.build import POSES, bank_form, build_bank, make_references
+from congrasp.common.task.sampling.build import bank_form, build_bank
 from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.sampling.object_headings import POSES
+from congrasp.common.task.sampling.references import make_references
 from tests import task as suite
 from tests.compiled import Compiled
 from tests.scenes import pointing

@@ -19,10 +19,11 @@ from congrasp.common.hands.closure import outline
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling import build
+from congrasp.common.task.sampling import cache
 from congrasp.common.task.sampling.bank import rows_of, stacked
-from congrasp.common.task.sampling.build import headings_of
-from congrasp.common.task.sampling.sets import load, load_for, make_sets, save
+from congrasp.common.task.sampling.object_headings import headings_of
+from congrasp.common.task.sampling.set_file import load, load_for, save
+from congrasp.common.task.sampling.sets import make_sets
 from congrasp.common.wire.codec import Message
 from tests import task as suite
 from tests.task import HAND, OBJECTS, TASK
@@ -36,7 +37,7 @@ def _banks_are_built_once(tmp_path_factory):
     """Also those of pools as small as these."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(build, "LEAST_OBJECTS", 1)
+        patch.setattr(cache, "LEAST_OBJECTS", 1)
         yield
 
 

@@ -135,11 +135,11 @@ class Shown(NamedTuple):
     base_quaternion: jax.Array
 
 
-def test_images_come_at_their_rate_or_once(monkeypatch):
+def test_images_follow_their_period(monkeypatch):
     """At 10 Hz in steps of 10 ms: two or three in 25 steps. Half of the points are dropped. Three
     at most together.
     """
-    monkeypatch.setattr(camera, "_TOGETHER", 3)
+    monkeypatch.setattr(camera, "IMAGES_TOGETHER", 3)
     pose = jnp.tile(jnp.array([[0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]]), (4, 1))
     points = jnp.repeat(cube(), 4, 0)
     still = jnp.zeros((4, 6)), jnp.full((4, 3), 3.0), pose[:, 3:]
@@ -161,7 +161,7 @@ def test_images_come_at_their_rate_or_once(monkeypatch):
         np.testing.assert_allclose(nearest, 0.0, atol=1e-5)
 
 
-def test_images_that_are_taken_in_parts_are_those_of_their_environments(monkeypatch):
+def test_images_in_parts_equal_single_images(monkeypatch):
     """Other objects, poses and hands in each of seven, every second one due; arrays of NumPy
     outside of a program.
     """
@@ -181,23 +181,24 @@ def test_images_that_are_taken_in_parts_are_those_of_their_environments(monkeypa
         + rng.normal(size=(7, 1, 2, 3)) * (0, 0, 0.03)
     )
     ends = ends.astype(np.float32)
-    given = state, np.arange(7), np.arange(7) % 2 == 0, pose, surface
+    due = np.arange(7) % 2 == 0
+    inputs = state, camera.Images(np.arange(7), pose, surface), due
 
     @jax.jit
-    def image(given, ends):
-        return camera._image(
-            *given, lambda rows: camera.Capsules(ends[rows], jnp.array([0.02]))
+    def image(inputs, ends):
+        return camera.with_images(
+            *inputs, lambda rows: camera.Capsules(ends[rows], jnp.array([0.02]))
         ).cloud
 
     def alone(i):
-        return image(*jax.tree.map(lambda x: x[i : i + 1], (given, ends)))
+        return image(*jax.tree.map(lambda x: x[i : i + 1], (inputs, ends)))
 
     expected = jax.tree.map(lambda *clouds: jnp.concatenate(clouds), *map(alone, range(7)))
-    monkeypatch.setattr(camera, "_TOGETHER", 3)
-    found = image(given, ends)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-3), found, expected)
-    np.testing.assert_array_equal(np.any(found.points != state.cloud.points, (1, 2)), given[2])
-    assert np.any(found.points != image(given, ends + 9.0).points, (1, 2)).any()
+    monkeypatch.setattr(camera, "IMAGES_TOGETHER", 3)
+    cloud = image(inputs, ends)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-3), cloud, expected)
+    np.testing.assert_array_equal(np.any(cloud.points != state.cloud.points, (1, 2)), due)
+    assert np.any(cloud.points != image(inputs, ends + 9.0).points, (1, 2)).any()
 
 
 @functools.cache
@@ -241,7 +242,7 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
         assert difference(loaded, tmp_path / kind) <= 3e-6
 
 
-def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
+def test_student_learns_from_its_cloud(tmp_path):
     """A teacher of the full state acts by where the object is; the student's one informative input
     is the cloud.
     """

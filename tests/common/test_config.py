@@ -16,12 +16,12 @@ CONFIGS = pathlib.Path(__file__).with_name("configs")
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_configurations_survive_the_wire(name):
+def test_json_round_trip(name):
     assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.json")), ids=lambda file: file.stem)
-def test_runs_of_earlier_versions_keep_their_batch_and_staleness(file):
+def test_earlier_configurations_keep_their_batch(file):
     written = json.loads(file.read_text())
     earlier = {**written, **written["ppo"]}  # where they were until they belonged to the run
     config = run_config_from_json(file.read_text())
@@ -32,12 +32,12 @@ def test_runs_of_earlier_versions_keep_their_batch_and_staleness(file):
 
 
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])
-def test_a_task_that_is_none_is_refused(task):
+def test_invalid_task_is_refused(task):
     with pytest.raises(CongraspError, match="does not match this version"):
         run_config_from_json(json.dumps({"task": task}))
 
 
-def test_weights_go_along_the_ramp():
+def test_weights_follow_the_ramp():
     first = RewardWeights(contact=1.0, heading_position=2.0)
     last = dataclasses.replace(first, heading_position=6.0)
     curriculum = CurriculumConfig(stationary_updates=5, ramp=(10, 20), reward=last)

@@ -105,7 +105,7 @@ def test_names_are_unique_over_all_constraints():
 
 
 @each
-def test_what_it_declares_is_what_it_computes(constraint, whole):
+def test_terms_and_errors_match_declarations(constraint, whole):
     paid, measured = evaluated(constraint.reward, whole), evaluated(constraint.measure, whole)
     assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
     assert sorted(measured) == sorted(error.name for error in constraint.errors)
@@ -121,7 +121,7 @@ def test_what_it_declares_is_what_it_computes(constraint, whole):
 
 
 @each_optional
-def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whole):
+def test_inactive_constraint_has_no_effect(constraint, whole):
     off = _without(whole, constraint)
     start, mask = 0, dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
     on_observation, off_observation = evaluated(observe, whole), evaluated(observe, off)
@@ -158,7 +158,7 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
     [("human", {"F": 20, "G": 5, "K": 15}), ("allegro", {"F": 16, "G": 4, "K": 15})],
 )
 @each
-def test_neutral_arrays_have_their_declared_shapes_and_are_unit(constraint, hand, sizes):
+def test_neutral_arrays_match_declarations(constraint, hand, sizes):
     neutral = constraint.neutral(get_hand(hand), TASK)
     assert neutral._fields == tuple(constraint.arrays) == constraint.goal._fields
     for name, array in constraint.arrays.items():
@@ -195,7 +195,7 @@ def test_names_that_it_gives_are_there(constraint):
     assert constraint.title and constraint.options and constraint.name.isidentifier()
 
 
-def test_the_papers_constraints_come_first():
+def test_constraints_of_the_paper_are_first():
     assert PAPER == NAMES[:4] == ("heading", "affordance", "pose", "trajectory")
     assert OURS == NAMES == TaskConfig().constraints
     assert [c.name for c in known(TaskConfig(constraints=("trajectory", "heading")))] == [
@@ -204,7 +204,7 @@ def test_the_papers_constraints_come_first():
     ]
 
 
-def test_what_is_not_known_is_named():
+def test_unknown_constraint_is_named():
     with pytest.raises(
         CongraspError, match=r"no constraint 'glove'.*Choose from: heading, affordance"
     ):
@@ -253,7 +253,7 @@ def _judged(state, surface, goal, action):
     )
 
 
-def test_a_task_ignores_what_it_does_not_know():
+def test_task_ignores_unsupported_constraints():
     """A choice of fingers and a limit of the force: f_max stays a number."""
     task, (state, surface, goal) = TaskConfig(constraints=PAPER), scene(5)
     flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
@@ -358,7 +358,7 @@ def _same(
 
 @pytest.mark.slow
 @each_optional
-def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint):
+def test_draws_are_independent_of_other_constraints(constraint):
     """A policy that knows a constraint, of which no episode has it, learns from the same
     episodes.
     """
@@ -368,7 +368,7 @@ def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint
     _same(some, all_of_them, constraint.name)
 
 
-def test_episodes_with_fingers_are_those_without_in_all_else():
+def test_fingers_change_no_other_draw():
     """By compiled programs, whose last bits depend on the constraints."""
     without = dataclasses.replace(
         TASK, constraints=tuple(name for name in NAMES if name != "fingers")
@@ -381,7 +381,7 @@ def test_episodes_with_fingers_are_those_without_in_all_else():
     assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15
 
 
-def test_a_constraint_without_blocks_is_always_active():
+def test_constraint_without_blocks_is_active():
     *_, goal = scene(0)
     always = [constraint for constraint in known(TASK) if not constraint.blocks]
     assert always and all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)

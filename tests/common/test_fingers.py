@@ -58,7 +58,7 @@ def pinch(on: bool = True):
     )
 
 
-def test_the_hand_knows_which_finger_a_link_belongs_to():
+def test_links_belong_to_fingers():
     assert HAND.fingers == ("thumb", "index", "middle", "ring", "little")
     np.testing.assert_array_equal(HAND.link_fingers, [-1, *np.repeat(np.arange(5), 3)])
     assert get_hand("allegro").fingers == ("thumb", "index", "middle", "ring")
@@ -89,7 +89,7 @@ def test_reward_by_hand():
     np.testing.assert_allclose(weighted["fingers_distance"], [-0.0432396], rtol=1e-5)
 
 
-def test_only_the_named_fingers_and_the_palm_earn():
+def test_contacts_of_other_fingers_earn_nothing():
     weights, unit = (
         HAND.contact_weights,
         RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0),
@@ -231,7 +231,7 @@ def _arrived(goal):
 
 
 @pytest.mark.parametrize("hand", pretrained_hands())
-def test_the_layout_of_shipped_policies_stands(hand):
+def test_layout_of_shipped_policies_is_unchanged(hand):
     bundle = load(policy_file(None, hand))
     assert layout(get_hand(hand), bundle.task) == bundle.spec.layout
 

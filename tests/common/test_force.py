@@ -79,7 +79,7 @@ def test_force_beyond_the_limit_earns_nothing(limit, most):
     np.testing.assert_allclose(free["force_excess"], [-15.0], rtol=1e-6)
 
 
-def test_error_is_the_share_of_steps_in_which_a_link_presses_too_hard():
+def test_error_is_the_share_of_steps_above_limit():
     hard, soft = (
         evaluated(metrics.errors, pressing()),
         evaluated(metrics.errors, pressing(limit=20.5)),
@@ -103,7 +103,7 @@ def _uniform(batch, seed):
     return np.random.default_rng(seed).uniform(size=(batch, 1)).astype(np.float32)
 
 
-def test_draws_are_log_uniform_above_what_the_weight_needs():
+def test_draws_are_log_uniform():
     count = 4000
     zero, low = np.zeros(count, int), np.where(np.arange(count) % 2, 1.0, 5.0)
     limit = np.asarray(

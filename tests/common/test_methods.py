@@ -32,7 +32,7 @@ RUN = RunConfig(
 
 
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.learns])
-def test_a_run_of_a_method_says_so_and_survives_the_wire(name):
+def test_run_records_its_method(name):
     run = with_method(RUN, name)
     assert run.task.method == name
     assert run_config_from_json(to_json(run)) == run
@@ -66,13 +66,13 @@ def test_a_single_stage_has_the_last_weights_from_the_start():
     assert constant.curriculum.weights(constant.task.reward, 0) == FIRST
 
 
-def test_graspxl_knows_heading_and_affordance_alone():
+def test_graspxl_has_heading_and_affordance():
     task = with_method(RUN, "graspxl").task
     assert [name for name, _ in layout(HAND, task)] == ["state", "heading", "affordance", "mask"]
     assert not task.dynamic_center
 
 
-def test_dgrasp_has_a_pose_in_every_episode_and_no_reward_for_the_heading():
+def test_dgrasp_always_has_a_pose():
     run = with_method(RUN, "dgrasp")
     assert [name for name, _ in layout(HAND, run.task)] == [
         "state",
@@ -89,7 +89,7 @@ def test_dgrasp_has_a_pose_in_every_episode_and_no_reward_for_the_heading():
         assert np.any(paid["pose_wrist_position"])
 
 
-def test_without_learning_actions_count_for_nothing_and_fingers_close_after_half_the_approach():
+def test_pd_ignores_actions():
     task = evaluated_as(TaskConfig(), "pd", "a policy")
     state, surface, goal = scene(1)
     state = state._replace(q_target=np.tile(np.float32(HAND.q_open), (4, 1)))
@@ -121,7 +121,7 @@ def test_a_policy_keeps_its_method(tmp_path):
     assert bundles.load(tmp_path / "other.safetensors").task == task
 
 
-def test_what_cannot_be():
+def test_invalid_methods_are_refused():
     with pytest.raises(CongraspError, match=r"no method 'magic'.*ours, pd"):
         get_method("magic")
     with pytest.raises(CongraspError, match=r"'pd' does not learn.*congrasp evaluate --method pd"):
@@ -160,7 +160,7 @@ def label(teacher, ahead, limit, velocity, table, own):
     return found[16]
 
 
-def test_a_label_is_the_way_from_the_student_s_guidance_to_the_teacher_s_target():
+def test_label_reaches_the_teacher_s_target():
     """alpha_w = 0.02 m; 15 m/s^2 allow a lead of 15 / 1800 m = 8.33 mm beyond v / 20."""
     assert label(0.2, 0.001, 0.04, 0.0, 1.0, 0.0) == pytest.approx((0.001 + 0.004) / 0.02, abs=1e-5)
     # The tracker is 3 mm off: the student's guidance is 4 mm ahead, and the target is where it was.
@@ -178,7 +178,7 @@ def test_a_label_is_the_way_from_the_student_s_guidance_to_the_teacher_s_target(
     np.testing.assert_allclose(ALLEGRO.wrist_servos[:, 0], [1800.0, 90.0], rtol=1e-4)
 
 
-def test_with_its_label_a_student_gives_the_wrist_the_teacher_s_target():
+def test_labelled_student_moves_like_its_teacher():
     """Whatever its tracker shows, as long as both know the wrist's velocity, which they do here."""
     task = TaskConfig(surface_points=N, constraints=("heading", "affordance", "fingers"))
     tracked = dataclasses.replace(

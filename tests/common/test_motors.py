@@ -18,7 +18,7 @@ from congrasp.common.hands.mjcf import WRIST_JOINTS, add_hand
 from congrasp.common.hands.motors import coupled, joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Coupling, Motor
 from congrasp.common.policy.bundle import policy_spec
-from congrasp.common.task.sampling.closed_poses import _fingers
+from congrasp.common.task.sampling.closed_poses import finger_groups
 from congrasp.services.assets.hands.model_files import import_hand
 from congrasp.services.train.presets import get_preset, with_hand
 
@@ -94,7 +94,9 @@ def test_poses_follow_and_fingers_that_one_motor_moves_close_together(hand):
     i2, i3, r1, i1 = _index(hand, "index_2", "index_3", "ring_1", "index_1")
     for q in (hand.q_open, hand.q_closed):
         assert q[i3] == pytest.approx(0.9 * q[i2]) and q[r1] == pytest.approx(0.1 + 0.8 * q[i1])
-    finger_of_joint, _, count = _fingers(hand)
+    groups = finger_groups(hand)
+    finger_of_joint = groups.of_joint
+    count = groups.number
     assert count == 3 and finger_of_joint[r1] == finger_of_joint[i1] != finger_of_joint[0]
 
 

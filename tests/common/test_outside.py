@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints.base import (
-    Constraint,
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.markers import Polyline
+from congrasp.common.task.constraints.specs import (
     ErrorSpec,
     GoalArray,
     ObservationField,
     Option,
-    Polyline,
     Weight,
 )
 from tests.children import python
@@ -63,7 +63,7 @@ class Level(Constraint):
         return {"upper": jnp.mean(height > height.mean(-1, keepdims=True), -1)}
 
     def sample(self, hand, draw, uniform):
-        return LevelGoal(uniform < draw.own("level")["upper"][:, None])
+        return LevelGoal(uniform < draw.columns("level")["upper"][:, None])
 
     def labels(self, hand):
         return {"wrist": ("wrist",)}
@@ -102,7 +102,7 @@ def height(scene, earning):
     return jnp.clip(rise, 0.0, 0.2)
 
 
-def test_nothing_else_must_be_changed():
+def test_outside_constraint_and_term_work():
     done = python("-m", "tests.common.test_outside", timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [

@@ -204,7 +204,7 @@ def test_measures_of_a_motion_worked_out_by_hand():
         assert found[name][0] == pytest.approx(value, rel=1e-5), name
 
 
-def test_hands_without_meshes_have_no_measure_of_them():
+def test_hand_without_meshes_has_no_mesh_measure():
     found = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
     assert set(found) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
 

@@ -41,7 +41,7 @@ def _resolve(affordance: bool, pose: bool, trajectory: bool):
     return asked, resolved(surface, asked, _flags(affordance, pose, trajectory))
 
 
-def test_what_is_active_follows_the_order_of_priority():
+def test_active_blocks_follow_priority():
     for flags in itertools.product([False, True], repeat=3):
         jax.tree.map(
             np.testing.assert_array_equal,
@@ -50,7 +50,7 @@ def test_what_is_active_follows_the_order_of_priority():
         )
 
 
-def test_a_lone_heading_stays_as_asked():
+def test_lone_heading_is_unchanged():
     asked, done = _resolve(False, False, False)
     np.testing.assert_allclose(done.goal["heading"].position, asked["heading"].position, atol=1e-6)
     np.testing.assert_allclose(
@@ -59,7 +59,7 @@ def test_a_lone_heading_stays_as_asked():
 
 
 @pytest.mark.parametrize("trajectory", [False, True])
-def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
+def test_overridden_heading_is_the_reference_s(trajectory):
     asked, done = _resolve(False, not trajectory, trajectory)
     q = asked["trajectory"].quaternion[0, -1] if trajectory else asked["pose"].quaternion[0]
     expected = Rotation.from_quat(q, scalar_first=True).apply(grasp_frame(HAND).heading)
@@ -67,7 +67,7 @@ def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
     assert abs(np.dot(done.goal["heading"].direction[0], done.goal["heading"].cross[0])) < 1e-5
 
 
-def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by_two_fifths():
+def test_heading_of_a_lone_trajectory():
     """By hand: the last waypoint is at (1, 2, 3) m and not turned, so that the centre is only
     shifted.
     """
@@ -90,7 +90,7 @@ def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by
     np.testing.assert_allclose(both["heading"].position, expected, atol=1e-5)
 
 
-def test_under_a_trajectory_the_poses_fingers_are_carried_by_its_last_waypoint():
+def test_trajectory_sets_the_wrist_of_a_pose():
     asked, done = _resolve(False, True, True)
     np.testing.assert_allclose(done.goal["pose"].position, asked["trajectory"].position[:, -1])
     np.testing.assert_allclose(done.goal["pose"].q, asked["pose"].q)
@@ -106,7 +106,7 @@ def _two_regions(graspable_x: float, avoid_x: float):
 
 
 @pytest.mark.parametrize("at_avoided", [True, False])
-def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avoided):
+def test_affordance_redirects_a_near_heading(at_avoided):
     surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
     where = np.tile(np.array([-0.1 if at_avoided else 0.1, 0.0, 0.0], np.float32), (4, 1))
     down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (4, 1))
@@ -143,7 +143,7 @@ def _redirected(
     return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
 
 
-def test_a_redirected_heading_keeps_its_direction_where_that_works():
+def test_redirection_keeps_a_feasible_direction():
     """By hand: of two graspable points the nearer one is at (0.1, 0, 0), and the position 2 cm
     behind it.
     """
@@ -153,7 +153,7 @@ def test_a_redirected_heading_keeps_its_direction_where_that_works():
     np.testing.assert_allclose(heading.cross, [1, 0, 0], atol=1e-6)
 
 
-def test_a_redirected_heading_never_ends_in_the_air():
+def test_redirection_ends_at_the_surface():
     """The middle of a ring of 4 cm is its hole: the heading goes to the ring."""
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.stack([0.1 + 0.04 * np.cos(turn), 0 * turn, 0.04 * np.sin(turn)], -1)
@@ -164,7 +164,7 @@ def test_a_redirected_heading_never_ends_in_the_air():
     assert surface[2] > -0.001 and np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
 
 
-def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
+def test_redirection_is_the_smallest_rotation():
     """By hand: v = -z and w = x from 15 cm above the avoid region, at which the graspable one lies
     20 cm aside.
 
@@ -177,7 +177,7 @@ def test_a_redirected_heading_turns_the_hand_by_the_least_rotation():
     np.testing.assert_allclose(heading.position, [0.1 + 0.016, 0, -0.012], atol=1e-6)
 
 
-def test_a_redirected_heading_goes_where_the_hand_can_close():
+def test_redirection_ends_where_a_hand_closes():
     """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the
     most.
     """
@@ -189,7 +189,7 @@ def test_a_redirected_heading_goes_where_the_hand_can_close():
 
 
 @pytest.mark.parametrize("wobble", [0.0, 1e-7, -1e-7])
-def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
+def test_redirection_is_robust_to_rounding(wobble):
     """The heading turns by a right angle, to where its cross-finger direction w pointed: w turns
     with it, whatever the last bits of w were."""
     avoid = [[-0.1, 0, 0], [-0.1, 0, 0.12], [0.1, 0, 0.25]]
@@ -219,7 +219,7 @@ def test_redirected_headings_lead_to_the_graspable_region(seed):
         np.testing.assert_allclose(getattr(heading, name)[~moved], given_array[~moved], atol=1e-6)
 
 
-def test_a_cross_finger_direction_along_the_heading_is_replaced_by_an_orthogonal_one():
+def test_parallel_cross_direction_is_replaced():
     _, surface, asked = scene(3)
     for wobble in (0.0, 1e-7):
         cross = asked["heading"].direction + np.float32([wobble, 0, 0])
@@ -288,7 +288,7 @@ def only(avoid=None, **constraints):
     return found
 
 
-def test_what_agrees_says_nothing():
+def test_agreeing_constraints_have_no_message():
     place = (-0.06, 0.0, 0.0)
     path = path_to(place)
     on_graspable = {**path, "position": path["position"] - path["position"][-1] + [-0.1, 0.0, 0.05]}
@@ -304,7 +304,7 @@ def test_what_agrees_says_nothing():
     assert all_of() == []
 
 
-def test_a_trajectory_that_ends_at_what_must_not_be_touched_is_refused():
+def test_trajectory_to_avoid_region_is_refused():
     end = np.array([0.08, 0.03, 0.0])
     path = np.linspace(end + np.array([0, 0.2, 0]), end, 15)
     found = only(AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))})
@@ -316,7 +316,7 @@ def test_a_trajectory_that_ends_at_what_must_not_be_touched_is_refused():
     )
 
 
-def test_a_pose_away_from_the_trajectorys_end_keeps_its_fingers_alone():
+def test_pose_off_the_trajectory_keeps_its_fingers():
     pose, path = at((-0.06, 0.0, 0.0)), path_to((-0.06, 0.0, 0.0))
     found = only(
         pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path
@@ -333,7 +333,7 @@ def test_a_pose_away_from_the_trajectorys_end_keeps_its_fingers_alone():
     )
 
 
-def test_a_pose_that_touches_what_must_not_be_touched_names_the_links():
+def test_pose_on_avoid_region_names_the_links():
     tip = HAND.keypoints[len(HAND.links) + 1]
     pose = {"q": np.zeros(20), "quaternion": NOT_TURNED}
     found = only(AVOID, pose={**pose, "position": np.array([0.08, 0.0, 0.0]) - tip})
@@ -343,7 +343,7 @@ def test_a_pose_that_touches_what_must_not_be_touched_names_the_links():
 
 
 @pytest.mark.parametrize("stronger", ["pose", "trajectory"])
-def test_a_heading_from_elsewhere_follows_the_reference(stronger):
+def test_contradicting_heading_is_overridden(stronger):
     place = (-0.06, 0.0, 0.0)
     reference = {"pose": at(place)} if stronger == "pose" else {"trajectory": path_to(place)}
     found = only(heading={"direction": -HEADING}, **reference)
@@ -351,7 +351,7 @@ def test_a_heading_from_elsewhere_follows_the_reference(stronger):
     assert "180 degrees" in found.message and f"The {stronger} overrides it" in found.message
 
 
-def test_a_heading_towards_what_must_not_be_touched_is_turned():
+def test_heading_to_avoid_region_is_redirected():
     found = only(
         AVOID,
         heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])},

@@ -13,8 +13,8 @@ from congrasp.common.hands.motors import tip_forces
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
-from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.privileged import Parameters
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import SceneState
 
 HAND = get_hand("human")
@@ -69,7 +69,7 @@ def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
     "changes",
     [{"observation": "tracked"}, {"sensing": SensingConfig(position_noise=(0.001, 0.002))}],
 )
-def test_policies_with_sensors_have_a_critic_of_the_true_state(changes):
+def test_critic_of_sensors_sees_the_true_state(changes):
     task = dataclasses.replace(TASK, **changes)
     sizes = dict(privileged.layout(HAND, task))
     assert sizes["observation"] == sum(size for _, size in full_layout(task))

@@ -35,15 +35,15 @@ CASES = {
     "wrist_velocity": ("state.u_velocity", add(0.5, 0)),
     "finger_deviation": ("state.q_initial", add(0.1, 0)),
     "drop": ("state.object_position_initial", add(0.06, 2)),
-    "heading_direction": ("features.of.heading.direction", add(0.1)),
-    "heading_position": ("features.of.heading.position", add(0.03, 0)),
-    "affordance_distance": ("features.of.affordance.distance", add(-0.008)),
+    "heading_direction": ("features.by_constraint.heading.direction", add(0.1)),
+    "heading_position": ("features.by_constraint.heading.position", add(0.03, 0)),
+    "affordance_distance": ("features.by_constraint.affordance.distance", add(-0.008)),
     "affordance_force": (
-        "features.of.affordance.force",
+        "features.by_constraint.affordance.force",
         add(1.0, HARD, 0),
     ),
     "pose_finger": ("goal.values.pose.q", add(0.1, 0)),
-    "pose_link": ("features.of.pose.keypoints", add(0.05, 0, 0)),
+    "pose_link": ("features.by_constraint.pose.keypoints", add(0.05, 0, 0)),
     "pose_wrist_position": ("goal.values.pose.position", add(0.02, 0)),
     "pose_wrist_rotation": ("goal.values.pose.quaternion", turned),
     "trajectory_position": (
@@ -93,9 +93,9 @@ def base():
         "features.nearest": 0.02 * X,
         "features.force": force,
         "features.touching": np.arange(L) == PRESSING,
-        "features.of.affordance.distance": 0.02,
-        "features.of.affordance.force": 0.0,
-        "features.of.affordance.touching_graspable": True,
+        "features.by_constraint.affordance.distance": 0.02,
+        "features.by_constraint.affordance.force": 0.0,
+        "features.by_constraint.affordance.touching_graspable": True,
         "goal.values.trajectory.position": goal["pose"].position[:, None],
         "goal.values.trajectory.quaternion": goal["pose"].quaternion[:, None],
         "goal.values.fingers.allowed": np.arange(len(HAND.fingers)) < 2,
@@ -110,7 +110,7 @@ def base():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_quantity_changes_its_term_alone(name, base):
+def test_quantity_changes_only_its_term(name, base):
     found, before = base
     after = evaluated(reward_terms, replaced(found, *CASES[name]), RewardWeights())
     assert {other for other, value in after.items() if np.any(value != before[other])} == {name}

@@ -120,7 +120,7 @@ def test_what_is_lost_leaves_the_last_pose(dropout, period):
     )
 
 
-def test_errors_have_their_size_in_every_axis_and_are_those_of_a_seed():
+def test_errors_have_their_declared_size():
     still = np.broadcast_to(PATH[5], (4000, 7))
     found = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1))
     away = found[:, :3] - still[:, :3]
@@ -150,7 +150,7 @@ def test_an_offset_is_that_of_every_sample():
     np.testing.assert_allclose(drawn.rotation_bias.std(0), 0.03, rtol=0.05)
 
 
-def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
+def test_resting_pose_is_the_mean_of_readings():
     """Readings at 0, 12, -6 and 2 mm; then one 5 cm away, after which 0 counts no more; a
     quaternion's sign is none.
     """
@@ -256,7 +256,7 @@ def named(row):
     return found
 
 
-def test_a_tracked_observation_knows_no_force_and_no_velocity():
+def test_tracked_observation_has_no_forces():
     """Nothing that only a simulator knows changes a bit of it."""
     state, surface, goal = scene(0)
     readings = readings_of(0, state)
@@ -277,7 +277,7 @@ def test_a_tracked_observation_knows_no_force_and_no_velocity():
     }
 
 
-def test_its_state_is_that_of_the_full_observation_through_the_tracked_pose():
+def test_tracked_state_uses_the_tracked_pose():
     state, surface, goal = scene(2)
     readings = readings_of(2, state)
     whole, own = (np.asarray(found)[1] for found in both(state, surface, goal, readings))
@@ -326,7 +326,7 @@ def test_its_past_is_worked_out_by_hand():
     )
 
 
-def test_the_wrist_s_velocity_is_its_way_in_the_last_step():
+def test_wrist_velocity_is_the_last_displacement():
     state, _, _ = scene(4)
     readings = readings_of(4, state)
     seen = sensing.seen_by(TASK, state, readings)

@@ -260,4 +260,4 @@ def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_pat
 
     monkeypatch.setattr(trimesh.sample, "sample_surface", counted)
     fresh = dataclasses.replace(own)
-    assert 0 < len(plausibility._surface(fresh)[1]) <= 2048 and counts
+    assert 0 < len(plausibility.mesh_points(fresh)[1]) <= 2048 and counts

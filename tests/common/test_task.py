@@ -74,7 +74,7 @@ def _rotation(q: np.ndarray) -> Rotation:
 def test_features_against_numpy():
     state, surface, goal = scene(7)
     geometry = FEATURES(state, surface, goal)
-    avoided = geometry.of["affordance"]
+    avoided = geometry.by_constraint["affordance"]
     b = 2
     wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
     origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
@@ -111,9 +111,9 @@ def test_features_against_numpy():
 
 def test_without_an_avoid_region_there_is_nothing_to_avoid():
     state, surface, goal = scene(8)
-    geometry = FEATURES(state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal).of[
-        "affordance"
-    ]
+    geometry = FEATURES(
+        state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal
+    ).by_constraint["affordance"]
     assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
     assert not np.any(geometry.nearest) and not np.any(geometry.touching)
 
@@ -146,7 +146,7 @@ def test_observation_blocks_by_hand():
     np.testing.assert_allclose(squash(np.array([[5.0, 0.0, 0.0]])), [[0.5, 0.0, 0.0]])
 
 
-def test_normals_follow_the_nearest_points_and_leave_everything_else_as_it_was():
+def test_normals_belong_to_the_nearest_points():
     """n of the surface point nearest to each keypoint, in the wrist frame, and the height -n . d
     above its plane.
     """
@@ -187,7 +187,7 @@ def test_reward_terms_against_numpy(near):  # noqa: PLR0915
     state, surface, goal = scene(11)
     goal = near_targets(state, goal, 12) if near else goal
     geometry = FEATURES(state, surface, goal)
-    avoided = geometry.of["affordance"]
+    avoided = geometry.by_constraint["affordance"]
     paid = {name: np.asarray(value) for name, value in REWARD(state, surface, goal, UNIT).items()}
     b = 3
     d = np.linalg.norm(np.asarray(geometry.nearest)[b], axis=-1)
@@ -316,7 +316,7 @@ def test_fingers_integrate_actions_within_their_limits():
     np.testing.assert_allclose(target[:, 2:], state.q_target[:, 2:], atol=1e-6)
 
 
-def test_active_waypoint_is_one_ahead_of_the_nearest_and_stops_at_the_last():
+def test_active_waypoint_is_one_ahead():
     path = np.zeros((3, 5, 3), np.float32)
     path[..., 0] = np.arange(5)
     wrist = np.array([[-1, 0, 0], [1.6, 0, 0], [9, 0, 0]], np.float32)
@@ -349,7 +349,7 @@ def test_heading_pose_aligns_axis_cross_and_center():
         (("affordance", "pose_finger", "trajectory"), "trajectory"),
     ],
 )
-def test_guidance_follows_the_strongest_constraint_on_the_initial_object(on, source):
+def test_guidance_of_the_strongest_constraint(on, source):
     state, surface, goal = scene(16)
     goal = dataclasses.replace(goal, active=active(*on))
     geometry = FEATURES(state, surface, goal)
@@ -370,7 +370,7 @@ def test_guidance_follows_the_strongest_constraint_on_the_initial_object(on, sou
     )
 
 
-def test_wrist_target_is_guidance_plus_residual_where_no_limit_stands():
+def test_wrist_target_is_guidance_plus_residual():
     state, surface, goal = scene(17)
     far = dataclasses.replace(
         TASK.control,
@@ -468,7 +468,7 @@ def test_metrics_against_numpy():
     hinges = _joint_differences(turn, state.u[b, 3:])
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
     np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
-    links = np.sum(np.asarray(geometry.of["affordance"].touching)[b])
+    links = np.sum(np.asarray(geometry.by_constraint["affordance"].touching)[b])
     np.testing.assert_allclose(found["affordance_ratio"][b], links)
     np.testing.assert_allclose(
         weights.pop("affordance_ratio")[b], np.sum(np.asarray(geometry.touching)[b])
@@ -476,7 +476,7 @@ def test_metrics_against_numpy():
     assert all((weight == 1.0).all() for weight in weights.values())
 
 
-def test_fixed_center_is_that_of_the_first_fingers_whatever_they_do():
+def test_fixed_center_is_that_of_initial_fingers():
     fixed = dataclasses.replace(TASK, dynamic_center=False)
     fixed_features = jax.jit(functools.partial(features, HAND, fixed))
     state, surface, goal = scene(19)
@@ -490,7 +490,7 @@ def test_fixed_center_is_that_of_the_first_fingers_whatever_they_do():
     assert np.abs(expected - geometry.center).max() > 0.01
 
 
-def test_guidance_reward_and_errors_speak_of_one_waypoint():
+def test_guidance_reward_and_error_share_a_waypoint():
     """By hand: waypoints every 2 cm along x, the wrist at 4.4 cm, the object pushed by 3 cm along
     x.
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.task.constraints.pose import (
+from congrasp.common.task.constraints.disturbance import (
     CLOSURE,
     JITTER,
     JOINTS,
@@ -103,7 +103,7 @@ def _uniform(batch, numbers):
     return np.random.default_rng(0).uniform(size=(batch, numbers)).astype(np.float32)
 
 
-def test_no_amount_changes_nothing():
+def test_zero_disturbance_changes_nothing():
     q = jnp.tile(jnp.array(HAND.q_open) * 0.9, (2, 1))
     np.testing.assert_allclose(fingers_off(HAND, q, jnp.zeros(2), _uniform(2, 21)), q, atol=1e-6)
     path = jnp.arange(18.0).reshape(2, 3, 3)
@@ -128,7 +128,7 @@ def test_fingers_are_off_by_closure_and_joint():
     assert found[:, wide].std() == pytest.approx(spread, rel=0.1)
 
 
-def test_a_path_moves_and_turns_as_a_whole_but_for_its_jitter():
+def test_disturbed_path_moves_rigidly():
     rng = np.random.default_rng(0)
     path = jnp.array(np.tile(rng.normal(size=(1, 4, 3)), (MANY, 1, 1)), jnp.float32)
     turns = jnp.array(

@@ -33,7 +33,7 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import set_file
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
@@ -315,7 +315,7 @@ def test_mutated_messages_at_every_key(tmp_path):
 
 # --- files ---
 
-SEALED = {"object": store.load, "set": stored_sets.load, "policy": bundles.load}
+SEALED = {"object": store.load, "set": set_file.load, "policy": bundles.load}
 """Loaders of messages with a checksum."""
 
 

@@ -18,8 +18,7 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
-from congrasp.common.task.sampling import sets as constraint_sets
-from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp import wrist_paths
@@ -39,7 +38,7 @@ CLAW = pathlib.Path(__file__).parents[1] / "hands" / "claw.json"
 NAN, INF = float("nan"), float("inf")
 LOADERS = {
     "object": store.load,
-    "set": stored_sets.load,
+    "set": set_file.load,
     "hand": read_hand,
     "motion": load_motion,
     "policy": bundles.load,
@@ -162,7 +161,7 @@ def test_an_object_that_names_another_folder_is_not_read(tmp_path):
     with pytest.raises(CongraspError, match="cannot name an object"):
         store.Catalogue(tmp_path / "b").add(dataclasses.replace(generate(0, "box"), name="../../x"))
     with pytest.raises(CongraspError, match="cannot name a constraint set"):
-        constraint_sets.save(Message({}, {"object": "../../x"}), tmp_path / "c")
+        set_file.save(Message({}, {"object": "../../x"}), tmp_path / "c")
     assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
 
 
@@ -344,10 +343,10 @@ def constraint_set():
         "object_digest": "0" * 16,
         "kind": "constraints",
     }
-    made |= {"format": 2, "variants": list(stored_sets.REGIONS), "finger_joints": ["a", "b"]}
+    made |= {"format": 2, "variants": list(set_file.REGIONS), "finger_joints": ["a", "b"]}
     sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
     arrays = {}
-    for name, meaning in stored_sets.MEANING.items():
+    for name, meaning in set_file.MEANING.items():
         letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
         kind = bool if "bool" in meaning else np.int32 if "indices" in meaning else np.float32
         arrays[name] = np.ones([int(x) if x.isdigit() else sizes[x] for x in letters], kind)
@@ -370,9 +369,9 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
     ):
         path.write_bytes(encode(change))
         with pytest.raises(CongraspError, match=why):
-            stored_sets.load(path)
+            set_file.load(path)
     path.write_bytes(encode(made))
-    assert stored_sets.load(path).meta == made.meta
+    assert set_file.load(path).meta == made.meta
 
 
 BVH = """HIERARCHY

@@ -10,11 +10,12 @@ from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints.affordance import Affordance
-from congrasp.common.task.constraints.base import Constraint, ErrorSpec, unknown_constraint
+from congrasp.common.task.constraints.base import Constraint, unknown_constraint
 from congrasp.common.task.constraints.fingers import Fingers
 from congrasp.common.task.constraints.force import Force
 from congrasp.common.task.constraints.heading import Heading
 from congrasp.common.task.constraints.pose import Pose
+from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.constraints.trajectory import Trajectory
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal
@@ -70,20 +71,32 @@ def draws_references(task: TaskSettings) -> bool:
 
 def blocks(task: TaskSettings) -> tuple[str, ...]:
     """Names of the gated blocks of the observation, in order; each is a bit of the mask."""
-    return tuple(block for constraint in known(task) for block in constraint.blocks)
+    names: list[str] = []
+    for constraint in known(task):
+        names += constraint.blocks
+    return tuple(names)
 
 
 def center_fingers(task: TaskSettings, goal: Goal) -> Array | None:
     """(B, G) bool: fingers that define the hand centre and the distance reward; None if no
     constraint selects them.
     """
-    chosen = [fingers for c in known(task) if (fingers := c.center_fingers(goal)) is not None]
-    return functools.reduce(operator.and_, chosen) if chosen else None
+    selections = []
+    for constraint in known(task):
+        fingers = constraint.center_fingers(goal)
+        if fingers is not None:
+            selections.append(fingers)
+    if not selections:
+        return None
+    return functools.reduce(operator.and_, selections)
 
 
 def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
     """Errors of several constraints, in order."""
-    return tuple(error for constraint in constraints for error in constraint.errors)
+    errors: list[ErrorSpec] = []
+    for constraint in constraints:
+        errors += constraint.errors
+    return tuple(errors)
 
 
 def goal_of(hand: Hand, task: TaskSettings, request: GraspRequest) -> Goal:
@@ -92,14 +105,11 @@ def goal_of(hand: Hand, task: TaskSettings, request: GraspRequest) -> Goal:
     """
     values = {}
     for constraint in known(task):
-        given = request.constraints.get(constraint.name, {})
         neutral = constraint.neutral(hand, task)
-        values[constraint.name] = neutral._replace(
-            **{
-                name: np.asarray(value, getattr(neutral, name).dtype)
-                for name, value in given.items()
-            }
-        )
+        requested = {}
+        for name, value in request.constraints.get(constraint.name, {}).items():
+            requested[name] = np.asarray(value, getattr(neutral, name).dtype)
+        values[constraint.name] = neutral._replace(**requested)
     return Goal(values, {})
 
 

@@ -1,17 +1,26 @@
 """Interface of a constraint: everything that the rest of the project derives from its file.
 
 A constraint's module defines a subclass of `Constraint`, and `common.task.constraints.CONSTRAINTS`
-contains an instance. All methods are pure functions of batched arrays (leading axis B) that may be
-traced; the defaults do nothing.
+contains an instance. The class attributes declare it (records in `constraints.specs`); the methods
+are hooks, and by default have no effect. In the order of the class:
 
-Its markers are drawn in pictures, recordings and the studio; all of them are in the object frame.
+* sampling: arrays of the bank, and the goal of an episode
+* priority rules: changes of weaker constraints, and their description
+* start of an episode: fingers and wrist
+* geometry of a control step, and guidance of the wrist
+* observation: fields and their values
+* reward: contacts that earn, and terms
+* errors
+* requests: parsed options, checks and defaults
+* display: markers (`constraints.markers`)
+
+Hooks that take batched arrays (leading axis B) are pure functions that may be traced.
 """
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, get_type_hints
+from typing import Any, ClassVar, get_type_hints
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,176 +28,19 @@ import numpy as np
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.grip import ObjectLoad
+from congrasp.common.task.constraints.markers import Marker
+from congrasp.common.task.constraints.specs import (
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Relation,
+    Weight,
+)
 from congrasp.common.task.sampling.bank import ConstraintBank, Draw
-from congrasp.common.task.sensing import Readings
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
-from congrasp.common.task.types import Array, Contacts, Features, Goal, SceneState, Surface
-
-
-class Arrow(NamedTuple):
-    """A direction that ends at a point."""
-
-    tip: np.ndarray
-    """(3,) m."""
-    direction: np.ndarray
-    """(3,) unit vector."""
-
-
-class Polyline(NamedTuple):
-    """A sequence of connected points."""
-
-    points: np.ndarray
-    """(n, 3) m."""
-
-
-class Ghost(NamedTuple):
-    """A translucent hand."""
-
-    position: np.ndarray
-    """(3,) position of the wrist, m."""
-    quaternion: np.ndarray
-    """(4,) orientation of the wrist."""
-    q: np.ndarray | None
-    """(F,) finger angles, rad; None draws only the wrist's axes."""
-
-
-class Paint(NamedTuple):
-    """The avoid region, painted on the object."""
-
-
-Marker = Arrow | Polyline | Ghost | Paint
-
-Window = Literal["approach", "hold"]
-"""Steps over which an error is averaged: before the table's removal, or in the `hold_steps` after
-it.
-"""
-
-
-@dataclasses.dataclass(frozen=True)
-class GoalArray:
-    """A goal array of a constraint, as the annotation of its field in the NamedTuple."""
-
-    shape: tuple[int | str, ...]
-    """Shape without the batch axis; each entry is a symbol of `symbol_sizes` or a number."""
-    meaning: str
-    """Unit, frame and meaning."""
-    kind: Literal["real", "position", "direction", "quaternion", "flag"] = "real"
-    """Kind of value: positions, directions and quaternions are in the object frame, and the latter
-    two must be unit vectors; flags are booleans."""
-    neutral: tuple[float, ...] = ()
-    """Last axis of the value used where no request gives one; zeros by default."""
-    required: bool = True
-    """True if a request for the constraint must include the array."""
-
-
-class Weight(NamedTuple):
-    """One term of the reward."""
-
-    name: str
-    """Name of the term and of its weight."""
-    default: float
-    meaning: str
-    """Symbol in the paper, and unit."""
-
-
-class ErrorSpec(NamedTuple):
-    """Definition of an error of a constraint; the paper's definitions are in its section
-    Metrics.
-    """
-
-    name: str
-    """Name of the episode's metric, such as `heading_rad`."""
-    unit: str
-    """rad, m, or empty for a ratio."""
-    window: Window
-    tolerance: float
-    """Largest error at which the constraint counts as met in one step."""
-    scale: float
-    """Scale that makes errors of different kinds comparable when grasps are compared."""
-    meaning: str
-    """Description of the compared quantity in displays."""
-    column: str = ""
-    """Name in tables and their JSON; `name` if empty."""
-    block: str = ""
-    """Block of the constraint without which the error is undefined, if its other blocks can be
-    active alone.
-    """
-
-
-class ObservationField(NamedTuple):
-    """A contiguous field of the observation."""
-
-    name: str
-    size: int
-    meaning: str
-    """Unit and frame; "wrist" is the wrist frame."""
-    privileged: bool = False
-    """True if only a simulator knows the values: a tracked observation lacks them."""
-
-
-class Relation(NamedTuple):
-    """Relation of a constraint to a weaker one when both are requested and cannot both be met."""
-
-    weaker: str
-    """Name of the other constraint."""
-    settled: Literal["overridden", "redirected", "refused"]
-    """Effect on the weaker constraint; a refused request is an error."""
-    measure: Any
-    """Function (hand, surface, goal) -> dict of arrays (B, ...), distances between the two."""
-    contradicts: Any
-    """measured -> (B,) bool."""
-    message: Any
-    """(hand, measurements of one environment, as NumPy) -> one or two sentences with the
-    numbers.
-    """
-
-
-class Scene(NamedTuple):
-    """One control step, as input of a constraint's terms."""
-
-    hand: Hand
-    task: TaskSettings
-    state: SceneState
-    features: Features
-    goal: Goal
-    readings: "Readings | None" = None
-    """Last control steps, if the policy observes them."""
-    cloud: Surface | None = None
-    """Cloud of the camera, world frame, if the policy has one."""
-    load: ObjectLoad | None = None
-    """Weight and friction of the objects, for the reward; None where they are not recorded."""
-
-    def gate(self, block: str) -> Array:
-        """(B,) 1 if a block is active, else 0."""
-        return self.goal.active[block].astype(jnp.float32)
-
-
-class Option(NamedTuple):
-    """Option of `congrasp grasp` that requests a constraint."""
-
-    name: str
-    help: str
-    kind: Literal["text", "direction", "place", "part", "pose", "path"] = "text"
-    """Kind of the parsed value: a text; three numbers in the axes of the object's file, normalised;
-    three numbers in the coordinates of the file, converted to a position (3,) in the object frame;
-    a `Part`; a wrist pose with finger angles, or a wrist path of K waypoints, from a file: dicts of
-    `q`, `position` and `quaternion`, object frame."""
-    words: tuple[str, ...] = ()
-    """Literal values accepted for any kind."""
-    many: bool = False
-    """Accepts several words, given as a tuple."""
-    switch: bool = False
-    """A flag without a value."""
-
-
-class Part(NamedTuple):
-    """A part of an object's surface, named by an option."""
-
-    text: str
-    """Text of the option."""
-    distance: np.ndarray
-    """(N,) distances from the object's surface points to the part, m."""
+from congrasp.common.task.types import Array, Contacts, Features, Goal, Surface
 
 
 class Constraint:
@@ -208,14 +60,18 @@ class Constraint:
     """Blocks of the observation that it gates, each with its mask bit; the heading, always active,
     has none.
     """
+
     overrides: ClassVar[tuple[str, ...]] = ()
     """Weaker constraints, or blocks of them, that are inactive when this one is requested."""
     overridden_by: ClassVar[tuple[str, ...]] = ()
     """Stronger constraints that make this one inactive without listing it in their `overrides`."""
+    relations: ClassVar[tuple[Relation, ...]] = ()
+    """Relations to weaker constraints."""
     guides: ClassVar[str] = ""
     """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide
     the wrist.
     """
+
     region: ClassVar[int] = 0
     """Region of the constraint bank from which its episodes are drawn (0 the whole surface, 1 the
     graspable region).
@@ -224,12 +80,12 @@ class Constraint:
     """True if it is drawn from reference grasps."""
     harvested: ClassVar[bool] = True
     """True if successful grasps under it may become references."""
+
     weights: ClassVar[tuple[Weight, ...]] = ()
     """Terms of the reward, each with a setting `--task.reward.TERM`."""
     errors: ClassVar[tuple[ErrorSpec, ...]] = ()
     """Errors, each with a metric `episode/ERROR`, a column in tables and a lane in the studio."""
-    relations: ClassVar[tuple[Relation, ...]] = ()
-    """Relations to weaker constraints."""
+
     options: ClassVar[tuple[Option, ...]] = ()
     """Options of `congrasp grasp` that request it."""
     needs: ClassVar[tuple[str, ...]] = ()
@@ -237,25 +93,11 @@ class Constraint:
     invalid: ClassVar[tuple[str, str]] = ("", "")
     """Fault of arrays that are not `valid`, and the remedy."""
 
-    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
-        """Fields of each of its blocks of the observation, in order."""
-        return ()
-
-    def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
-        """Names of the elements of flag arrays by field, for pages and command lines; those of
-        fingers by default.
-        """
-        return {
-            name: hand.fingers
-            for name, array in self.arrays.items()
-            if array.kind == "flag" and array.shape == ("G",)
-        }
-
-    # Sampling and the start of an episode.
+    # Sampling.
 
     def columns(self, hand: Hand, bank: ConstraintBank) -> Any:
-        """Pytree of arrays (N, ...) that `sample` needs of each object (`Draw.own`), computed once;
-        None for nothing.
+        """Pytree of arrays (N, ...) that `sample` needs of each object (`Draw.columns`), computed
+        once; None for nothing.
 
         Headings, reference poses and trajectories, which constraints share, belong to the bank.
         """
@@ -279,11 +121,9 @@ class Constraint:
         The default is True where a reference allows it if it is drawn from references, and True
         everywhere otherwise.
         """
-        return (
-            jnp.any(self.allowed(draw), -1)
-            if self.from_reference
-            else jnp.ones(draw.objects.shape, bool)
-        )
+        if self.from_reference:
+            return jnp.any(self.allowed(draw), -1)
+        return jnp.ones(draw.objects.shape, bool)
 
     def allowed(self, draw: Draw) -> Array:
         """(B, M) bool: references of the drawn objects from which it may be drawn; by default those
@@ -307,13 +147,32 @@ class Constraint:
         """
         raise NotImplementedError
 
+    # Priority rules.
+
     def override(
-        self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal
+        self, hand: Hand, surface: Surface, requested: Mapping[str, Array], goal: Goal
     ) -> Goal:
-        """Returns the goal with the arrays of weaker constraints that this one replaces, where it
-        is requested.
+        """Returns the goal with the arrays of weaker constraints that this one replaces.
+
+        Args:
+          hand: the hand.
+          surface: surface points of the objects.
+          requested: (B,) bool by the names of the constraints.
+          goal: goal after the rules of weaker constraints; it changes where this one is requested.
         """
         return goal
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """Describes the effect of the priority rules on it when it is requested, in sentences.
+
+        Args:
+          overridden: names of the requested stronger constraints that override it or one of its
+            blocks.
+          redirected: True if it changed the heading.
+        """
+        return []
+
+    # Start of an episode.
 
     def initial_fingers(self, goal: Goal) -> tuple[Array, Array] | None:
         """(B,) bool where an episode begins with other finger angles than the open hand's, and
@@ -336,21 +195,11 @@ class Constraint:
         """
         return None
 
-    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
-        """Initial goal arrays by field, when a user switches it on."""
-        return self.neutral(hand, task)._asdict()
-
-    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-        """Prescribed wrist positions (n, 3), object frame, and last orientation (4,); None if it
-        prescribes none.
-        """
-        return None
-
-    # One control step.
+    # Geometry of a control step, and guidance.
 
     def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> Any:
         """Geometry specific to the constraint that observation, reward and errors share, as a
-        pytree.
+        pytree (`Features.by_constraint`).
         """
         return ()
 
@@ -366,6 +215,12 @@ class Constraint:
         """
         raise NotImplementedError
 
+    # Observation.
+
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
+        """Fields of each of its blocks of the observation, in order."""
+        return ()
+
     def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
         """Values (B, ...) of the `fields` of each block; they are concatenated, then gated."""
         return ()
@@ -375,6 +230,8 @@ class Constraint:
         none.
         """
         return None
+
+    # Reward.
 
     def forbidden(self, scene: Scene) -> Array | None:
         """(B, L) bool: links that must not touch the object, whether or not it is active; None for
@@ -388,7 +245,8 @@ class Constraint:
 
         By default those of all links that it does not forbid.
         """
-        if (forbidden := self.forbidden(scene)) is None:
+        forbidden = self.forbidden(scene)
+        if forbidden is None:
             return touching, force
         lost = forbidden & self.active(scene.goal)[:, None]
         return touching & ~lost, jnp.where(lost[..., None], 0.0, force)
@@ -403,6 +261,8 @@ class Constraint:
         """
         return {}
 
+    # Errors.
+
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Errors (B,) of one step by the names of `errors`, active or not.
 
@@ -410,39 +270,30 @@ class Constraint:
         """
         return {}
 
-    # Display.
+    # Requests.
 
-    def markers(self, own: Any, blocks: Collection[str]) -> tuple[Marker, ...]:
-        """Markers for pictures, recordings and the studio, shown while it is active.
-
-        Args:
-          own: its goal arrays for one episode, as NumPy.
-          blocks: active blocks of the observation.
+    def labels(self, hand: Hand) -> dict[str, tuple[str, ...]]:
+        """Names of the elements of flag arrays by field, for pages and command lines; those of
+        fingers by default.
         """
-        return ()
+        return {
+            name: hand.fingers
+            for name, array in self.arrays.items()
+            if array.kind == "flag" and array.shape == ("G",)
+        }
 
-    def valid(self, surface: Surface, own: Any) -> Array:
-        """(B,) bool: the goal arrays, of valid shapes, finite and normalised, are consistent."""
-        return jnp.ones(surface.points.shape[0], bool)
-
-    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Describes the effect of the priority rules on it when it is requested, in sentences.
-
-        Args:
-          overridden: names of the requested stronger constraints that override it or one of its
-            blocks.
-          redirected: True if it changed the heading.
-        """
-        return []
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
+        """Initial goal arrays by field, when a user switches it on."""
+        return self.neutral(hand, task)._asdict()
 
     def parse(
-        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+        self, option_values: Mapping[str, Any], hand: Hand, obj: GraspObject
     ) -> dict[str, np.ndarray] | None:
         """Parses the values of `options` into goal arrays by field, without batch axis; None if no
         option is given.
 
         Args:
-          given: values by option name, parsed by `kind`; None for an absent option.
+          option_values: values by option name, parsed by `kind`; None for an absent option.
           hand: the hand.
           obj: the object.
 
@@ -451,8 +302,10 @@ class Constraint:
         """
         return None
 
-    def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
+    def avoid_region(self, option_values: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
         """(N,) bool, the avoid region requested by the options; None if they request none.
+
+        Called if `parse` returned goal arrays; `option_values` as there.
 
         Raises:
           CongraspError: the region would be empty or the whole surface.
@@ -479,7 +332,31 @@ class Constraint:
                 raise CongraspError(f"--{option}: {lacks} '{word}'.", f"Known: {', '.join(names)}.")
         return np.isin(names, words)
 
-    # Derived properties.
+    def valid(self, surface: Surface, values: Any) -> Array:
+        """(B,) bool: the goal arrays, of valid shapes, finite and normalised, are consistent."""
+        return jnp.ones(surface.points.shape[0], bool)
+
+    def wrist_path(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Prescribed wrist positions (n, 3), object frame, and last orientation (4,); None if it
+        prescribes none.
+
+        Args:
+          values: requested goal arrays by field, without batch axis.
+        """
+        return None
+
+    # Display.
+
+    def markers(self, values: Any, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """Markers for pictures, recordings and the studio, shown while it is active.
+
+        Args:
+          values: its goal arrays for one episode, as NumPy.
+          blocks: active blocks of the observation.
+        """
+        return ()
+
+    # Derived properties, which no constraint overrides.
 
     @property
     def optional(self) -> bool:
@@ -490,30 +367,32 @@ class Constraint:
     def arrays(self) -> dict[str, GoalArray]:
         """Goal arrays by field name."""
         hints = get_type_hints(self.goal, include_extras=True)
-        return {name: hints[name].__metadata__[0] for name in self.goal._fields}  # type: ignore[attr-defined]
+        names: tuple[str, ...] = self.goal._fields  # type: ignore[attr-defined]
+        return {name: hints[name].__metadata__[0] for name in names}
 
     def neutral(self, hand: Hand, task: TaskSettings) -> Any:
         """Goal arrays, without batch axis, of an episode that does not request it."""
-        symbols = symbol_sizes(hand, task)
-        made = {}
+        sizes = symbol_sizes(hand, task)
+        values = {}
         for name, array in self.arrays.items():
-            shape = tuple(symbols[n] if isinstance(n, str) else n for n in array.shape)
-            fill = np.asarray(array.neutral or 0.0, np.float32)
-            made[name] = np.broadcast_to(fill, shape).astype(
-                bool if array.kind == "flag" else np.float32
-            )
-        return self.goal(**made)
+            shape = [sizes[axis] if isinstance(axis, str) else axis for axis in array.shape]
+            kind = bool if array.kind == "flag" else np.float32
+            last_axis = np.asarray(array.neutral or 0.0, np.float32)
+            values[name] = np.broadcast_to(last_axis, shape).astype(kind)
+        return self.goal(**values)
 
     def active(self, goal: Goal) -> Array:
         """(B,) bool: it is active, see `among`; always for one without blocks."""
-        return self.among(goal.active) if self.blocks else jnp.ones(len(goal[self.name][0]), bool)
+        if not self.blocks:
+            return jnp.ones(len(goal[self.name][0]), bool)
+        return self.among(goal.active)
 
     def among(self, blocks: Mapping[str, Array]) -> Array:
         """(B,) bool: one of its blocks is active. Only optional constraints have blocks.
 
         A reference pose of which a trajectory keeps only the fingers is therefore active.
         """
-        return functools.reduce(operator.or_, (blocks[block] for block in self.blocks))
+        return functools.reduce(operator.or_, [blocks[block] for block in self.blocks])
 
 
 def symbol_sizes(hand: Hand, task: TaskSettings) -> dict[str, int]:
@@ -521,8 +400,8 @@ def symbol_sizes(hand: Hand, task: TaskSettings) -> dict[str, int]:
     return {"F": len(hand.joints), "G": len(hand.fingers), "K": task.trajectory_points}
 
 
-def unknown_constraint(name: str, known: Sequence[str]) -> UnknownConstraintError:
-    """Error for a request of an unknown constraint."""
+def unknown_constraint(name: str, names: Sequence[str]) -> UnknownConstraintError:
+    """Error for a request of an unknown constraint; `names` are the existing ones."""
     return UnknownConstraintError(
-        f"There is no constraint '{name}'.", f"Choose from: {', '.join(known)}."
+        f"There is no constraint '{name}'.", f"Choose from: {', '.join(names)}."
     )

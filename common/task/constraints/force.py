@@ -9,25 +9,32 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.constraints.base import (
-    Constraint,
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.specs import (
     ErrorSpec,
     GoalArray,
     ObservationField,
     Option,
-    Scene,
     Weight,
 )
 from congrasp.common.task.geometry import FORCE_SCALE
 from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import GRAVITY, TaskSettings
 from congrasp.common.task.types import Array, Surface
 
-LEAST, MOST = 1.0, 20.0
-"""Limits drawn in training, N, as far as the object's weight allows."""
-_LOWEST, _HIGHEST = 0.5, 50.0  # range of a request's limit, N
-_FAR = 10.0  # N beyond the limit at which the cost saturates
+LEAST = 1.0
+"""Lowest limit drawn in training, N; heavier objects need a higher one."""
+MOST = 20.0
+"""Highest limit drawn in training, N."""
+_MIN_REQUEST = 0.5
+"""Lowest limit of a request, N."""
+_MAX_REQUEST = 50.0
+"""Highest limit of a request, N."""
+_MAX_COST_EXCESS = 10.0
+"""Excess of a link's force at which the cost saturates, N."""
 _SUGGESTED = 5.0
+"""Limit when a user switches the constraint on, N."""
 
 
 class ForceGoal(NamedTuple):
@@ -39,14 +46,21 @@ class ForceGoal(NamedTuple):
 class Force(Constraint):
     """An upper limit on the net contact force of each link."""
 
-    name, title, goal = "force", "force limit", ForceGoal
+    name = "force"
+    title = "force limit"
+    goal = ForceGoal
     blocks = ("force_limit",)
     weights = (
         Weight("force_over", 0.05, "Per newton beyond the limit, per link (at most 10 N each)."),
     )
     errors = (
         ErrorSpec(
-            "force_ratio", "", "hold", 0.0, 0.1, "share of steps in which a link presses too hard"
+            name="force_ratio",
+            unit="",
+            window="hold",
+            tolerance=0.0,
+            scale=0.1,
+            meaning="share of steps in which a link presses too hard",
         ),
     )
     options = (
@@ -58,49 +72,46 @@ class Force(Constraint):
         ),
     )
     invalid = (
-        f"The constraint 'force' takes a limit between {_LOWEST:g} and {_HIGHEST:g} N.",
+        f"The constraint 'force' takes a limit between {_MIN_REQUEST:g} and {_MAX_REQUEST:g} N.",
         "Set 'force_limit'.",
     )
-
-    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
-        """Fields for the limit and each link's excess."""
-        return (
-            (
-                ObservationField("force_limit", 1, f"the limit divided by {MOST:g} N"),
-                ObservationField(
-                    "force_over",
-                    len(hand.links),
-                    "e / (e + 5 N) for each link's excess e in N",
-                    True,
-                ),
-            ),
-        )
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
         low = jnp.log(least_force(draw.mass, draw.friction))
         return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
 
-    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
-        """A limit of 5 N."""
-        return {"limit": np.array(_SUGGESTED, np.float32)}
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """The limit is compatible with every other constraint."""
+        return ["No link may press harder than the force limit."]
+
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
+        """Fields for the limit and each link's excess."""
+        block = (
+            ObservationField("force_limit", 1, f"the limit divided by {MOST:g} N"),
+            ObservationField(
+                "force_over",
+                len(hand.links),
+                "e / (e + 5 N) for each link's excess e in N",
+                privileged=True,
+            ),
+        )
+        return (block,)
+
+    def observe(self, scene: Scene) -> tuple[list[Array], ...]:
+        """The limit and the squashed excess of each link."""
+        excess = _excess(scene)
+        return ([_limit(scene) / MOST, excess / (excess + FORCE_SCALE)],)
 
     def force_max(self, scene: Scene, most: Array) -> Array:
         """No force beyond the limit earns anything."""
         active = self.active(scene.goal)[:, None]
         return jnp.where(active, jnp.minimum(most, _limit(scene)), most)
 
-    def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """The limit and the squashed excess of each link."""
-        over = _excess(scene)
-        return ([_limit(scene) / MOST, over / (over + FORCE_SCALE)],)
-
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Cost of each newton beyond the limit."""
-        return {
-            "force_over": -scene.gate("force_limit")
-            * jnp.sum(jnp.minimum(_excess(scene), _FAR), -1)
-        }
+        excess = jnp.minimum(_excess(scene), _MAX_COST_EXCESS)
+        return {"force_over": -scene.gate("force_limit") * jnp.sum(excess, -1)}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Steps in which at least one link presses harder than the limit, as a share of all
@@ -109,35 +120,45 @@ class Force(Constraint):
         beyond = jnp.any(_excess(scene) > 0.0, -1).astype(jnp.float32)
         return {"force_ratio": (beyond, jnp.ones_like(beyond))}
 
-    def valid(self, surface: Surface, own: ForceGoal) -> Array:
-        """True for a limit within the range that a hand can satisfy."""
-        return (own.limit >= _LOWEST) & (own.limit <= _HIGHEST)
-
-    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """The limit is compatible with every other constraint."""
-        return ["No link may press harder than the force limit."]
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
+        """A limit of 5 N."""
+        return {"limit": np.array(_SUGGESTED, np.float32)}
 
     def parse(
-        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+        self, option_values: Mapping[str, Any], hand: Hand, obj: GraspObject
     ) -> dict[str, np.ndarray] | None:
         """Parses a number, or computes the least limit for the object's weight."""
-        text = given["force"]
-        if text and given["gentle"]:
+        text = option_values["force"]
+        gentle = option_values["gentle"]
+        if text and gentle:
             raise CongraspError("--force and --gentle both set the force limit.", "Leave one out.")
-        if given["gentle"]:
+        if gentle:
             return {"limit": np.asarray(least_force(obj.mass, 1.0), np.float32)}
         if not text:
             return None
-        try:
-            limit = float(text)
-        except ValueError:
-            limit = np.nan
-        if not _LOWEST <= limit <= _HIGHEST:
-            span = f"{_LOWEST:g} and {_HIGHEST:g}"
-            raise CongraspError(
-                f"--force is '{text}', not a number between {span}.", "Write --force 3."
-            )
-        return {"limit": np.array(limit, np.float32)}
+        return {"limit": np.array(_parsed_limit(text), np.float32)}
+
+    def valid(self, surface: Surface, values: ForceGoal) -> Array:
+        """True for a limit within the range that a hand can satisfy."""
+        return (values.limit >= _MIN_REQUEST) & (values.limit <= _MAX_REQUEST)
+
+
+def _parsed_limit(text: str) -> float:
+    """Parses the value of --force.
+
+    Raises:
+      CongraspError: it is not a number, or out of range.
+    """
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = np.nan
+    if not _MIN_REQUEST <= limit <= _MAX_REQUEST:
+        raise CongraspError(
+            f"--force is '{text}', not a number between {_MIN_REQUEST:g} and {_MAX_REQUEST:g}.",
+            "Write --force 3.",
+        )
+    return limit
 
 
 def least_force(mass: Array, friction: Array) -> Array:
@@ -152,7 +173,7 @@ def least_force(mass: Array, friction: Array) -> Array:
 
 def _limit(scene: Scene) -> Array:
     """Limit (B, 1) in N, positive whether or not it is active."""
-    return jnp.maximum(scene.goal["force"].limit, _LOWEST)[:, None]
+    return jnp.maximum(scene.goal["force"].limit, _MIN_REQUEST)[:, None]
 
 
 def _excess(scene: Scene) -> Array:

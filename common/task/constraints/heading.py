@@ -13,26 +13,27 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.constraints.base import (
-    Arrow,
-    Constraint,
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.fingers import chosen_fingers
+from congrasp.common.task.constraints.markers import Arrow, Marker
+from congrasp.common.task.constraints.specs import (
     ErrorSpec,
     GoalArray,
-    Marker,
     ObservationField,
     Option,
-    Scene,
     Weight,
 )
-from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.geometry import flat, hand_center, in_world
 from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Contacts, Features, Goal
 
 ABOVE = "above"
 """Literal for the heading straight down, in any pose of the object."""
-_FAR = 0.15
+TURNED = float(np.radians(30.0))
+"""Angle between a heading and that of a stronger constraint above which they contradict, rad."""
+_MAX_COST_DISTANCE = 0.15
 """Distance beyond which the cost saturates, m: a fallen object that rolls away must not dominate
 the reward.
 """
@@ -77,7 +78,9 @@ class HeadingFeatures(NamedTuple):
 class Heading(Constraint):
     """Approach direction and position (paper, section Constraint Formulation)."""
 
-    name, title, goal = "heading", "heading", HeadingGoal
+    name = "heading"
+    title = "heading"
+    goal = HeadingGoal
     guides = "heading"
     weights = (
         Weight(
@@ -90,14 +93,21 @@ class Heading(Constraint):
         ),
     )
     errors = (
-        ErrorSpec("heading_rad", "rad", "hold", 0.25, 0.2, "direction"),
         ErrorSpec(
-            "heading_m",
-            "m",
-            "hold",
-            0.03,
-            0.02,
-            "distance of the hand's centre from the heading's line",
+            name="heading_rad",
+            unit="rad",
+            window="hold",
+            tolerance=0.25,
+            scale=0.2,
+            meaning="direction",
+        ),
+        ErrorSpec(
+            name="heading_m",
+            unit="m",
+            window="hold",
+            tolerance=0.03,
+            scale=0.02,
+            meaning="distance of the hand's centre from the heading's line",
         ),
     )
     options = (
@@ -117,6 +127,55 @@ class Heading(Constraint):
         ),
     )
 
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> HeadingGoal:
+        """Samples one of the object's headings for its resting pose and region, moved back clear of
+        the table.
+        """
+        bank = draw.bank
+        slot = chance.index(uniform[:, 0], bank.heading_index.shape[-1])
+        slot_index = draw.objects, draw.region, draw.rests, slot
+        heading_index = draw.objects, draw.region, bank.heading_index[slot_index]
+        back = bank.heading_back[slot_index][:, None]
+        direction = bank.heading_direction[heading_index]
+        return HeadingGoal(
+            position=bank.heading_position[heading_index] - back * direction,
+            direction=direction,
+            cross=bank.heading_cross[heading_index],
+        )
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """Effect of the heading: it guides the wrist unless a stronger constraint does."""
+        if overridden:
+            return []
+        return ["The heading guides the wrist."]
+
+    def initial_wrist(
+        self, hand: Hand, back_off: Array, goal: Goal, q: Array
+    ) -> tuple[Array, Array, Array]:
+        """Wrist aligned with the heading and backed off (paper, section Hand Initialization)."""
+        points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+        center = hand_center(hand, points, chosen_fingers(goal.values, goal))
+        position, quaternion = heading_wrist_pose(hand, goal["heading"], center)
+        position = position - back_off[:, None] * goal["heading"].direction
+        everywhere = jnp.ones(position.shape[0], bool)
+        return everywhere, position, quaternion
+
+    def features(
+        self, hand: Hand, contacts: Contacts, features: Features, goal: Goal
+    ) -> HeadingFeatures:
+        """Target in the wrist frame."""
+        heading = goal["heading"]
+        turn = features.object_quaternion
+        return HeadingFeatures(
+            position=features.object_position + rotations.rotate(turn, heading.position),
+            direction=rotations.rotate(turn, heading.direction),
+        )
+
+    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
+        """Wrist pose that aligns the current hand with the heading."""
+        pose = heading_wrist_pose(scene.hand, scene.goal["heading"], scene.features.center)
+        return in_world(*object_pose(scene, current=current), *pose)
+
     def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for hand centre, target, residual, direction and object rotation."""
         block = (
@@ -134,96 +193,63 @@ class Heading(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> HeadingGoal:
-        """Samples one of the object's headings for its resting pose and region, moved back clear of
-        the table.
-        """
-        bank, where = draw.bank, (draw.objects, draw.region)
-        slot = chance.index(uniform[:, 0], bank.heading_index.shape[-1])
-        index = *where, bank.heading_index[*where, draw.rests, slot]
-        back = bank.heading_back[*where, draw.rests, slot][:, None]
-        direction = bank.heading_direction[index]
-        return HeadingGoal(
-            bank.heading_position[index] - back * direction, direction, bank.heading_cross[index]
-        )
-
-    def initial_wrist(
-        self, hand: Hand, back_off: Array, goal: Goal, q: Array
-    ) -> tuple[Array, Array, Array]:
-        """Wrist aligned with the heading and backed off (paper, section Hand Initialization)."""
-        points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
-        center = hand_center(hand, points, chosen_fingers(goal.values, goal))
-        position, quaternion = heading_wrist_pose(hand, goal["heading"], center)
-        position = position - back_off[:, None] * goal["heading"].direction
-        return jnp.ones(position.shape[0], bool), position, quaternion
-
-    def features(
-        self, hand: Hand, contacts: Contacts, features: Features, goal: Goal
-    ) -> HeadingFeatures:
-        """Target in the wrist frame."""
-        own = goal["heading"]
-        return HeadingFeatures(
-            features.object_position + rotations.rotate(features.object_quaternion, own.position),
-            rotations.rotate(features.object_quaternion, own.direction),
-        )
-
-    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """Wrist pose that aligns the current hand with the heading."""
-        pose = heading_wrist_pose(scene.hand, scene.goal["heading"], scene.features.center)
-        return in_world(*object_pose(scene, current=current), *pose)
-
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
         """p, p-bar, p-bar - p, v-bar and the object's rotation matrix, in the wrist frame."""
-        features, own = scene.features, scene.features.of["heading"]
+        center = scene.features.center
+        target = scene.features.by_constraint["heading"]
         block = [
-            features.center,
-            own.position,
-            own.position - features.center,
-            own.direction,
-            flat(rotations.to_matrix(features.object_quaternion)),
+            center,
+            target.position,
+            target.position - center,
+            target.direction,
+            flat(rotations.to_matrix(scene.features.object_quaternion)),
         ]
         return (block,)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Reward term r^head."""
-        axis, own = jnp.array(grasp_frame(scene.hand).heading), scene.features.of["heading"]
+        axis = jnp.array(grasp_frame(scene.hand).heading)
+        target = scene.features.by_constraint["heading"]
+        distance = jnp.linalg.norm(scene.features.center - target.position, axis=-1)
         return {
-            "heading_direction": jnp.sum(axis * own.direction, -1),
-            "heading_position": -jnp.minimum(
-                jnp.linalg.norm(scene.features.center - own.position, axis=-1), _FAR
-            ),
+            "heading_direction": jnp.sum(axis * target.direction, -1),
+            "heading_position": -jnp.minimum(distance, _MAX_COST_DISTANCE),
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Geodesic distance between v and v-bar; length of p - p-bar projected on the plane
         perpendicular to v-bar.
         """
-        axis, own = jnp.array(grasp_frame(scene.hand).heading), scene.features.of["heading"]
-        target = own.direction
-        cosine = jnp.sum(axis * target, -1)
-        sine = jnp.linalg.norm(jnp.cross(jnp.broadcast_to(axis, target.shape), target), axis=-1)
-        off = scene.features.center - own.position
-        lateral = off - jnp.sum(off * target, -1, keepdims=True) * target
+        axis = jnp.array(grasp_frame(scene.hand).heading)
+        target = scene.features.by_constraint["heading"]
+        direction = target.direction
+        cosine = jnp.sum(axis * direction, -1)
+        sine = jnp.linalg.norm(
+            jnp.cross(jnp.broadcast_to(axis, direction.shape), direction), axis=-1
+        )
+        offset = scene.features.center - target.position
+        lateral = offset - jnp.sum(offset * direction, -1, keepdims=True) * direction
         return {
             "heading_rad": jnp.arctan2(sine, cosine),
             "heading_m": jnp.linalg.norm(lateral, axis=-1),
         }
 
     def parse(
-        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+        self, option_values: Mapping[str, Any], hand: Hand, obj: GraspObject
     ) -> dict[str, np.ndarray] | None:
-        """Parses direction and position, if given."""
-        direction = None if isinstance(given["heading"], str) else given["heading"]
-        found = {"direction": direction, "position": given["at"]}
-        return {name: value for name, value in found.items() if value is not None} or None
+        """Returns direction and position, if given."""
+        arrays = {}
+        direction = option_values["heading"]
+        if direction is not None and not isinstance(direction, str):
+            arrays["direction"] = direction
+        position = option_values["at"]
+        if position is not None:
+            arrays["position"] = position
+        return arrays or None
 
-    def markers(self, own: HeadingGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+    def markers(self, values: HeadingGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """Arrow to the target of the hand's centre."""
-        return (Arrow(own.position, own.direction),)
-
-    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Effect of the heading: it guides the wrist unless a stronger constraint does."""
-        return [] if overridden else ["The heading guides the wrist."]
+        return (Arrow(values.position, values.direction),)
 
 
 def heading_wrist_pose(hand: Hand, heading: HeadingGoal, center: Array) -> tuple[Array, Array]:
@@ -235,10 +261,10 @@ def heading_wrist_pose(hand: Hand, heading: HeadingGoal, center: Array) -> tuple
       heading: the heading.
       center: (B, 3) hand centre in the wrist frame.
     """
-    frame = grasp_frame(hand)
-    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
+    grasp = grasp_frame(hand)
+    axes = rotations.frame_from_axes(jnp.array(grasp.heading), jnp.array(grasp.cross))
     target = rotations.frame_from_axes(heading.direction, heading.cross)
-    quaternion = rotations.multiply(target, rotations.conjugate(own))
+    quaternion = rotations.multiply(target, rotations.conjugate(axes))
     return heading.position - rotations.rotate(quaternion, center), quaternion
 
 
@@ -250,17 +276,15 @@ def heading_of_wrist(
 
     `fingers` (B, G) bool selects the tips that define the hand centre; all by default.
     """
-    frame = grasp_frame(hand)
-    center = hand_center(
-        hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)), fingers
-    )
-    axes = [
-        jnp.broadcast_to(jnp.array(axis), center.shape) for axis in (frame.heading, frame.cross)
-    ]
+    grasp = grasp_frame(hand)
+    keypoints = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+    center = hand_center(hand, keypoints, fingers)
+    heading = jnp.broadcast_to(jnp.array(grasp.heading), center.shape)
+    cross = jnp.broadcast_to(jnp.array(grasp.cross), center.shape)
     return {
         "position": position + rotations.rotate(quaternion, center),
-        "direction": rotations.rotate(quaternion, axes[0]),
-        "cross": rotations.rotate(quaternion, axes[1]),
+        "direction": rotations.rotate(quaternion, heading),
+        "cross": rotations.rotate(quaternion, cross),
     }
 
 
@@ -280,13 +304,18 @@ def orthogonal_cross(heading: HeadingGoal) -> HeadingGoal:
     Where the two are parallel an arbitrary orthogonal direction is used, since the remainder is
     rounding error.
     """
-    axis = jnp.eye(3)[jnp.argmin(jnp.abs(heading.direction), -1)]
-    cross, other = (
-        vector - jnp.sum(vector * heading.direction, -1, keepdims=True) * heading.direction
-        for vector in (heading.cross, axis)
-    )
-    cross = jnp.where(jnp.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3, other, cross)
+    direction = heading.direction
+    axis = jnp.eye(3)[jnp.argmin(jnp.abs(direction), -1)]
+    cross = _orthogonal_part(heading.cross, direction)
+    arbitrary = _orthogonal_part(axis, direction)
+    parallel = jnp.linalg.norm(cross, axis=-1, keepdims=True) < 1e-3
+    cross = jnp.where(parallel, arbitrary, cross)
     return heading._replace(cross=cross / jnp.linalg.norm(cross, axis=-1, keepdims=True))
+
+
+def _orthogonal_part(vector: Array, direction: Array) -> Array:
+    """Component of vectors (B, 3) orthogonal to unit directions (B, 3)."""
+    return vector - jnp.sum(vector * direction, -1, keepdims=True) * direction
 
 
 def object_pose(scene: Scene, *, current: bool) -> tuple[Array, Array]:
@@ -297,7 +326,3 @@ def object_pose(scene: Scene, *, current: bool) -> tuple[Array, Array]:
     if current:
         return state.object_position, state.object_quaternion
     return state.object_position_initial, state.object_quaternion_initial
-
-
-TURNED = float(np.radians(30.0))
-"""Angle between a heading and that of a stronger constraint above which they contradict, rad."""

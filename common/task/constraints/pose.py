@@ -1,9 +1,6 @@
 """Reference pose: target pose of wrist and fingers in the grasp.
 
-In training, references are disturbed like captured human grasps. In a captured pose, joints are off
-by some tenths of a radian and the wrist by a centimetre, the fingers are more or less closed than
-those of the hand that follows it, and the waypoints of a captured path jitter. The size of the
-disturbance is drawn for each episode, between none and the maxima below.
+In training, references are disturbed like captured grasps (`constraints.disturbance`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -12,22 +9,16 @@ from typing import Annotated, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common import chance, rotations
+from congrasp.common import rotations
 from congrasp.common.hands import kinematics
-from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.constraints.base import (
-    Constraint,
-    ErrorSpec,
-    Ghost,
-    GoalArray,
-    Marker,
-    ObservationField,
-    Option,
-    Relation,
-    Scene,
-    Weight,
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.disturbance import (
+    disturbed_fingers,
+    disturbed_wrist,
+    fingers_numbers,
+    wrist_numbers,
 )
 from congrasp.common.task.constraints.heading import (
     TURNED,
@@ -35,86 +26,33 @@ from congrasp.common.task.constraints.heading import (
     heading_turn,
     object_pose,
 )
+from congrasp.common.task.constraints.markers import Ghost, Marker
+from congrasp.common.task.constraints.specs import (
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Relation,
+    Weight,
+)
 from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
 from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Contacts, Features, Goal, Surface
-
-JOINTS = 0.3
-"""rad, largest standard deviation of an independent error of every finger joint."""
-CLOSURE = (0.6, 1.1)
-"""Least and greatest closure at full scale, as a share of the range from the open hand to the
-reference's fingers.
-"""
-WRIST = 0.01, 0.2
-"""m and rad, largest standard deviation of the wrist's errors along and about each axis."""
-JITTER = 0.005
-"""m, largest standard deviation of an independent error of every coordinate of every waypoint but
-the last.
-"""
-
-
-def fingers_numbers(hand: Hand) -> int:
-    """Number of random numbers that `disturbed_fingers` uses for a pose: the closure, and each
-    joint.
-    """
-    return 1 + len(hand.joints)
-
-
-def wrist_numbers(waypoints: int) -> int:
-    """Number of random numbers that `disturbed_wrist` uses for K waypoints: translation, rotation,
-    3 K of jitter.
-    """
-    return 6 + 3 * waypoints
-
-
-def disturbed_fingers(hand: Hand, q: Array, amount: Array, uniform: Array) -> Array:
-    """Disturbs reference fingers (B, F), within their limits.
-
-    Args:
-      hand: the hand.
-      q: (B, F) finger angles, rad.
-      amount: (B,) between 0 and 1, scale of the errors.
-      uniform: (B, 1 + F) random numbers in [0, 1).
-    """
-    share = CLOSURE[0] + (CLOSURE[1] - CLOSURE[0]) * uniform[:, :1]
-    q_open, amount = jnp.array(hand.q_open), amount[:, None]
-    q = q_open + (1 + amount * (share - 1)) * (q - q_open)
-    q = q + amount * JOINTS * chance.normal(uniform[:, 1:])
-    return coupled(hand, jnp.clip(q, hand.lower, hand.upper))
-
-
-def disturbed_wrist(
-    position: Array, quaternion: Array, amount: Array, uniform: Array
-) -> tuple[Array, Array]:
-    """Disturbs wrist poses (B, K, 3), (B, K, 4) by one rigid motion for all K, with jitter of the
-    waypoints.
-
-    All rotate about the last one, so that a path keeps its shape.
-
-    Args:
-      position: positions in the object frame, m.
-      quaternion: rotations from the wrist frame to the object frame.
-      amount: (B,) between 0 and 1, scale of the errors.
-      uniform: (B, 6 + 3 K) random numbers in [0, 1).
-    """
-    noise = amount[:, None] * chance.normal(uniform)
-    move, turn = WRIST[0] * noise[:, :3], rotations.from_rotation_vector(WRIST[1] * noise[:, 3:6])
-    last_is_kept = (np.arange(position.shape[1]) < position.shape[1] - 1)[:, None]
-    jitter = JITTER * last_is_kept * noise[:, 6:].reshape(position.shape)
-    turn, last = jnp.broadcast_to(turn[:, None], quaternion.shape), position[:, -1:]
-    return last + move[:, None] + rotations.rotate(
-        turn, position - last
-    ) + jitter, rotations.multiply(turn, quaternion)
-
 
 TOUCHING = 0.015
 """Distance from a joint or fingertip of a reference pose to the surface below which it counts as
 touching, m.
 """
-_FAR, _TURNED = 0.15, 0.5
-"""Errors (m, rad) beyond which the tracking cost saturates."""
-_GATE_FAR, _GATE_NEAR = 0.10, 0.03
+_MAX_COST_DISTANCE = 0.15
+"""Distance of the wrist beyond which the cost saturates, m."""
+_MAX_COST_ANGLE = 0.5
+"""Angle of the wrist beyond which the cost saturates, rad."""
+_GATE_FAR = 0.10
+"""Distance between hand and object from which on the fingers are not rewarded, m."""
+_GATE_NEAR = 0.03
+"""Distance between hand and object below which the fingers are fully rewarded, m."""
 
 
 class PoseGoal(NamedTuple):
@@ -142,11 +80,14 @@ class Pose(Constraint):
     Observation Space).
     """
 
-    name, title, goal = "pose", "reference pose", PoseGoal
+    name = "pose"
+    title = "reference pose"
+    goal = PoseGoal
     blocks = ("pose_finger", "pose_wrist")
     overrides = ("heading", "affordance")
     guides = "pose_wrist"
-    from_reference, harvested = True, False
+    from_reference = True
+    harvested = False
     weights = (
         Weight(
             "pose_finger",
@@ -167,8 +108,23 @@ class Pose(Constraint):
         ),
     )
     errors = (
-        ErrorSpec("pose_rad", "rad", "hold", 0.25, 0.25, "mean over joints and wrist hinges"),
-        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "distance of the wrist", block="pose_wrist"),
+        ErrorSpec(
+            name="pose_rad",
+            unit="rad",
+            window="hold",
+            tolerance=0.25,
+            scale=0.25,
+            meaning="mean over joints and wrist hinges",
+        ),
+        ErrorSpec(
+            name="pose_m",
+            unit="m",
+            window="hold",
+            tolerance=0.03,
+            scale=0.02,
+            meaning="distance of the wrist",
+            block="pose_wrist",
+        ),
     )
     options = (
         Option(
@@ -178,6 +134,61 @@ class Pose(Constraint):
             "pose",
         ),
     )
+
+    def numbers(self, hand: Hand, task: TaskSettings) -> int:
+        """Those of disturbed fingers and of a disturbed wrist."""
+        return fingers_numbers(hand) + wrist_numbers(1)
+
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> PoseGoal:
+        """Samples one of the object's reference poses."""
+        index = draw.objects, draw.region, draw.reference["pose"]
+        q = draw.bank.pose_q[index]
+        position = draw.bank.pose_position[index]
+        quaternion = draw.bank.pose_quaternion[index]
+        if draw.disturbance is None:
+            return PoseGoal(q, position, quaternion)
+        for_fingers, for_wrist = jnp.split(uniform, [fingers_numbers(hand)], -1)
+        q = disturbed_fingers(hand, q, draw.disturbance, for_fingers)
+        positions, quaternions = disturbed_wrist(
+            position[:, None], quaternion[:, None], draw.disturbance, for_wrist
+        )
+        return PoseGoal(q, positions[:, 0], quaternions[:, 0])
+
+    def override(
+        self, hand: Hand, surface: Surface, requested: Mapping[str, Array], goal: Goal
+    ) -> Goal:
+        """Replaces the heading by that of the reference pose."""
+        pose = goal["pose"]
+        heading = heading_of_wrist(hand, pose.q, pose.position, pose.quaternion)
+        return goal.where(requested["pose"], "heading", **heading)
+
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """Effect of the pose: it guides wrist and fingers, or only the fingers."""
+        if overridden:
+            return [
+                "Only the fingers of the reference pose count: the trajectory determines the wrist."
+            ]
+        return ["The reference pose guides wrist and fingers; the heading follows from it."]
+
+    def initial_fingers(self, goal: Goal) -> tuple[Array, Array]:
+        """Reference finger angles (paper, section Hand Initialization)."""
+        return goal.active["pose_finger"], goal["pose"].q
+
+    def features(
+        self, hand: Hand, contacts: Contacts, features: Features, goal: Goal
+    ) -> PoseFeatures:
+        """Keypoints of the reference pose."""
+        points = rotations.transform(
+            features.object_position,
+            features.object_quaternion,
+            _reference_keypoints(hand, goal["pose"]),
+        )
+        return PoseFeatures(points)
+
+    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
+        """Reference wrist pose in the world frame."""
+        pose = scene.goal["pose"]
+        return in_world(*object_pose(scene, current=current), pose.position, pose.quaternion)
 
     def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for residuals of joints and keypoints, and of the virtual wrist joints."""
@@ -192,118 +203,59 @@ class Pose(Constraint):
         )
         return fingers, (wrist,)
 
-    def numbers(self, hand: Hand, task: TaskSettings) -> int:
-        """Those of disturbed fingers and of a disturbed wrist."""
-        return fingers_numbers(hand) + wrist_numbers(1)
-
-    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> PoseGoal:
-        """Samples one of the object's reference poses."""
-        index = draw.objects, draw.region, draw.reference["pose"]
-        q, position, quaternion = (
-            getattr(draw.bank, f"pose_{name}")[index] for name in PoseGoal._fields
-        )
-        if draw.disturbance is not None:
-            fingers, turned = jnp.split(uniform, [fingers_numbers(hand)], -1)
-            q = disturbed_fingers(hand, q, draw.disturbance, fingers)
-            wrist = disturbed_wrist(
-                position[:, None], quaternion[:, None], draw.disturbance, turned
-            )
-            position, quaternion = (part[:, 0] for part in wrist)
-        return PoseGoal(q, position, quaternion)
-
-    def override(
-        self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal
-    ) -> Goal:
-        """Replaces the heading by that of the reference pose."""
-        own = goal["pose"]
-        return goal.where(
-            asked["pose"], "heading", **heading_of_wrist(hand, own.q, own.position, own.quaternion)
-        )
-
-    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Reference wrist pose."""
-        return np.asarray(own["position"])[None], np.asarray(own["quaternion"])
-
-    def initial_fingers(self, goal: Goal) -> tuple[Array, Array]:
-        """Reference finger angles (paper, section Hand Initialization)."""
-        return goal.active["pose_finger"], goal["pose"].q
-
-    def features(
-        self, hand: Hand, contacts: Contacts, features: Features, goal: Goal
-    ) -> PoseFeatures:
-        """Keypoints of the reference pose."""
-        own = goal["pose"]
-        points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
-        points = rotations.transform(own.position, own.quaternion, points)
-        return PoseFeatures(
-            rotations.transform(features.object_position, features.object_quaternion, points)
-        )
-
-    def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """Reference wrist pose in the world frame."""
-        own = scene.goal["pose"]
-        return in_world(*object_pose(scene, current=current), own.position, own.quaternion)
-
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
         """Residuals q-bar - q and x-bar - x; u-bar - u."""
-        own, state, features = scene.goal["pose"], scene.state, scene.features
-        fingers = [own.q - state.q, flat(features.of["pose"].keypoints - features.keypoints)]
-        wrist = in_world(
-            state.object_position, state.object_quaternion, own.position, own.quaternion
-        )
-        return fingers, [wrist_to_joints(state, *wrist) - state.u]
+        state = scene.state
+        features = scene.features
+        keypoint_residuals = features.by_constraint["pose"].keypoints - features.keypoints
+        fingers = [scene.goal["pose"].q - state.q, flat(keypoint_residuals)]
+        return fingers, [wrist_to_joints(state, *_wrist_target(scene)) - state.u]
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Reward term r^pose."""
-        own, state, features, active = scene.goal["pose"], scene.state, scene.features, scene.gate
-        position, quaternion = in_world(
-            state.object_position, state.object_quaternion, own.position, own.quaternion
-        )
-        gate = pose_gate(jnp.min(jnp.linalg.norm(features.nearest, axis=-1), -1)) * active(
-            "pose_finger"
-        )
-        far = jnp.minimum(square(features.wrist_position - position), _FAR**2)
-        turned = jnp.minimum(rotations.angle(features.wrist_quaternion, quaternion), _TURNED)
+        features = scene.features
+        position, quaternion = _wrist_target(scene)
+        gap = jnp.min(jnp.linalg.norm(features.nearest, axis=-1), -1)
+        fingers_active = pose_gate(gap) * scene.gate("pose_finger")
+        wrist_active = scene.gate("pose_wrist")
+        keypoint_residuals = features.by_constraint["pose"].keypoints - features.keypoints
+        away = jnp.minimum(square(features.wrist_position - position), _MAX_COST_DISTANCE**2)
+        angle = rotations.angle(features.wrist_quaternion, quaternion)
+        turned = jnp.minimum(angle, _MAX_COST_ANGLE)
         return {
-            "pose_finger": -gate * square(state.q - own.q),
-            "pose_link": -gate
-            * jnp.sum(square(features.of["pose"].keypoints - features.keypoints), -1),
-            "pose_wrist_position": -active("pose_wrist") * far,
-            "pose_wrist_rotation": -active("pose_wrist") * turned**2,
+            "pose_finger": -fingers_active * square(scene.state.q - scene.goal["pose"].q),
+            "pose_link": -fingers_active * jnp.sum(square(keypoint_residuals), -1),
+            "pose_wrist_position": -wrist_active * away,
+            "pose_wrist_rotation": -wrist_active * turned**2,
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Mean absolute error of the finger joints and the three wrist hinges; distance of the
         wrist.
         """
-        own, state = scene.goal["pose"], scene.state
-        position, quaternion = in_world(
-            state.object_position, state.object_quaternion, own.position, own.quaternion
-        )
+        state = scene.state
+        position, quaternion = _wrist_target(scene)
         hinges = wrist_to_joints(state, position, quaternion)[..., 3:] - state.u[..., 3:]
-        angles = jnp.concatenate([state.q - own.q, hinges], -1)
+        angles = jnp.concatenate([state.q - scene.goal["pose"].q, hinges], -1)
         return {
             "pose_rad": jnp.mean(jnp.abs(angles), -1),
             "pose_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
         }
 
     def parse(
-        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+        self, option_values: Mapping[str, Any], hand: Hand, obj: GraspObject
     ) -> dict[str, np.ndarray] | None:
         """Returns the arrays of the file."""
-        return given["pose"]
+        return option_values["pose"]
 
-    def markers(self, own: PoseGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+    def wrist_path(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Reference wrist pose."""
+        return np.asarray(values["position"])[None], np.asarray(values["quaternion"])
+
+    def markers(self, values: PoseGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """Ghost of the reference hand, or of its wrist only."""
-        return (Ghost(own.position, own.quaternion, own.q if "pose_finger" in blocks else None),)
-
-    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Effect of the pose: it guides wrist and fingers, or only the fingers."""
-        if overridden:
-            return [
-                "Only the fingers of the reference pose count: the trajectory determines the wrist."
-            ]
-        return ["The reference pose guides wrist and fingers; the heading follows from it."]
+        q = values.q if "pose_finger" in blocks else None
+        return (Ghost(values.position, values.quaternion, q),)
 
 
 def pose_gate(distance: Array) -> Array:
@@ -311,59 +263,78 @@ def pose_gate(distance: Array) -> Array:
     return jnp.clip((_GATE_FAR - distance) / (_GATE_FAR - _GATE_NEAR), 0.0, 1.0)
 
 
+def heading_message(stronger: str, turn: float) -> str:
+    """Message for a heading that contradicts a stronger constraint by an angle in rad."""
+    return (
+        f"The heading differs by {np.degrees(turn):.0f} degrees from the approach of the "
+        f"{stronger}. The {stronger} overrides it: the heading follows from it."
+    )
+
+
+def _reference_keypoints(hand: Hand, pose: PoseGoal) -> Array:
+    """Keypoints (B, P, 3) of reference poses, object frame."""
+    points = kinematics.keypoints(hand, kinematics.link_transforms(hand, pose.q))
+    return rotations.transform(pose.position, pose.quaternion, points)
+
+
+def _wrist_target(scene: Scene) -> tuple[Array, Array]:
+    """Reference wrist pose (B, 3), (B, 4) relative to the object's current pose, world frame."""
+    state = scene.state
+    pose = scene.goal["pose"]
+    return in_world(state.object_position, state.object_quaternion, pose.position, pose.quaternion)
+
+
+def _touching_keypoints(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """(B, P) bool: keypoints of the reference pose that would touch the avoid region."""
+    squared = squared_distances(surface.points, _reference_keypoints(hand, goal["pose"]))
+    avoid = jnp.min(jnp.where(surface.avoid[..., None], squared, jnp.inf), -2)
+    graspable = jnp.min(jnp.where(surface.avoid[..., None], jnp.inf, squared), -2)
+    return {"touching": (avoid < TOUCHING**2) & (avoid < graspable)}
+
+
+def _contradicts_affordance(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: a keypoint would touch the avoid region."""
+    return jnp.any(apart["touching"], -1)
+
+
+def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    """Message for an affordance that the pose overrides."""
+    touching = hand.keypoint_links[np.flatnonzero(apart["touching"])]
+    names = dict.fromkeys(hand.links[link].name for link in touching)
+    return (
+        f"In the reference pose, {', '.join(names)} would touch the avoid region. The pose defines "
+        f"the contacts and overrides the affordance."
+    )
+
+
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
     """Angle (B,) in rad between the heading and that of the reference."""
     return {"turn": heading_turn(hand, goal["heading"], goal["pose"].quaternion)}
 
 
+def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: the heading differs from that of the reference."""
+    return apart["turn"] > TURNED
+
+
 def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    """Message for a heading that the pose overrides."""
     return heading_message("pose", apart["turn"])
-
-
-def heading_message(stronger: str, turn: float) -> str:
-    """Message for a heading that contradicts a stronger constraint by an angle in rad."""
-    return (
-        f"The heading differs by {np.degrees(turn):.0f} degrees from the approach of the "
-        f"{stronger}. The "
-        f"{stronger} overrides it: the heading follows from it."
-    )
-
-
-def _touches(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    """(B, P) bool: keypoints of the reference pose that would touch the avoid region."""
-    own = goal["pose"]
-    points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
-    points = rotations.transform(own.position, own.quaternion, points)
-    away = squared_distances(surface.points, points)
-    avoid = jnp.min(jnp.where(surface.avoid[..., None], away, jnp.inf), -2)
-    graspable = jnp.min(jnp.where(surface.avoid[..., None], jnp.inf, away), -2)
-    return {"touching": (avoid < TOUCHING**2) & (avoid < graspable)}
-
-
-def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
-    names = dict.fromkeys(
-        hand.links[hand.keypoint_links[i]].name for i in np.flatnonzero(apart["touching"])
-    )
-    return (
-        f"In the reference pose, {', '.join(names)} would touch the avoid region. The pose defines "
-        f"the contacts "
-        "and overrides the affordance."
-    )
 
 
 Pose.relations = (
     Relation(
-        "affordance",
-        "overridden",
-        _touches,
-        lambda apart: jnp.any(apart["touching"], -1),
-        _affordance_message,
+        weaker="affordance",
+        settled="overridden",
+        measure=_touching_keypoints,
+        contradicts=_contradicts_affordance,
+        message=_affordance_message,
     ),
     Relation(
-        "heading",
-        "overridden",
-        _apart_from_heading,
-        lambda apart: apart["turn"] > TURNED,
-        _heading_message,
+        weaker="heading",
+        settled="overridden",
+        measure=_apart_from_heading,
+        contradicts=_contradicts_heading,
+        message=_heading_message,
     ),
 )

@@ -16,8 +16,9 @@ import numpy as np
 
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import CONSTRAINTS, get_constraint
-from congrasp.common.task.constraints.base import Constraint, Relation
+from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.heading import orthogonal_cross
+from congrasp.common.task.constraints.specs import Relation
 from congrasp.common.task.types import Array, Goal, Surface
 
 
@@ -43,34 +44,32 @@ class Contradiction(NamedTuple):
     """True if neither overrides the other: the request is an error."""
 
 
-def _overrides(stronger: Constraint, weaker: str) -> bool:
-    """True if it overrides a constraint or one of its blocks."""
-    return any(
-        _hits(stronger, block, get_constraint(weaker))
-        for block in (weaker, *get_constraint(weaker).blocks)
-    )
+def _overrides(stronger: Constraint, name: str) -> bool:
+    """True if it overrides the constraint of this name or one of its blocks."""
+    weaker = get_constraint(name)
+    return any(_overrides_block(stronger, block, weaker) for block in (name, *weaker.blocks))
 
 
-def _hits(stronger: Constraint, block: str, owner: Constraint) -> bool:
-    """True if it overrides this block."""
-    return (
-        not {block, owner.name}.isdisjoint(stronger.overrides)
-        or stronger.name in owner.overridden_by
-    )
+def _overrides_block(stronger: Constraint, block: str, owner: Constraint) -> bool:
+    """True if it overrides a block, by the block's name or by that of its constraint."""
+    listed = block in stronger.overrides or owner.name in stronger.overrides
+    return listed or stronger.name in owner.overridden_by
 
 
-def active_blocks(asked: Mapping[str, Array]) -> dict[str, Array]:
+def active_blocks(requested: Mapping[str, Array]) -> dict[str, Array]:
     """Active blocks for the requested constraints, (B,) bool each."""
-    return {
-        block: asked[owner.name]
-        & ~_any(
-            (asked[c.name] for c in CONSTRAINTS if c.name in asked and _hits(c, block, owner)),
-            asked[owner.name],
-        )
-        for owner in CONSTRAINTS
-        if owner.name in asked
-        for block in owner.blocks
-    }
+    constraints = [constraint for constraint in CONSTRAINTS if constraint.name in requested]
+    active = {}
+    for owner in constraints:
+        flags = requested[owner.name]
+        for block in owner.blocks:
+            overriding = [
+                requested[constraint.name]
+                for constraint in constraints
+                if _overrides_block(constraint, block, owner)
+            ]
+            active[block] = flags & ~_any(overriding, flags)
+    return active
 
 
 def _any(flags: Iterable[Array], like: Array) -> Array:
@@ -78,33 +77,37 @@ def _any(flags: Iterable[Array], like: Array) -> Array:
     return functools.reduce(operator.or_, flags, like & False)
 
 
-def _moot(relation: Relation, stronger: Constraint, asked: Mapping[str, Array]) -> Array:
+def _is_moot(relation: Relation, stronger: Constraint, requested: Mapping[str, Array]) -> Array:
     """(B,) bool: another requested constraint overrides the weaker one anyway."""
-    others = [
-        c
-        for c in CONSTRAINTS
-        if c.name in asked and c is not stronger and _overrides(c, relation.weaker)
-    ]
-    if _overrides(stronger, relation.weaker):
-        others = [c for c in others if CONSTRAINTS.index(c) > CONSTRAINTS.index(stronger)]
-    return _any((asked[c.name] for c in others), asked[stronger.name])
+    overriding = []
+    overrides_itself = _overrides(stronger, relation.weaker)
+    for constraint in CONSTRAINTS:
+        if constraint.name not in requested or constraint is stronger:
+            continue
+        is_weaker = CONSTRAINTS.index(constraint) < CONSTRAINTS.index(stronger)
+        if overrides_itself and is_weaker:
+            continue
+        if _overrides(constraint, relation.weaker):
+            overriding.append(requested[constraint.name])
+    return _any(overriding, requested[stronger.name])
 
 
-def _relations(asked: Iterable[str]) -> list[tuple[Constraint, Relation]]:
+def _relations(requested: Iterable[str]) -> list[tuple[Constraint, Relation]]:
     """Relations between constraints that may be requested together, those of the strongest
     first.
     """
-    names = {*asked, "heading"}
-    return [
-        (c, r)
-        for c in reversed(CONSTRAINTS)
-        if c.name in names
-        for r in c.relations
-        if r.weaker in names
-    ]
+    names = {*requested, "heading"}
+    relations = []
+    for constraint in reversed(CONSTRAINTS):
+        if constraint.name not in names:
+            continue
+        relations += [
+            (constraint, relation) for relation in constraint.relations if relation.weaker in names
+        ]
+    return relations
 
 
-def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]) -> Resolution:
+def resolve(hand: Hand, surface: Surface, goal: Goal, requested: Mapping[str, Array]) -> Resolution:
     """Applies the priority rules to a batch of requests.
 
     Args:
@@ -112,41 +115,47 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
       surface: surface points of the objects.
       goal: requested goal arrays; those of absent constraints may hold any finite values. Its
         active flags are ignored.
-      asked: (B,) bool by the name of each optional constraint of the goal.
+      requested: (B,) bool by the name of each optional constraint of the goal.
     """
-    found: dict[str, list[Array]] = {"redirected": [], "refused": []}
-    for stronger, relation in _relations(asked):
-        if relation.settled in found:
-            both = asked[stronger.name] & ~_moot(relation, stronger, asked)
-            if relation.weaker in asked:
-                both = both & asked[relation.weaker]
-            found[relation.settled].append(
-                both & relation.contradicts(relation.measure(hand, surface, goal))
-            )
+    redirected: list[Array] = []
+    refused: list[Array] = []
+    for stronger, relation in _relations(requested):
+        if relation.settled == "overridden":
+            continue
+        both = requested[stronger.name] & ~_is_moot(relation, stronger, requested)
+        if relation.weaker in requested:
+            both = both & requested[relation.weaker]
+        contradicting = both & relation.contradicts(relation.measure(hand, surface, goal))
+        if relation.settled == "redirected":
+            redirected.append(contradicting)
+        else:
+            refused.append(contradicting)
     cross = orthogonal_cross(goal["heading"]).cross
-    resolved = Goal(goal.values, active_blocks(asked)).replace("heading", cross=cross)
+    resolved = Goal(goal.values, active_blocks(requested)).replace("heading", cross=cross)
     for constraint in CONSTRAINTS:
-        if constraint.name in asked:
-            resolved = constraint.override(hand, surface, asked, resolved)
+        if constraint.name in requested:
+            resolved = constraint.override(hand, surface, requested, resolved)
     none = jnp.zeros(goal["heading"].position.shape[0], bool)
-    return Resolution(resolved, _any(found["redirected"], none), ~_any(found["refused"], none))
+    return Resolution(
+        goal=resolved,
+        redirected=_any(redirected, none),
+        aligned=~_any(refused, none),
+    )
 
 
-def explain(asked: Iterable[str], redirected: bool = False) -> list[str]:
+def explain(requested: Iterable[str], redirected: bool = False) -> list[str]:
     """Describes the effect of the rules on a request, in sentences, strongest constraint first."""
-    names = {*asked, "heading"}
-    words = []
-    for constraint in reversed(CONSTRAINTS):
-        if constraint.name in names:
-            others = [
-                c.name for c in CONSTRAINTS if c.name in names and _overrides(c, constraint.name)
-            ]
-            words += constraint.explain(others, redirected)
-    return words
+    names = {*requested, "heading"}
+    constraints = [constraint for constraint in CONSTRAINTS if constraint.name in names]
+    sentences = []
+    for constraint in reversed(constraints):
+        overriding = [other.name for other in constraints if _overrides(other, constraint.name)]
+        sentences += constraint.explain(overriding, redirected)
+    return sentences
 
 
 def contradictions(
-    hand: Hand, points: np.ndarray, avoid: np.ndarray, goal: Goal, asked: Iterable[str]
+    hand: Hand, points: np.ndarray, avoid: np.ndarray, goal: Goal, requested: Iterable[str]
 ) -> list[Contradiction]:
     """Contradictions within one request, strongest constraint first.
 
@@ -155,22 +164,29 @@ def contradictions(
       points: (N, 3) surface points.
       avoid: (N,) bool, those of the avoid region.
       goal: requested goal arrays without batch axis.
-      asked: names of the explicitly requested constraints, including the heading if it was
+      requested: names of the explicitly requested constraints, including the heading if it was
         requested.
     """
-    names = set(asked)
+    names = set(requested)
     flags = {name: np.ones(1, bool) for name in names}
     batch = jax.tree.map(lambda array: np.asarray(array)[None], goal)
     surface = Surface(np.asarray(points, np.float32)[None], np.asarray(avoid)[None])
     result = []
     for stronger, relation in _relations(names):
-        if not {stronger.name, relation.weaker} <= names or _moot(relation, stronger, flags).any():
+        if not {stronger.name, relation.weaker} <= names:
+            continue
+        if _is_moot(relation, stronger, flags).any():
             continue
         measured = relation.measure(hand, surface, batch)
-        if relation.contradicts(measured).any():
-            one = {name: np.asarray(value)[0] for name, value in measured.items()}
-            refused = relation.settled == "refused"
-            result.append(
-                Contradiction(relation.weaker, stronger.name, relation.message(hand, one), refused)
+        if not relation.contradicts(measured).any():
+            continue
+        distances = {name: np.asarray(value)[0] for name, value in measured.items()}
+        result.append(
+            Contradiction(
+                weaker=relation.weaker,
+                stronger=stronger.name,
+                message=relation.message(hand, distances),
+                refused=relation.settled == "refused",
             )
+        )
     return result

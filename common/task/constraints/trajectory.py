@@ -10,18 +10,8 @@ import numpy as np
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.constraints.base import (
-    Constraint,
-    ErrorSpec,
-    GoalArray,
-    Marker,
-    ObservationField,
-    Option,
-    Polyline,
-    Relation,
-    Scene,
-    Weight,
-)
+from congrasp.common.task.constraints.base import Constraint
+from congrasp.common.task.constraints.disturbance import disturbed_wrist, wrist_numbers
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.heading import (
     TURNED,
@@ -29,9 +19,19 @@ from congrasp.common.task.constraints.heading import (
     heading_turn,
     object_pose,
 )
-from congrasp.common.task.constraints.pose import disturbed_wrist, heading_message, wrist_numbers
+from congrasp.common.task.constraints.markers import Marker, Polyline
+from congrasp.common.task.constraints.pose import heading_message
+from congrasp.common.task.constraints.specs import (
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Relation,
+    Weight,
+)
 from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
 from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
 
@@ -44,8 +44,10 @@ CLOSED = 0.4
 gives the fingers. Median distance to the centres of closed reference poses, for the shares 0, 0.4,
 0.5 and 1: human 21, 19, 19 and 42 mm, Allegro 32, 26, 24 and 46 mm, Sharpa 25, 19, 20 and 51 mm
 (432, 398 and 417 poses on 32 objects of all families)."""
-_FAR, _TURNED = 0.15, 0.5
-"""Errors (m, rad) beyond which the tracking cost saturates."""
+_MAX_COST_DISTANCE = 0.15
+"""Distance from the waypoint beyond which the tracking cost saturates, m."""
+_MAX_COST_ANGLE = 0.5
+"""Angle to the waypoint beyond which the tracking cost saturates, rad."""
 
 
 class TrajectoryGoal(NamedTuple):
@@ -63,11 +65,14 @@ class TrajectoryGoal(NamedTuple):
 class Trajectory(Constraint):
     """A sequence of wrist poses (paper, section Constraint Formulation)."""
 
-    name, title, goal = "trajectory", "wrist trajectory", TrajectoryGoal
+    name = "trajectory"
+    title = "wrist trajectory"
+    goal = TrajectoryGoal
     blocks = ("trajectory",)
     overrides = ("heading", "pose_wrist")
     guides = "trajectory"
-    from_reference, harvested = True, False
+    from_reference = True
+    harvested = False
     weights = (
         Weight(
             "trajectory_position",
@@ -82,22 +87,22 @@ class Trajectory(Constraint):
     )
     errors = (
         ErrorSpec(
-            "trajectory_rad",
-            "rad",
-            "approach",
-            0.3,
-            0.2,
-            "angle of the wrist to the waypoint",
-            "traj_rad",
+            name="trajectory_rad",
+            unit="rad",
+            window="approach",
+            tolerance=0.3,
+            scale=0.2,
+            meaning="angle of the wrist to the waypoint",
+            column="traj_rad",
         ),
         ErrorSpec(
-            "trajectory_m",
-            "m",
-            "approach",
-            0.03,
-            0.03,
-            "distance of the wrist from the waypoint",
-            "traj_m",
+            name="trajectory_m",
+            unit="m",
+            window="approach",
+            tolerance=0.03,
+            scale=0.03,
+            meaning="distance of the wrist from the waypoint",
+            column="traj_m",
         ),
     )
     options = (
@@ -109,14 +114,6 @@ class Trajectory(Constraint):
             "path",
         ),
     )
-
-    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
-        """Fields for residuals of the virtual wrist joints, of every waypoint."""
-        size, meaning = (
-            6 * task.trajectory_points,
-            "m and rad, wrist joints of every waypoint minus the current ones",
-        )
-        return ((ObservationField("waypoint_u - u", size, meaning),),)
 
     def allowed(self, draw: Draw) -> Array:
         """References clear of the table that agree with an affordance, if one is requested (region
@@ -133,9 +130,9 @@ class Trajectory(Constraint):
         self, task: TaskSettings, active: Mapping[str, Array], uniform: Array
     ) -> Array | None:
         """Episodes with an affordance, with probability `p_together`."""
-        return (
-            active["affordance"] & (uniform < task.p_together) if "affordance" in active else None
-        )
+        if "affordance" not in active:
+            return None
+        return active["affordance"] & (uniform < task.p_together)
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> TrajectoryGoal:
         """Samples the trajectory to one of the object's reference poses.
@@ -143,19 +140,19 @@ class Trajectory(Constraint):
         A disturbance that would make it contradict an affordance is dropped.
         """
         index = draw.objects, draw.region, draw.reference["trajectory"]
-        path = TrajectoryGoal(
-            draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index]
-        )
+        position = draw.bank.trajectory_position[index]
+        quaternion = draw.bank.trajectory_quaternion[index]
         if draw.disturbance is None:
-            return path
-        disturbed = TrajectoryGoal(*disturbed_wrist(*path, draw.disturbance, uniform))
-        kept = _agrees(draw, disturbed.position[:, -1])[:, None, None]
+            return TrajectoryGoal(position, quaternion)
+        moved, turned = disturbed_wrist(position, quaternion, draw.disturbance, uniform)
+        agrees = _agrees(draw, moved[:, -1])[:, None, None]
         return TrajectoryGoal(
-            *(jnp.where(kept, *pair) for pair in zip(disturbed, path, strict=True))
+            position=jnp.where(agrees, moved, position),
+            quaternion=jnp.where(agrees, turned, quaternion),
         )
 
     def override(
-        self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal
+        self, hand: Hand, surface: Surface, requested: Mapping[str, Array], goal: Goal
     ) -> Goal:
         """Replaces the wrist of a reference pose by the last waypoint, and the heading by the
         waypoint's.
@@ -163,45 +160,61 @@ class Trajectory(Constraint):
         The heading's position is the hand centre with the pose's fingers or, without a pose, of a
         partly closed hand.
         """
-        here, last = asked["trajectory"], last_waypoint(goal)
-        q = jnp.broadcast_to(jnp.array(closing(hand)), (here.shape[0], len(hand.joints)))
+        mask = requested["trajectory"]
+        position, quaternion = last_waypoint(goal)
+        q = jnp.broadcast_to(jnp.array(closing(hand)), (mask.shape[0], len(hand.joints)))
         if "pose" in goal.values:
-            q = jnp.where(asked["pose"][:, None], goal["pose"].q, q)
-            goal = goal.where(here, "pose", position=last[0], quaternion=last[1])
-        return goal.where(
-            here, "heading", **heading_of_wrist(hand, q, *last, chosen_fingers(asked, goal))
-        )
+            q = jnp.where(requested["pose"][:, None], goal["pose"].q, q)
+            goal = goal.where(mask, "pose", position=position, quaternion=quaternion)
+        fingers = chosen_fingers(requested, goal)
+        heading = heading_of_wrist(hand, q, position, quaternion, fingers)
+        return goal.where(mask, "heading", **heading)
 
-    def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Waypoints."""
-        return np.asarray(own["position"]), np.asarray(own["quaternion"])[-1]
+    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
+        """Effect of the trajectory: it guides the wrist."""
+        return [
+            "The wrist trajectory guides the wrist; the heading follows from its last waypoint."
+        ]
 
     def initial_wrist(
         self, hand: Hand, back_off: Array, goal: Goal, q: Array
     ) -> tuple[Array, Array, Array]:
         """First waypoint (paper, section Hand Initialization)."""
-        own = goal["trajectory"]
-        return goal.active["trajectory"], own.position[:, 0], own.quaternion[:, 0]
+        path = goal["trajectory"]
+        return goal.active["trajectory"], path.position[:, 0], path.quaternion[:, 0]
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
         """Waypoint after the one nearest to the wrist."""
         return tracked_waypoint(scene, current=current)
 
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
+        """Fields for residuals of the virtual wrist joints, of every waypoint."""
+        residuals = ObservationField(
+            "waypoint_u - u",
+            6 * task.trajectory_points,
+            "m and rad, wrist joints of every waypoint minus the current ones",
+        )
+        return ((residuals,),)
+
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
         """Residuals u-bar^(k) - u of every waypoint."""
-        own, state = scene.goal["trajectory"], scene.state
+        state = scene.state
+        path = scene.goal["trajectory"]
         waypoints = in_world(
-            state.object_position, state.object_quaternion, own.position, own.quaternion
+            state.object_position, state.object_quaternion, path.position, path.quaternion
         )
-        return ([flat(wrist_to_joints(state, *waypoints) - state.u[..., None, :])],)
+        residuals = wrist_to_joints(state, *waypoints) - state.u[..., None, :]
+        return ([flat(residuals)],)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
         """Reward term r^traj."""
-        active, features = scene.gate("trajectory"), scene.features
+        active = scene.gate("trajectory")
+        features = scene.features
         position, quaternion = tracked_waypoint(scene, current=True)
-        far = jnp.minimum(square(features.wrist_position - position), _FAR**2)
-        turned = jnp.minimum(rotations.angle(features.wrist_quaternion, quaternion), _TURNED)
-        return {"trajectory_position": -active * far, "trajectory_rotation": -active * turned**2}
+        away = jnp.minimum(square(features.wrist_position - position), _MAX_COST_DISTANCE**2)
+        angle = rotations.angle(features.wrist_quaternion, quaternion)
+        turned = jnp.minimum(angle, _MAX_COST_ANGLE)
+        return {"trajectory_position": -active * away, "trajectory_rotation": -active * turned**2}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
         """Angle and distance between the wrist and the tracked waypoint."""
@@ -212,20 +225,18 @@ class Trajectory(Constraint):
         }
 
     def parse(
-        self, given: Mapping[str, Any], hand: Hand, obj: GraspObject
+        self, option_values: Mapping[str, Any], hand: Hand, obj: GraspObject
     ) -> dict[str, np.ndarray] | None:
         """Returns the waypoints of the file."""
-        return given["trajectory"]
+        return option_values["trajectory"]
 
-    def markers(self, own: TrajectoryGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+    def wrist_path(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Waypoints."""
+        return np.asarray(values["position"]), np.asarray(values["quaternion"])[-1]
+
+    def markers(self, values: TrajectoryGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """Path of the wrist."""
-        return (Polyline(own.position),)
-
-    def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """Effect of the trajectory: it guides the wrist."""
-        return [
-            "The wrist trajectory guides the wrist; the heading follows from its last waypoint."
-        ]
+        return (Polyline(values.position),)
 
 
 def closing(hand: Hand) -> np.ndarray:
@@ -237,8 +248,8 @@ def closing(hand: Hand) -> np.ndarray:
 
 def last_waypoint(goal: Goal) -> tuple[Array, Array]:
     """Wrist pose (B, 3), (B, 4) at the end of the trajectory, object frame."""
-    own = goal["trajectory"]
-    return own.position[:, -1], own.quaternion[:, -1]
+    path = goal["trajectory"]
+    return path.position[:, -1], path.quaternion[:, -1]
 
 
 def active_waypoint(wrist_position: Array, waypoints: Array, lookahead: int) -> Array:
@@ -256,14 +267,14 @@ def tracked_waypoint(scene: Scene, *, current: bool) -> tuple[Array, Array]:
     Guidance, reward and errors use the same waypoint, selected with the object's pose of the
     guidance.
     """
-    own, control = scene.goal["trajectory"], scene.task.control
-    guiding, _ = in_world(
-        *object_pose(scene, current=control.follow_object), own.position, own.quaternion
-    )
-    index = active_waypoint(scene.features.wrist_position, guiding, control.lookahead)[
-        ..., None, None
-    ]
-    position, quaternion = (jnp.take_along_axis(array, index, -2)[..., 0, :] for array in own)
+    path = scene.goal["trajectory"]
+    control = scene.task.control
+    guiding_pose = object_pose(scene, current=control.follow_object)
+    guiding, _ = in_world(*guiding_pose, path.position, path.quaternion)
+    index = active_waypoint(scene.features.wrist_position, guiding, control.lookahead)
+    index = index[..., None, None]
+    position = jnp.take_along_axis(path.position, index, -2)[..., 0, :]
+    quaternion = jnp.take_along_axis(path.quaternion, index, -2)[..., 0, :]
     return in_world(*object_pose(scene, current=current), position, quaternion)
 
 
@@ -276,14 +287,24 @@ def _apart_from_pose(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Arra
     }
 
 
+def _contradicts_pose(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: the trajectory ends at another wrist pose."""
+    return (apart["apart"] > APART) | (apart["twist"] > TWISTED)
+
+
 def _pose_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    """Message for a pose whose wrist the trajectory overrides."""
     return (
         f"The reference pose puts the wrist {100 * apart['apart']:.1f} cm and "
-        f"{np.degrees(apart['twist']):.0f} "
-        "degrees from the trajectory's end. The trajectory determines the wrist; only the fingers "
-        "of the pose "
-        "count."
+        f"{np.degrees(apart['twist']):.0f} degrees from the trajectory's end. The trajectory "
+        f"determines the wrist; only the fingers of the pose count."
     )
+
+
+def _apart_from_affordance(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
+    """Distances in m from the trajectory's end to either region."""
+    end, _ = last_waypoint(goal)
+    return _apart_from_regions(surface, end)
 
 
 def _apart_from_regions(surface: Surface, end: Array) -> dict[str, Array]:
@@ -310,38 +331,50 @@ def _contradicts_affordance(apart: Mapping[str, Array]) -> Array:
 
 
 def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    """Message for an affordance and a trajectory that cannot both be met."""
     return (
         f"The trajectory ends {100 * apart['avoid']:.1f} cm from the avoid region, and "
         f"{100 * apart['graspable']:.1f} cm from the graspable region. Neither overrides the "
-        f"other: let it end "
-        "nearer to the graspable region, or remove one of the two."
+        f"other: let it end nearer to the graspable region, or remove one of the two."
     )
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    return {"turn": heading_turn(hand, goal["heading"], last_waypoint(goal)[1])}
+    """Angle (B,) in rad between the heading and that of the last waypoint."""
+    _, quaternion = last_waypoint(goal)
+    return {"turn": heading_turn(hand, goal["heading"], quaternion)}
+
+
+def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
+    """(B,) bool: the heading differs from that of the last waypoint."""
+    return apart["turn"] > TURNED
+
+
+def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
+    """Message for a heading that the trajectory overrides."""
+    return heading_message("trajectory", apart["turn"])
 
 
 Trajectory.relations = (
     Relation(
-        "pose",
-        "overridden",
-        _apart_from_pose,
-        lambda apart: (apart["apart"] > APART) | (apart["twist"] > TWISTED),
-        _pose_message,
+        weaker="pose",
+        settled="overridden",
+        measure=_apart_from_pose,
+        contradicts=_contradicts_pose,
+        message=_pose_message,
     ),
     Relation(
-        "affordance",
-        "refused",
-        lambda hand, surface, goal: _apart_from_regions(surface, last_waypoint(goal)[0]),
-        _contradicts_affordance,
-        _affordance_message,
+        weaker="affordance",
+        settled="refused",
+        measure=_apart_from_affordance,
+        contradicts=_contradicts_affordance,
+        message=_affordance_message,
     ),
     Relation(
-        "heading",
-        "overridden",
-        _apart_from_heading,
-        lambda apart: apart["turn"] > TURNED,
-        lambda hand, apart: heading_message("trajectory", apart["turn"]),
+        weaker="heading",
+        settled="overridden",
+        measure=_apart_from_heading,
+        contradicts=_contradicts_heading,
+        message=_heading_message,
     ),
 )

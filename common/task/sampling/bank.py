@@ -63,59 +63,8 @@ class ConstraintBank(NamedTuple):
     """(N,) bool: grasps of the policy in training may replace the object's references."""
     grasps: Array
     """(N, V) int, number of such grasps so far."""
-    own: Any = {}  # noqa: RUF012 - never changed
+    columns: Any = {}  # noqa: RUF012 - never changed
     """Columns (N, ...) of single constraints by name (`Constraint.columns`)."""
-
-
-_AXES = {
-    **{name: "VRH" for name in ("heading_index", "heading_back")},
-    **{name: "VH" for name in ("heading_position", "heading_direction", "heading_cross")},
-    **{f"pose_{name}": "VM" for name in ("q", "position", "quaternion")},
-    **{f"trajectory_{name}": "VM" for name in ("position", "quaternion")},
-    "rest": "R",
-    "has_affordance": "R",
-    "pose_valid": "VRM",
-}
-"""Leading axes of an object's arrays whose sizes may differ between objects."""
-
-
-SHARED = ConstraintBank._fields[:-1]
-"""Fields of the bank that do not belong to a single constraint."""
-
-
-def surface_of(task: TaskSettings, bank: ConstraintBank, objects: Array) -> Surface:
-    """Surfaces (B, P, ...) of the objects (B,), with normals if the task's policy observes them."""
-    normals = bank.normals[objects] if task.surface_normals else None
-    return Surface(bank.points[objects], bank.avoid[objects], normals)
-
-
-def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
-    """Splits a bank into objects, without the leading axis N and columns of single constraints."""
-    shared = bank[: len(SHARED)]
-    return [
-        ConstraintBank(*(np.asarray(field)[n] for field in shared)) for n in range(len(bank.points))
-    ]
-
-
-def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
-    """Stacks the rows of objects into a bank; resting poses, headings and references are repeated
-    up to the longest.
-    """
-    most = {
-        axis: max(getattr(row, name).shape[_AXES[name].index(axis)] for row in rows)
-        for axis, name in (("R", "rest"), ("H", "heading_position"), ("M", "pose_q"))
-    }
-
-    def repeated(name: str, value: np.ndarray) -> np.ndarray:
-        """Repeats the rows of an array along these axes up to the longest of any object."""
-        for place, axis in enumerate(_AXES.get(name, "")):
-            if axis in most:
-                value = np.take(value, np.resize(np.arange(value.shape[place]), most[axis]), place)
-        return value
-
-    return ConstraintBank(
-        **{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in SHARED}
-    )
 
 
 class Draw(NamedTuple):
@@ -137,15 +86,88 @@ class Draw(NamedTuple):
     friction: Array = 1.0
     """(B,) sliding friction between hand and object."""
     disturbance: Array | None = None
-    """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.pose`); None for no
-    errors.
+    """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.disturbance`); None
+    for no errors.
     """
 
-    def own(self, constraint: str) -> Any:
+    def columns(self, constraint: str) -> Any:
         """Columns (B, ...) of a constraint for the drawn objects (`Constraint.columns`)."""
-        return jax.tree.map(lambda column: column[self.objects], self.bank.own[constraint])
+        return jax.tree.map(lambda column: column[self.objects], self.bank.columns[constraint])
 
     @property
     def allowed(self) -> Array:
         """(B, M) bool: references that clear the table."""
         return self.bank.pose_valid[self.objects, self.region, self.rests]
+
+
+_LEADING_AXES = {
+    "rest": "R",
+    "heading_position": "VH",
+    "heading_direction": "VH",
+    "heading_cross": "VH",
+    "heading_index": "VRH",
+    "heading_back": "VRH",
+    "pose_q": "VM",
+    "pose_position": "VM",
+    "pose_quaternion": "VM",
+    "trajectory_position": "VM",
+    "trajectory_quaternion": "VM",
+    "pose_valid": "VRM",
+    "has_affordance": "R",
+}
+"""Leading axes of an object's arrays whose sizes may differ between objects."""
+_SIZED_BY = {"R": "rest", "H": "heading_position", "M": "pose_q"}
+"""Field of the bank that gives the size of an axis."""
+SHARED = ConstraintBank._fields[:-1]
+"""Fields of the bank that do not belong to a single constraint."""
+
+
+def surface_of(task: TaskSettings, bank: ConstraintBank, objects: Array) -> Surface:
+    """Surfaces (B, P, ...) of the objects (B,), with normals if the task's policy observes them."""
+    normals = bank.normals[objects] if task.surface_normals else None
+    return Surface(bank.points[objects], bank.avoid[objects], normals)
+
+
+def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
+    """Splits a bank into objects, without the leading axis N and columns of single constraints."""
+    shared = [np.asarray(field) for field in bank[: len(SHARED)]]
+    rows = []
+    for n in range(len(bank.points)):
+        rows.append(ConstraintBank(*[field[n] for field in shared]))
+    return rows
+
+
+def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
+    """Stacks the rows of objects into a bank; resting poses, headings and references are repeated
+    up to the longest.
+    """
+    lengths = {}
+    for axis, name in _SIZED_BY.items():
+        place = _LEADING_AXES[name].index(axis)
+        lengths[axis] = max(getattr(row, name).shape[place] for row in rows)
+    columns = {}
+    for name in SHARED:
+        axes = _LEADING_AXES.get(name, "")
+        columns[name] = np.stack([_repeated(getattr(row, name), axes, lengths) for row in rows])
+    return ConstraintBank(**columns)
+
+
+def _repeated(array: np.ndarray, axes: str, lengths: Mapping[str, int]) -> np.ndarray:
+    """Repeats the rows of an array along its leading `axes` up to the length of each axis."""
+    for place, axis in enumerate(axes):
+        if axis in lengths:
+            index = np.resize(np.arange(array.shape[place]), lengths[axis])
+            array = np.take(array, index, place)
+    return array
+
+
+def feasible_indices(feasible: np.ndarray) -> np.ndarray:
+    """Indices (V, R, H) of the true entries of masks (V, R, H), repeated to fill each row; zeros
+    without any.
+    """
+    index = np.zeros(feasible.shape, int)
+    for region, rest in np.ndindex(feasible.shape[:2]):
+        entries = np.flatnonzero(feasible[region, rest])
+        if len(entries):
+            index[region, rest] = np.resize(entries, feasible.shape[-1])
+    return index

@@ -22,6 +22,7 @@ from congrasp.common.task.geometry import squared_distances
 from congrasp.common.task.types import Array
 
 _STEPS = 40
+"""Steps of the fingers' range at which contact is tested."""
 
 
 class Poses(NamedTuple):
@@ -35,25 +36,39 @@ class Poses(NamedTuple):
     """(M, 4) wrist."""
 
 
-@functools.cache
-def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
-    """Finger indices of the joints (F,) and of the keypoints (P,; -1 for the palm), and the number
-    of fingers.
+class FingerGroups(NamedTuple):
+    """Fingers that close on their own; those moved by the same motor count as one."""
 
-    Fingers moved by the same motor count as one.
-    """
-    roots = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
-    owners = np.split(
-        transmission(hand).motor, np.cumsum([len(link.joints) for link in hand.links])[:-1]
-    )
+    of_joint: np.ndarray
+    """(F,) index of the group of each joint; -1 for none."""
+    of_keypoint: np.ndarray
+    """(P,) index of the group of each keypoint; -1 for the palm."""
+    number: int
+    """Number of groups."""
+
+
+@functools.cache
+def finger_groups(hand: Hand) -> FingerGroups:
+    """Returns the groups of a hand's fingers."""
+    # A finger is named by the first link of its chain; the palm has no name.
+    root_of_link = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
+    first_joints = np.cumsum([len(link.joints) for link in hand.links])[:-1]
+    motors_of_link = np.split(transmission(hand).motor, first_joints)
     for motor in range(len(hand.motors)):
-        first, *others = dict.fromkeys(
-            root for root, own in zip(roots, owners, strict=True) if motor in own
+        moved = dict.fromkeys(
+            root
+            for root, motors in zip(root_of_link, motors_of_link, strict=True)
+            if motor in motors
         )
-        roots = [first if root in others else root for root in roots]
-    names = [name for name in dict.fromkeys(roots) if name]
-    of_link = np.array([names.index(root) if root else -1 for root in roots])
-    return of_link[hand.joint_links], of_link[hand.keypoint_links], len(names)
+        first, *others = moved
+        root_of_link = [first if root in others else root for root in root_of_link]
+    names = [name for name in dict.fromkeys(root_of_link) if name]
+    group_of_link = np.array([names.index(root) if root else -1 for root in root_of_link])
+    return FingerGroups(
+        of_joint=group_of_link[hand.joint_links],
+        of_keypoint=group_of_link[hand.keypoint_links],
+        number=len(names),
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -76,7 +91,7 @@ def closed_poses(
       cross: (M, 3) direction of the cross-finger axis.
     """
     count = direction.shape[0]
-    joint_finger, point_finger, fingers = _fingers(hand)
+    groups = finger_groups(hand)
     radii = jnp.array(hand.keypoint_radii)
     goal = HeadingGoal(heading_position, direction, cross)
 
@@ -87,37 +102,36 @@ def closed_poses(
         position, quaternion = heading_wrist_pose(hand, goal, center)
 
         def clear(fraction: Array) -> Array:
-            """(M, fingers) bool: fingers at this fraction of their range do not penetrate the
+            """(M, groups) bool: fingers at this fraction of their range do not penetrate the
             object.
             """
             q = closure_pose(hand, fraction[None])
-            own = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
-            here = rotations.transform(
-                position, quaternion, jnp.broadcast_to(own, (count, *own.shape))
+            local = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+            keypoints = rotations.transform(
+                position, quaternion, jnp.broadcast_to(local, (count, *local.shape))
             )
-            nearest = jnp.argmin(
-                squared_distances(here, jnp.broadcast_to(points, (count, *points.shape))), -1
-            )
-            offset = here - points[nearest]
+            surface = jnp.broadcast_to(points, (count, *points.shape))
+            nearest = jnp.argmin(squared_distances(keypoints, surface), -1)
+            offset = keypoints - points[nearest]
             inside = jnp.sum(offset * normals[nearest], -1) < 0
             gap = jnp.where(inside, -1.0, jnp.linalg.norm(offset, axis=-1)) - radii
-            return jnp.stack(
-                [jnp.all(jnp.where(point_finger == k, gap, 1.0) > 0, -1) for k in range(fingers)],
-                -1,
-            )
+            clears = []
+            for group in range(groups.number):
+                gap_of_group = jnp.where(groups.of_keypoint == group, gap, 1.0)
+                clears.append(jnp.all(gap_of_group > 0, -1))
+            return jnp.stack(clears, -1)
 
         fractions = jnp.linspace(-1.0, 1.0, _STEPS)
         free = jax.lax.map(clear, fractions)
-        closed = jnp.sum(jnp.cumprod(free, 0), 0)  # steps before the first touch
-        fraction = fractions[jnp.clip(closed, 0, _STEPS - 1)][:, joint_finger]
-        return closure_pose(hand, fraction)
+        steps_before_touch = jnp.sum(jnp.cumprod(free, 0), 0)
+        fraction = fractions[jnp.clip(steps_before_touch, 0, _STEPS - 1)]
+        return closure_pose(hand, fraction[:, groups.of_joint])
 
     open_center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), (count, 3))
     q = close(open_center)
     # Closing moves the hand centre: realign the wrist with the heading position, and close again.
-    center = kinematics.hand_center(
-        hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
-    )
+    keypoints = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
+    center = kinematics.hand_center(hand, keypoints)
     q = close(center)
     position, quaternion = heading_wrist_pose(hand, goal, center)
     return Poses(q, position, quaternion)

@@ -14,6 +14,13 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.types import Array
 
+_REPLAY_DT = 0.0025
+"""Time step of the wrist's controller, s."""
+_REPLAY_SECONDS = 0.5
+"""Duration of the path, s."""
+_SETTLE_SECONDS = 0.25
+"""Time for the wrist to reach the end of the path, s."""
+
 
 class PathStyle(NamedTuple):
     """Ranges from which a trajectory is drawn uniformly."""
@@ -43,10 +50,6 @@ HUMAN = PathStyle(
 )
 """Paths as people reach. Captured ones come at 17 to 63 degrees to the heading of their grasp (5th
 to 95th percentile), from about 11 cm (`docs/notes/captures.md`)."""
-
-_REPLAY_DT = 0.0025
-_REPLAY_SECONDS = 0.5
-_SETTLE_SECONDS = 0.25
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints", "style"))
@@ -98,21 +101,26 @@ def make_trajectories(
     slides = (1 - s) * distance * outward + jnp.sin(jnp.pi * s) * amplitude * lateral
     reached = _replay(hand, jnp.concatenate([slides, (1 - s) * turn * axis], -1))
 
-    moved = jnp.linalg.norm(jnp.diff(reached[..., :3], axis=0), axis=-1)
-    length = jnp.concatenate([jnp.zeros((1, count)), jnp.cumsum(moved, 0)])
-    wanted = jnp.linspace(0.0, 1.0, waypoints)[:, None] * length[-1]
-    when = jax.vmap(jnp.interp, (1, 1, None), 1)(wanted, length, jnp.arange(float(steps)))
-    before = jnp.clip(when.astype(jnp.int32), 0, steps - 2)
-    share = (when - before)[..., None]
-    columns = jnp.arange(count)
-    # (K, M, 6)
-    joints = (1 - share) * reached[before, columns] + share * reached[before + 1, columns]
-    joints = jnp.swapaxes(joints, 0, 1)
+    joints = _resampled(reached, waypoints)
     turns = rotations.from_rotation_vector(joints[..., 3:])
-    return (
-        position[:, None] + joints[..., :3],
-        rotations.multiply(turns, jnp.broadcast_to(quaternion[:, None], turns.shape)),
+    last = jnp.broadcast_to(quaternion[:, None], turns.shape)
+    return position[:, None] + joints[..., :3], rotations.multiply(turns, last)
+
+
+def _resampled(motion: Array, waypoints: int) -> Array:
+    """Wrist joints (M, K, 6) at waypoints that are evenly spaced along motions (T, M, 6)."""
+    steps, count, _ = motion.shape
+    moved = jnp.linalg.norm(jnp.diff(motion[..., :3], axis=0), axis=-1)
+    length = jnp.concatenate([jnp.zeros((1, count)), jnp.cumsum(moved, 0)])
+    length_at_waypoint = jnp.linspace(0.0, 1.0, waypoints)[:, None] * length[-1]
+    step = jax.vmap(jnp.interp, (1, 1, None), 1)(
+        length_at_waypoint, length, jnp.arange(float(steps))
     )
+    before = jnp.clip(step.astype(jnp.int32), 0, steps - 2)
+    share = (step - before)[..., None]
+    columns = jnp.arange(count)
+    joints = (1 - share) * motion[before, columns] + share * motion[before + 1, columns]
+    return jnp.swapaxes(joints, 0, 1)
 
 
 def _replay(hand: Hand, target: Array) -> Array:
@@ -133,7 +141,9 @@ def _replay(hand: Hand, target: Array) -> Array:
         v = (v + _REPLAY_DT * force / weight) / (1 + _REPLAY_DT * kv / weight)
         return (x + _REPLAY_DT * v, v), x
 
-    return jax.lax.scan(step, (target[0], jnp.zeros_like(target[0])), target)[1]
+    start = target[0], jnp.zeros_like(target[0])
+    _, motion = jax.lax.scan(step, start, target)
+    return motion
 
 
 def _perpendicular(vector: Array, axis: Array) -> Array:

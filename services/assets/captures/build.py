@@ -20,16 +20,15 @@ from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import (
-    HEADINGS,
+from congrasp.common.task.sampling.headings import Headings
+from congrasp.common.task.sampling.object_headings import HEADINGS, headings_of
+from congrasp.common.task.sampling.sets import for_training, set_of
+from congrasp.common.task.sampling.table import (
     SOFT,
     above_table,
     clear_of_table,
-    headings_of,
     height_over_table,
 )
-from congrasp.common.task.sampling.headings import Headings
-from congrasp.common.task.sampling.sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
 from congrasp.services.assets.captures.references import (

@@ -19,7 +19,9 @@ from congrasp.common.hands.closure import outline
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.shapes import halves
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
+from congrasp.common.task.sampling.heading_sampler import HeadingOptions, sample_headings
+from congrasp.common.task.sampling.headings import max_width
+from congrasp.common.task.sampling.reach import within_reach
 from congrasp.services.assets.objects.mesh_files import (
     check_triangles,
     load_geometry,
@@ -257,7 +259,7 @@ def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
         obj,
         np.random.default_rng(0),
         use_affordance=use_affordance,
-        max_width=max_width(hand, HUMAN.object_scale),
+        options=HeadingOptions(max_width=max_width(hand, HUMAN.object_scale)),
     )
     if found is None:
         return np.zeros(len(obj.rest_poses), bool)

@@ -14,7 +14,7 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.task.sampling import build
+from congrasp.common.task.sampling import cache as bank_cache
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate import episodes as simulation
 from congrasp.services.evaluate import plan, references
@@ -36,7 +36,7 @@ def cache(tmp_path_factory):
     """Folder of the references: few attempts, in small batches; and of the bank."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(build, "LEAST_OBJECTS", 1)
+        patch.setattr(bank_cache, "LEAST_OBJECTS", 1)
         patch.setattr(references, "_ATTEMPTS", 2)
         patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=8)})
         yield

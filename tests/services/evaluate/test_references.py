@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands, reference_file
-from congrasp.common.task.sampling.build import POSES
 from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.sampling.object_headings import POSES
 from congrasp.services.evaluate import references
 from congrasp.services.evaluate.references import HELD_OUT
 from tests import task

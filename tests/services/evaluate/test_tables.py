@@ -17,7 +17,7 @@ from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task import sensing
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import set_bank
 from congrasp.services.evaluate import experiment as experiments
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import protocol
@@ -227,7 +227,7 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
 
 def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
     sets = constraint_sets
-    back = stored_sets.bank_of(sets)
+    back = set_bank.bank_of(sets)
     for name in (
         "points",
         "avoid",
@@ -251,7 +251,7 @@ def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
         np.testing.assert_array_equal(
             back.has_affordance[n, :rests], bank.has_affordance[n, :rests]
         )
-    held = stored_sets.bank_of(sets, "held-out")
-    training = stored_sets.bank_of(sets, "training")
+    held = set_bank.bank_of(sets, "held-out")
+    training = set_bank.bank_of(sets, "training")
     assert not np.any(held.pose_valid[:, 0, 0] & training.pose_valid[:, 0, 0])
     assert 0 < held.pose_valid[:, 0].any(1).mean() < training.pose_valid[:, 0].any(1).mean()

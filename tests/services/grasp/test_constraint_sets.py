@@ -10,9 +10,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import outline
 from congrasp.common.objects import store
-from congrasp.common.task.sampling import sets
-from congrasp.common.task.sampling import sets as stored_sets
-from congrasp.common.task.sampling.headings import Headings, within_reach
+from congrasp.common.task.sampling import set_file, sets
+from congrasp.common.task.sampling.headings import Headings
+from congrasp.common.task.sampling.reach import within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
 from congrasp.services.grasp.parse import read_request
@@ -24,7 +24,7 @@ BOX, _, MUG, _ = OBJECTS
 @pytest.fixture(scope="module")
 def file(constraint_sets, tmp_path_factory):
     """Constraint set of the mug."""
-    return sets.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
+    return set_file.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
 
 
 def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
@@ -69,7 +69,7 @@ def test_a_set_equals_the_bank_of_training(constraint_sets):
 
 
 def test_files_round_trip(constraint_sets, file):
-    read = stored_sets.load(file)
+    read = set_file.load(file)
     assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(
         constraint_sets[2].meta
     )
@@ -121,7 +121,7 @@ def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file
     ):
         read_request(BOX, HAND, 15, trajectory=str(file))
     larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})
-    file = sets.save(larger, tmp_path)
+    file = set_file.save(larger, tmp_path)
     with pytest.raises(
         CongraspError,
         match=r"human hand is trained on objects 1\.4 times as large: add --scale 1\.4",

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from congrasp.common.task.sampling.sets import load as load_set
+from congrasp.common.task.sampling.set_file import load as load_set
 from congrasp.services.assets.captures.build import Report
 from congrasp.services.cli.main import load
 

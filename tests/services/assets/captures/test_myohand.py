@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.objects.store import Catalogue
-from congrasp.common.task.sampling.sets import bank_of, load_for
+from congrasp.common.task.sampling.set_bank import bank_of
+from congrasp.common.task.sampling.set_file import load_for
 from congrasp.services.assets.captures.myohand import wrist_pose
 from tests.services.assets.captures import known
 

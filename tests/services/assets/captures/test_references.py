@@ -21,8 +21,9 @@ from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task.plausibility import hand_hand
-from congrasp.common.task.sampling.build import HEADINGS
-from congrasp.common.task.sampling.sets import bank_of, describe
+from congrasp.common.task.sampling.object_headings import HEADINGS
+from congrasp.common.task.sampling.set_bank import bank_of
+from congrasp.common.task.sampling.set_description import describe
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.build import Report, _from_below, _resting_poses
 from congrasp.services.assets.captures.extract import LATER, Surface, _before_carried, _opposed

@@ -1,4 +1,4 @@
-"""Constraint banks that are kept on disk."""
+"""Cache of constraint banks."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ import pytest
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task.config import RewardWeights, TaskConfig
-from congrasp.common.task.sampling import build as kept_banks
+from congrasp.common.task.sampling import cache
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
-from congrasp.common.task.sampling.build import kept_bank
+from congrasp.common.task.sampling.cache import cached_bank
 
 HAND = get_hand("human")
 TASK = TaskConfig()
@@ -19,13 +19,13 @@ OBJECTS = [procedural.generate(seed, "box") for seed in range(2)]
 
 
 @pytest.fixture(autouse=True)
-def _small_pools_in_a_cache_of_their_own(tmp_path, monkeypatch):
+def _cache_of_small_pools(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(kept_banks, "LEAST_OBJECTS", 2)
+    monkeypatch.setattr(cache, "LEAST_OBJECTS", 2)
 
 
 class Builder:
-    """Makes banks of random numbers, and counts how often it was asked."""
+    """Makes banks of random numbers, and counts its calls."""
 
     def __init__(self):
         self.built = 0
@@ -38,10 +38,10 @@ class Builder:
         return ConstraintBank(**fields)
 
 
-def test_a_bank_is_built_once_and_found_again_as_it_was():
+def test_bank_is_built_once():
     build = Builder()
-    first = kept_bank(HAND, TASK, OBJECTS, 0, build)
-    again = kept_bank(HAND, TASK, OBJECTS, 0, build)
+    first = cached_bank(HAND, TASK, OBJECTS, 0, build)
+    again = cached_bank(HAND, TASK, OBJECTS, 0, build)
     assert build.built == 1
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         assert isinstance(b, jax.Array) and a.dtype == b.dtype
@@ -59,17 +59,17 @@ def test_a_bank_is_built_once_and_found_again_as_it_was():
     ],
     ids=["seed", "objects", "headings", "waypoints", "hand"],
 )
-def test_whatever_a_bank_depends_on_makes_another(hand, task, objects, seed):
+def test_other_arguments_build_another_bank(hand, task, objects, seed):
     build = Builder()
-    kept_bank(HAND, TASK, OBJECTS, 0, build)
-    kept_bank(hand, task, objects, seed, build)
+    cached_bank(HAND, TASK, OBJECTS, 0, build)
+    cached_bank(hand, task, objects, seed, build)
     assert build.built == 2
 
 
-def test_what_no_bank_depends_on_does_not():
+def test_irrelevant_settings_reuse_a_bank():
     build = Builder()
-    kept_bank(HAND, TASK, OBJECTS, 0, build)
-    kept_bank(
+    cached_bank(HAND, TASK, OBJECTS, 0, build)
+    cached_bank(
         HAND,
         dataclasses.replace(TASK, reward=RewardWeights(force=7.0), p_pose=0.1),
         OBJECTS,
@@ -79,22 +79,22 @@ def test_what_no_bank_depends_on_does_not():
     assert build.built == 1
 
 
-def test_a_damaged_file_is_made_anew(tmp_path):
+def test_damaged_file_is_rebuilt(tmp_path):
     build = Builder()
-    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    cached_bank(HAND, TASK, OBJECTS, 0, build)
     (file,) = (tmp_path / "congrasp" / "banks").iterdir()
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(data)
-    kept_bank(HAND, TASK, OBJECTS, 0, build)
-    kept_bank(HAND, TASK, OBJECTS, 0, build)
+    cached_bank(HAND, TASK, OBJECTS, 0, build)
+    cached_bank(HAND, TASK, OBJECTS, 0, build)
     assert build.built == 2
 
 
-def test_only_the_banks_used_last_are_kept(tmp_path):
+def test_cache_keeps_the_last_used_banks(tmp_path):
     build = Builder()
-    for seed in range(kept_banks.MOST_FILES + 2):
-        kept_bank(HAND, TASK, OBJECTS, seed, build)
-    assert len(list((tmp_path / "congrasp" / "banks").iterdir())) == kept_banks.MOST_FILES
-    kept_bank(HAND, TASK, OBJECTS, kept_banks.MOST_FILES + 1, build)
-    assert build.built == kept_banks.MOST_FILES + 2
+    for seed in range(cache.MOST_FILES + 2):
+        cached_bank(HAND, TASK, OBJECTS, seed, build)
+    assert len(list((tmp_path / "congrasp" / "banks").iterdir())) == cache.MOST_FILES
+    cached_bank(HAND, TASK, OBJECTS, cache.MOST_FILES + 1, build)
+    assert build.built == cache.MOST_FILES + 2

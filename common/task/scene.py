@@ -1,0 +1,31 @@
+"""One control step of B environments, as input of observation, reward and errors."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.grip import ObjectLoad
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Features, Goal, SceneState, Surface
+
+
+class Scene(NamedTuple):
+    """State, derived geometry and goal of a control step, with the hand and the task."""
+
+    hand: Hand
+    task: TaskSettings
+    state: SceneState
+    features: Features
+    goal: Goal
+    readings: Readings | None = None
+    """Last control steps, if the policy observes them."""
+    cloud: Surface | None = None
+    """Cloud of the camera, world frame, if the policy has one."""
+    load: ObjectLoad | None = None
+    """Weight and friction of the objects, for the reward; None where they are not recorded."""
+
+    def gate(self, block: str) -> Array:
+        """(B,) 1 if a block is active, else 0."""
+        return self.goal.active[block].astype(jnp.float32)
