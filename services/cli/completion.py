@@ -13,13 +13,16 @@ Shell = Literal["bash", "zsh", "fish"]
 def completion(shell: Annotated[Shell, tyro.conf.Positional]) -> int:
     """Print the script with which a shell completes the commands and options of congrasp.
 
+    Write it to a file that the shell reads: ~/.local/share/bash-completion/completions/congrasp,
+    ~/.zfunc/_congrasp or ~/.config/fish/completions/congrasp.fish.
+
     Args:
       shell: The shell.
 
     Examples:
-      congrasp completion bash > ~/.local/share/bash-completion/completions/congrasp
-      congrasp completion zsh > ~/.zfunc/_congrasp
-      congrasp completion fish > ~/.config/fish/completions/congrasp.fish
+      congrasp completion bash
+      congrasp completion zsh
+      congrasp completion fish
     """
     print(script(shell))
     return 0

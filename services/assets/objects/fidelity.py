@@ -80,7 +80,7 @@ class _Surface(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """What triangles enclose."""
+    """Volume enclosed by triangles."""
 
     volume: float
     """m^3, the mean of three axes."""
