@@ -84,7 +84,7 @@ def import_meshes(
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
     from congrasp.services.assets.objects.meshes import import_sources
-    from congrasp.services.assets.objects.named import distinct, find_sources
+    from congrasp.services.assets.objects.sources import distinct, find_sources
 
     if not paths:
         raise CongraspError("There is nothing to import.", "Pass mesh files or folders.")

@@ -22,9 +22,9 @@ from congrasp.common.task.sampling.headings import INWARD, Headings
 from congrasp.common.task.sampling.reach import within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.mesh_files import read_mesh
-from congrasp.services.assets.objects.meshes import Source
 from congrasp.services.assets.objects.options import length, size_in_words
 from congrasp.services.assets.objects.repair import with_few_faces
+from congrasp.services.assets.objects.sources import Source
 from congrasp.services.record.palette import HEADING, OBJECT, PIECES, WAYPOINT, region_colours
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import (

@@ -20,7 +20,8 @@ from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.objects.decompose import decompose, simplify
+from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.hulls import simplify
 from congrasp.services.export.motion_file import GraspMotion, pick_motion
 from congrasp.services.record.episode import grasp_span
 from tests.benchmarks.dexgraspbench_hands import Match, benchmarked, match_hand

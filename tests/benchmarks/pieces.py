@@ -17,8 +17,10 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.objects.decompose import merge, simplify
-from congrasp.services.assets.objects.fidelity import enclosed, fidelity
+from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.hulls import simplify
+from congrasp.services.assets.objects.interior import enclosed
+from congrasp.services.assets.objects.merging import merge
 from congrasp.services.assets.objects.named import objects_of
 
 _CLOSING = 100

@@ -31,16 +31,17 @@ def quick_imports() -> Iterator[None]:
 
     Decomposition, errors and halves that a hand can hold take most of an import's time.
     """
-    from congrasp.services.assets.objects import decompose, meshes
+    from congrasp.services.assets.objects import assembly, collision
+    from congrasp.services.assets.objects.decompose import Decomposition
     from congrasp.services.assets.objects.fidelity import Fidelity
 
-    def hull(vertices: np.ndarray, faces: np.ndarray, **options: object) -> decompose.Decomposition:
-        return decompose.Decomposition([np.asarray(vertices)], "hull", [])
+    def hull(vertices: np.ndarray, faces: np.ndarray, **options: object) -> Decomposition:
+        return Decomposition([np.asarray(vertices)], "hull", [])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decompose, "decompose", hull)
-        patch.setattr(decompose, "fidelity", lambda *_: Fidelity(0.0, 0.0))
-        patch.setattr(meshes, "cut_to_hold", lambda obj: obj)
+        patch.setattr(collision, "decompose", hull)
+        patch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
+        patch.setattr(assembly, "cut_to_hold", lambda obj: obj)
         yield
 
 

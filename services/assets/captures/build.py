@@ -40,9 +40,10 @@ from congrasp.services.assets.captures.references import (
 )
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
-from congrasp.services.assets.objects.meshes import UNLABELLED, Source, import_sources
-from congrasp.services.assets.objects.named import find_sources
+from congrasp.services.assets.objects.assembly import UNLABELLED
+from congrasp.services.assets.objects.meshes import import_sources
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import Source, find_sources
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]

@@ -18,7 +18,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
-from congrasp.services.assets.objects.mesh_files import SUFFIXES
+from congrasp.services.assets.objects.file_kinds import SUFFIXES
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 

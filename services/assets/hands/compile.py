@@ -21,7 +21,8 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.confined import call_confined
-from congrasp.services.assets.objects.mesh_files import SUFFIXES, load_geometry
+from congrasp.services.assets.objects.file_kinds import SUFFIXES
+from congrasp.services.assets.objects.mesh_files import load_geometry
 
 MEMORY = 3 << 30
 """Limit of the address space for reading a file, bytes."""

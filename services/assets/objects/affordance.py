@@ -1,13 +1,13 @@
 """New partitions of an object into graspable region and avoid region.
 
-They come from a mesh of one part, painted vertices, a half-space, touched points, or cuts into
-halves that a hand can hold. They relabel the object's surface points and pieces; nothing else about
-the object changes.
+They are derived from a mesh of one part, painted vertices, a half-space, touched points, or cuts
+into halves that a hand can hold. They relabel the object's surface points and pieces; nothing else
+about the object changes.
 """
 
 import dataclasses
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,16 +30,17 @@ from congrasp.services.assets.objects.mesh_files import (
 )
 
 LEAST_SHARE = 0.10
-"""Least share of the surface that the graspable region must have (paper, section Constraint
-Setup).
-"""
-_ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
-_SAME_BOX = (
-    0.1  # tolerance of the bounding box of a painted file, as a share of the object's length
-)
-_COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
-
-
+"""Share of the surface that the graspable region must have (paper, section Constraint Setup)."""
+_PART_DISTANCE = 0.003
+"""Distance from a part's mesh up to which a surface point belongs to the part, m."""
+_PART_SAMPLES = 8000
+"""Points on a part's mesh."""
+_BOX_TOLERANCE = 0.1
+"""Tolerance of the bounding box of a painted file, as a share of the object's length."""
+_COLOUR_TOLERANCE = 60
+"""Largest distance of two colours in RGB that count as one."""
+_LISTED_COLOURS = 5
+"""Colours that a message lists."""
 _CUTS = (0.5, 0.65, 0.35, 0.8, 0.2)
 """Shares of the surface points on the near side of a cut, in the order in which they are tried."""
 UNCOVERED = "none of its halves can be held without the other: it has no affordance"
@@ -52,7 +53,7 @@ def relabelled(
     graspable: Sequence[bool],
     name: str = "",
 ) -> GraspObject:
-    """The object with other parts.
+    """Returns the object with other parts.
 
     Args:
       obj: the object.
@@ -85,30 +86,37 @@ def relabelled(
 def with_labels(
     pieces: Sequence[Piece], points: np.ndarray, labels: np.ndarray
 ) -> tuple[Piece, ...]:
-    """The pieces with the part that most of their vertices are nearest to, by labels (N,) of points
-    (N, 3).
+    """Returns the pieces with the part that most of their vertices are nearest to.
+
+    Args:
+      pieces: convex pieces.
+      points: (N, 3) surface points, in the same frame.
+      labels: (N,) part of each point.
     """
-    near = cKDTree(points)
-    corners = (np.zeros((1, 3)) if piece.vertices is None else piece.vertices for piece in pieces)
-    votes = (
-        labels[near.query(own + piece.pos)[1]] for piece, own in zip(pieces, corners, strict=True)
-    )
-    return tuple(
-        dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
-        for piece, vote in zip(pieces, votes, strict=True)
-    )
+    tree = cKDTree(points)
+    labelled = []
+    for piece in pieces:
+        corners = np.zeros((1, 3)) if piece.vertices is None else piece.vertices
+        votes = labels[tree.query(corners + piece.pos)[1]]
+        labelled.append(dataclasses.replace(piece, part=int(np.bincount(votes).argmax())))
+    return tuple(labelled)
 
 
 def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspObject:
-    """The object with the surface points `graspable` (512,) bool as graspable region, the others as
-    avoid region.
+    """Returns the object with two parts, a graspable region and an avoid region.
+
+    Args:
+      obj: the object.
+      graspable: (512,) bool, its surface points of the graspable region.
+      name: name of the new object; unchanged if empty.
     """
     return relabelled(obj, np.where(graspable, 0, 1), ("grasp", "avoid"), (True, False), name)
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
-    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame; `normal`
-    has any length.
+    """Returns (512,) bool: surface points x with normal . x >= offset (m), in the object frame.
+
+    The normal is scaled to length 1.
 
     Raises:
       CongraspError: the normal is zero or not finite, or the offset is larger than the object.
@@ -130,7 +138,7 @@ def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> n
 
 
 def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
-    """(512,) distances of the surface points from a part, m.
+    """Returns distances (512,) of the surface points from a part, m.
 
     Args:
       obj: an imported object.
@@ -142,37 +150,38 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     """
     geometry: Any = load_geometry(path, "Export the part as PLY.")
     up = "y" if obj.file_up == "y" else up_of(geometry)
-    geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
+    if isinstance(geometry, trimesh.Scene):
+        geometry = geometry.to_geometry()
     points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
     if len(getattr(geometry, "faces", ())):
         check_triangles(path, geometry)
-    if len(getattr(geometry, "faces", ())) and geometry.area > 0:
-        points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
+        if geometry.area > 0:
+            samples = trimesh.sample.sample_surface(geometry, _PART_SAMPLES, seed=0)[0]
+            points = np.concatenate([points, samples])
     points = upright(points[np.isfinite(points).all(-1)], up)
     if not len(points):
         raise CongraspError(f"{path} holds no points.", "Export the part as PLY.")
-    return np.asarray(
-        cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0]
-    )
+    in_object_frame = points * obj.file_scale + np.asarray(obj.origin)
+    return np.asarray(cKDTree(in_object_frame).query(obj.points)[0])
 
 
 def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
-    """(512,) bool: surface points that lie on a part (`from_part`).
+    """Returns (512,) bool: surface points that lie on a part (`from_part`).
 
     Raises:
       CongraspError: the file cannot be read, or the part lies elsewhere.
     """
     distance = from_part(obj, path)
-    if distance.min() > _ON_PART:
+    if distance.min() > _PART_DISTANCE:
         raise CongraspError(
             f"{path} lies {100 * distance.min():.1f} cm from the surface of '{obj.name}'.",
             "The part must be in the frame and unit of the object's own file.",
         )
-    return distance <= _ON_PART
+    return distance <= _PART_DISTANCE
 
 
 def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) -> np.ndarray:
-    """(512,) bool: surface points whose nearest vertex in a coloured PLY file has a colour.
+    """Returns (512,) bool: surface points whose nearest vertex in a file has a colour.
 
     Args:
       obj: an imported object.
@@ -186,45 +195,61 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     """
     mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
-    colours = (
-        getattr(visual, "vertex_colors", ()) if getattr(visual, "kind", None) == "vertex" else ()
-    )
+    colours = ()
+    if getattr(visual, "kind", None) == "vertex":
+        colours = getattr(visual, "vertex_colors", ())
     if not len(colours):
         raise CongraspError(
             f"{path} has no coloured vertices.", "Paint them and export as PLY with colours."
         )
     vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)
-    vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
+    vertices = vertices[finite]
+    rgb = np.asarray(colours)[finite, :3].astype(int)
     _check_box(obj, path, vertices)
-    same = np.linalg.norm(rgb - np.array(colour), axis=-1) <= _COLOUR_TOLERANCE
-    if not same.any():
-        seen = ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in _commonest(rgb))
-        given = "#{:02x}{:02x}{:02x}".format(*colour)
+    has_colour = np.linalg.norm(rgb - np.array(colour), axis=-1) <= _COLOUR_TOLERANCE
+    if not has_colour.any():
+        present = ", ".join(_hexadecimal(row) for row in _commonest(rgb))
         raise CongraspError(
-            f"No vertex of {path} has the colour {given}.", f"Its colours are {seen}."
+            f"No vertex of {path} has the colour {_hexadecimal(colour)}.",
+            f"Its colours are {present}.",
         )
-    return same[cKDTree(vertices).query(obj.points)[1]]
+    return has_colour[cKDTree(vertices).query(obj.points)[1]]
+
+
+def _hexadecimal(colour: Iterable[int]) -> str:
+    """Formats red, green and blue, 0 to 255, as #rrggbb."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> None:
-    """Raises a CongraspError if the bounding box of vertices (n, 3), m, object frame, is not that
-    of the object.
+    """Raises a CongraspError if vertices (n, 3), m, object frame, have another box than the object.
+
+    Args:
+      obj: the object.
+      path: file of the vertices.
+      vertices: those of finite numbers.
     """
     if not len(vertices):
         raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
-    own, other = (np.stack([x.min(0), x.max(0)]) for x in (obj.visual_vertices, vertices))
-    off = float(np.abs(own - other).max())
-    if off > _SAME_BOX * np.ptp(own, axis=0).max():
+    box = np.stack([vertices.min(0), vertices.max(0)])
+    object_box = np.stack([obj.visual_vertices.min(0), obj.visual_vertices.max(0)])
+    deviation = float(np.abs(object_box - box).max())
+    if deviation > _BOX_TOLERANCE * np.ptp(object_box, axis=0).max():
         raise CongraspError(
-            f"{path} does not show '{obj.name}': its bounding box is off by {100 * off:.3g} cm.",
+            f"{path} does not show '{obj.name}': its bounding box is off by "
+            f"{100 * deviation:.3g} cm.",
             "It must be in the frame and unit of the object's own file.",
         )
 
 
 def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarray:
-    """(512,) bool: surface points within `radius` (m) of any of the points (n, 3) of the object
-    frame.
+    """Returns (512,) bool: surface points near any of some points.
+
+    Args:
+      obj: the object.
+      points: (n, 3) in the object frame, m.
+      radius: m.
     """
     if len(points) == 0:
         return np.zeros(len(obj.points), bool)
@@ -232,39 +257,46 @@ def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarr
 
 
 def cut_to_hold(obj: GraspObject) -> GraspObject:
-    """An object of two halves with the first partition that is covered in all resting poses, or in
-    the most.
+    """Returns the object with the first partition that is covered in the most resting poses.
 
-    Its current halves come first, then their exchange, then cuts across the longest axis that make
-    the graspable half larger or smaller. If no half can be held in any resting pose, a note is
+    Its current halves are tried first, then their exchange, then cuts across the longest axis that
+    make the graspable half larger or smaller. If no half can be held in any resting pose, a note is
     added.
     """
-    most = int(covered(obj, use_affordance=False).sum())
-    best, score = obj, -1
+    coverable = int(covered(obj, use_affordance=False).sum())
+    best = obj
+    best_covered = -1
     for candidate in _cuts(obj):
-        found = int(covered(candidate).sum())
-        if found > score:
-            best, score = candidate, found
-        if score >= most:
+        candidate_covered = int(covered(candidate).sum())
+        if candidate_covered > best_covered:
+            best = candidate
+            best_covered = candidate_covered
+        if best_covered >= coverable:
             break
-    return best if score > 0 else dataclasses.replace(best, notes=(*best.notes, UNCOVERED))
+    if best_covered > 0:
+        return best
+    return dataclasses.replace(best, notes=(*best.notes, UNCOVERED))
 
 
 def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
-    """(R,) bool, resting poses in which the human hand has a heading on the graspable region, or
-    the whole surface.
+    """Returns (R,) bool: resting poses in which the human hand has a heading.
+
+    Args:
+      obj: the object.
+      use_affordance: True for headings on the graspable region, False for the whole surface.
     """
     hand = outline(HUMAN)
-    found = sample_headings(
+    headings = sample_headings(
         obj,
         np.random.default_rng(0),
         use_affordance=use_affordance,
         options=HeadingOptions(max_width=max_width(hand, HUMAN.object_scale)),
     )
-    if found is None:
+    if headings is None:
         return np.zeros(len(obj.rest_poses), bool)
     avoid = obj.non_graspable_points if use_affordance else None
-    return np.asarray(within_reach(found, obj, obj.rest_poses, hand, avoid)[1].any(-1))
+    is_reachable = within_reach(headings, obj, obj.rest_poses, hand, avoid)[1]
+    return np.asarray(is_reachable.any(-1))
 
 
 def _cuts(obj: GraspObject) -> Iterator[GraspObject]:
@@ -274,11 +306,12 @@ def _cuts(obj: GraspObject) -> Iterator[GraspObject]:
     for cut in _CUTS:
         labels = halves(obj.points, cut)
         for half in (first, 1 - first):
-            if cut != 0.5 or half != first:
+            is_current = cut == 0.5 and half == first
+            if not is_current:
                 yield relabelled(obj, labels, obj.part_names, [half == 0, half == 1])
 
 
 def _commonest(rgb: np.ndarray) -> np.ndarray:
-    """The five most frequent colours (n, 3) among rows (N, 3)."""
+    """The most frequent colours (n, 3) among rows (N, 3)."""
     colours, counts = np.unique(rgb, axis=0, return_counts=True)
-    return colours[np.argsort(-counts)[:5]]
+    return colours[np.argsort(-counts)[:_LISTED_COLOURS]]

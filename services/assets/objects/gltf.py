@@ -1,11 +1,11 @@
-"""GLB files as trimesh reads them: triangles alone, positions and texture coordinates as floats, in
-bounded memory.
+"""GLB files, prepared for trimesh: triangles alone, and numbers as floats, in bounded memory.
 
 A glTF file with embedded buffers becomes GLB.
 """
 
 import base64
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,19 @@ MAX_FACES = 20_000_000
 """Triangles of a mesh file, those of a GLB file counted wherever the scene shows them."""
 MAX_NODES = 10_000
 """Nodes, meshes and accessors of a GLB file, each."""
+_MAX_MEMORY_RATIO = 16
+"""Bytes of the accessors' numbers relative to those of the file."""
+_MAX_UNSHARED_BYTES = 1 << 20
+"""Bytes of the accessors' numbers that any file may have."""
+_HEADER_BYTES = 20
+"""Bytes of a GLB file before its JSON: the file's header, and that of the first chunk."""
+_CHUNK_HEADER_BYTES = 8
+_FLOAT = 5126
+"""glTF's code of float32."""
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Numbers of each type of glTF."""
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""NumPy's types by glTF's codes."""
 _COMPRESSED = {
     "KHR_draco_mesh_compression": "is compressed with Draco",
     "EXT_meshopt_compression": "is compressed with meshopt (gltfpack -c)",
@@ -33,17 +44,22 @@ _LOOKS = (
     "KHR_animation_",
 )
 """Beginnings of glTF extensions that change no geometry."""
-_TRIANGLES = (4, 5)  # glTF's modes of primitives: triangles and strips of them
+_TRIANGLE_MODES = (4, 5)
+"""glTF's modes of primitives: triangles and strips of them."""
+_TREE = dict[str, Any]
+"""JSON of a scene, or of one of its parts."""
 
 
 def packed(data: bytes) -> bytes:
-    """The GLB file of a glTF scene in one file, whose buffers are embedded as data URIs.
+    """Returns the GLB file of a glTF scene in one file, whose buffers are data URIs.
 
     Raises:
       CongraspError: its buffers are other files; a predicate without a subject.
       ValueError: an embedded buffer is damaged.
     """
-    tree, binary, starts = json.loads(data), bytearray(), list[int]()
+    tree = json.loads(data)
+    binary = bytearray()
+    starts: list[int] = []
     for buffer in _list(tree, "buffers"):
         head, mark, text = str(buffer.get("uri")).partition(";base64,")
         if not (mark and head.startswith("data:")):
@@ -59,92 +75,68 @@ def packed(data: bytes) -> bytes:
     return _glb({**tree, "buffers": [{"byteLength": len(binary)}]}, bytes(binary))
 
 
-def _glb(tree: dict[str, Any], binary: bytes) -> bytes:
-    """A GLB file of a scene and its numbers."""
-    text = json.dumps(tree).encode()
-    chunks = (
-        (text + b" " * (-len(text) % 4), b"JSON"),
-        (binary + bytes(-len(binary) % 4), b"BIN\0"),
-    )
-    body = b"".join(len(chunk).to_bytes(4, "little") + name + chunk for chunk, name in chunks)
-    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
-
-
 def plain_glb(data: bytes, notes: list[str]) -> bytes:
-    """A GLB file of triangles alone, whose positions and texture coordinates are floats.
+    """Returns a GLB file of triangles alone, whose positions and texture coordinates are floats.
+
+    Args:
+      data: content of the file.
+      notes: the number of primitives without triangles is appended.
 
     Raises:
       CongraspError: it needs an extension that changes geometry, such as a compression; a predicate
         without a subject.
       ValueError: its parts do not fit its size.
     """
-    length = int.from_bytes(data[12:16], "little")
-    if len(data) < 20 or length > len(data):
-        raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
-    tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
+    tree, binary = _tree_and_binary(data)
     _check_extensions(tree)
-    for part in (views := _list(tree, "bufferViews")):
-        _check_counts(part, 1 << 32)  # by the format
-    ends = [
-        x.get("byteOffset", 0) + x.get("byteLength", 0) for x in views if not x.get("buffer", 0)
-    ]
-    if max(ends, default=0) > len(binary) and not any(
-        "uri" in buffer for buffer in _list(tree, "buffers")[:1]
-    ):
-        raise ValueError(f"it was cut: it has {len(binary)} of {max(ends)} bytes of numbers")
-    if not _list(tree, "scenes"):  # which the format allows; viewers show every node then
-        inner = {child for node in _list(tree, "nodes") for child in node.get("children", ())}
-        tree["scenes"] = [{"nodes": sorted(set(range(len(_list(tree, "nodes")))) - inner)}]
-        tree["scene"] = 0
+    _check_size(tree, len(binary))
+    _ensure_scene(tree)
     _keep_triangles(tree, notes)
-    _check_scene(tree, len(data))
-    accessors = _list(tree, "accessors")
-    used = {
-        index
-        for mesh in _list(tree, "meshes")
-        for piece in _list(mesh, "primitives")
-        for name, index in piece["attributes"].items()
-        if name == "POSITION" or name.startswith("TEXCOORD")
-    }
-    for index in sorted(used):
-        part = accessors[index]
-        if part["componentType"] == 5126 and "sparse" not in part:
-            continue
-        values = _floats(tree, part, binary)
-        binary += bytes(-len(binary) % 4)
-        tree["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes}
-        )
-        binary += values.tobytes()
-        view = len(tree["bufferViews"]) - 1
-        accessors[index] = {
-            "bufferView": view,
-            "componentType": 5126,
-            "count": len(values),
-            "type": part["type"],
-        }
+    _check_accessors(tree, len(data))
+    _check_scene(tree)
+    for index in sorted(_used_accessors(tree)):
+        accessor = _list(tree, "accessors")[index]
+        if accessor["componentType"] != _FLOAT or "sparse" in accessor:
+            _replace_by_floats(tree, index, binary)
     return _glb(tree, bytes(binary))
 
 
-def _check_extensions(tree: dict[str, Any]) -> None:
-    """Raises a CongraspError for a required extension that changes geometry, and for positions that
-    only one has.
+def _glb(tree: _TREE, binary: bytes) -> bytes:
+    """A GLB file of a scene and its numbers."""
+    text = json.dumps(tree).encode()
+    json_chunk = text + b" " * (-len(text) % 4)
+    binary_chunk = binary + bytes(-len(binary) % 4)
+    body = b""
+    for name, chunk in ((b"JSON", json_chunk), (b"BIN\0", binary_chunk)):
+        body += len(chunk).to_bytes(4, "little") + name + chunk
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
+
+
+def _tree_and_binary(data: bytes) -> tuple[_TREE, bytearray]:
+    """The scene of a GLB file, and its numbers."""
+    length = int.from_bytes(data[12:16], "little")
+    if len(data) < _HEADER_BYTES or length > len(data):
+        raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
+    end = _HEADER_BYTES + length
+    return json.loads(data[_HEADER_BYTES:end]), bytearray(data[end + _CHUNK_HEADER_BYTES :])
+
+
+def _check_extensions(tree: _TREE) -> None:
+    """Raises a CongraspError for an extension that changes geometry.
+
+    That is a required one, one of a buffer, or one that alone has a primitive's positions.
     """
-    views = [name for view in _list(tree, "bufferViews") for name in view.get("extensions", {})]
-    pieces = [
-        piece
-        for mesh in _list(tree, "meshes")
-        for piece in _list(mesh, "primitives")
-        if "attributes" in piece
-    ]
-    empty = {
-        i
-        for i, part in enumerate(_list(tree, "accessors"))
-        if not {"bufferView", "sparse"} & part.keys()
-    }
-    unread = [piece for piece in pieces if piece["attributes"].get("POSITION") in empty]
-    bare = [name for piece in unread for name in piece.get("extensions", {})]
-    for name in (*tree.get("extensionsRequired", []), *views, *bare):
+    names = list(tree.get("extensionsRequired", []))
+    for view in _list(tree, "bufferViews"):
+        names += view.get("extensions", {})
+    empty = set()
+    for index, accessor in enumerate(_list(tree, "accessors")):
+        if not {"bufferView", "sparse"} & accessor.keys():
+            empty.add(index)
+    for primitive in _primitives(tree):
+        if "attributes" in primitive and primitive["attributes"].get("POSITION") in empty:
+            names += primitive.get("extensions", {})
+    for name in names:
         if name in _COMPRESSED:
             raise CongraspError(f"{_COMPRESSED[name]}.", "Export it without compression.")
         if name != "KHR_mesh_quantization" and not str(name).startswith(_LOOKS):
@@ -153,101 +145,187 @@ def _check_extensions(tree: dict[str, Any]) -> None:
             )
 
 
-def _keep_triangles(tree: dict[str, Any], notes: list[str]) -> None:
-    """Removes primitives of lines, points or nothing from the meshes."""
-    left_out = 0
-    for mesh in _list(tree, "meshes"):
-        pieces = _list(mesh, "primitives")
-        mesh["primitives"] = [
-            piece
-            for piece in pieces
-            if "POSITION" in piece.get("attributes", {}) and piece.get("mode", 4) in _TRIANGLES
-        ]
-        left_out += len(pieces) - len(mesh["primitives"])
-    if left_out:
-        notes.append(f"{left_out} of its primitives without triangles or positions were left out")
+def _check_size(tree: _TREE, size: int) -> None:
+    """Raises a ValueError if the buffer views end beyond the binary numbers of `size` bytes."""
+    end = 0
+    for view in _list(tree, "bufferViews"):
+        _check_counts(view, 1 << 32)  # by the format
+        if not view.get("buffer", 0):
+            end = max(end, view.get("byteOffset", 0) + view.get("byteLength", 0))
+    is_in_file = not any("uri" in buffer for buffer in _list(tree, "buffers")[:1])
+    if end > size and is_in_file:
+        raise ValueError(f"it was cut: it has {size} of {end} bytes of numbers")
 
 
-def _floats(tree: dict[str, Any], part: dict[str, Any], binary: bytearray) -> np.ndarray:
-    """The float32 values (count, columns) of an accessor; normalised integers are divided by their
-    largest value.
-    """
-
-    def values(view: int, offset: int, kind: str, rows: int, columns: int) -> np.ndarray:
-        """Values of a buffer view."""
-        about = tree["bufferViews"][view]
-        start, size = about.get("byteOffset", 0) + offset, np.dtype(kind).itemsize
-        if about.get("buffer", 0) or rows * columns == 0:
-            raise ValueError("its numbers are in another file")
-        steps = about.get("byteStride", size * columns), size
-        return np.ndarray((rows, columns), kind, bytes(binary), start, steps)
-
-    kind, columns, count = _NUMBERS[part["componentType"]], _COLUMNS[part["type"]], part["count"]
-    if "bufferView" in part:
-        found = values(part["bufferView"], part.get("byteOffset", 0), kind, count, columns).astype(
-            np.float32
-        )
-    else:
-        found = np.zeros((count, columns), np.float32)
-    if some := part.get("sparse"):
-        at, new = some["indices"], some["values"]
-        rows = values(
-            at["bufferView"],
-            at.get("byteOffset", 0),
-            _NUMBERS[at["componentType"]],
-            some["count"],
-            1,
-        )
-        found[rows[:, 0]] = values(
-            new["bufferView"], new.get("byteOffset", 0), kind, some["count"], columns
-        )
-    if part.get("normalized") and np.dtype(kind).kind != "f":
-        found = np.maximum(found / np.iinfo(kind).max, -1.0).astype(np.float32)
-    return found
-
-
-def _check_scene(tree: dict[str, Any], size: int) -> None:
-    """Accessors lie in the file, and the scene, which may show a mesh many times, has a bounded
-    number of triangles.
-    """
-    accessors, meshes, nodes = (_list(tree, name) for name in ("accessors", "meshes", "nodes"))
-    for part in accessors:
-        _check_counts(part, size)
-    taken = sum(
-        part["count"] * _COLUMNS[part["type"]] * int(_NUMBERS[part["componentType"]][2])
-        for part in accessors
-    )
-    if taken > 16 * size + (1 << 20):
-        raise ValueError(f"its accessors take {taken} bytes, but it has {size}")
-    faces = [
-        sum(_triangles(piece, accessors) for piece in _list(mesh, "primitives")) for mesh in meshes
-    ]
-    shown, parents = 0, set[int]()
+def _ensure_scene(tree: _TREE) -> None:
+    """Adds a scene of all nodes to a file without scenes, as viewers do; the format allows it."""
+    if _list(tree, "scenes"):
+        return
+    nodes = _list(tree, "nodes")
+    roots = set(range(len(nodes)))
     for node in nodes:
+        roots -= set(node.get("children", ()))
+    tree["scenes"] = [{"nodes": sorted(roots)}]
+    tree["scene"] = 0
+
+
+def _keep_triangles(tree: _TREE, notes: list[str]) -> None:
+    """Removes primitives of lines, points or nothing from the meshes."""
+    removed = 0
+    for mesh in _list(tree, "meshes"):
+        primitives = _list(mesh, "primitives")
+        mesh["primitives"] = [primitive for primitive in primitives if _has_triangles(primitive)]
+        removed += len(primitives) - len(mesh["primitives"])
+    if removed:
+        notes.append(f"{removed} of its primitives without triangles or positions were left out")
+
+
+def _has_triangles(primitive: _TREE) -> bool:
+    """True for a primitive of triangles with positions."""
+    if "POSITION" not in primitive.get("attributes", {}):
+        return False
+    return primitive.get("mode", 4) in _TRIANGLE_MODES
+
+
+def _check_accessors(tree: _TREE, size: int) -> None:
+    """Raises a ValueError if the accessors take far more memory than the file has bytes."""
+    total = 0
+    for accessor in _list(tree, "accessors"):
+        _check_counts(accessor, size)
+        number_bytes = int(_NUMBERS[accessor["componentType"]][2])
+        total += accessor["count"] * _COLUMNS[accessor["type"]] * number_bytes
+    if total > _MAX_MEMORY_RATIO * size + _MAX_UNSHARED_BYTES:
+        raise ValueError(f"its accessors take {total} bytes, but it has {size}")
+
+
+def _check_scene(tree: _TREE) -> None:
+    """Raises a ValueError for too many triangles, and for nodes that are not a tree.
+
+    A scene may show a mesh many times.
+    """
+    accessors = _list(tree, "accessors")
+    mesh_triangles = []
+    for mesh in _list(tree, "meshes"):
+        primitives = _list(mesh, "primitives")
+        mesh_triangles.append(sum(_triangles(primitive, accessors) for primitive in primitives))
+    shown_triangles = 0
+    children = set[int]()
+    for node in _list(tree, "nodes"):
         for child in node.get("children", []):
-            if child in parents or not isinstance(child, int):
+            if child in children or not isinstance(child, int):
                 raise ValueError("a node of its scene has two parents")
-            parents.add(child)
+            children.add(child)
         if "mesh" in node:
-            shown += faces[node["mesh"]]
-    if max(shown, sum(faces)) > MAX_FACES:
+            shown_triangles += mesh_triangles[node["mesh"]]
+    if max(shown_triangles, sum(mesh_triangles)) > MAX_FACES:
         raise ValueError(f"its scene has more than {MAX_FACES} triangles")
 
 
-def _list(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    found = tree.get(name, [])
-    if len(found) > MAX_NODES:
+def _used_accessors(tree: _TREE) -> set[int]:
+    """Indices of the accessors of positions and of texture coordinates."""
+    used = set()
+    for primitive in _primitives(tree):
+        for name, index in primitive["attributes"].items():
+            if name == "POSITION" or name.startswith("TEXCOORD"):
+                used.add(index)
+    return used
+
+
+def _replace_by_floats(tree: _TREE, index: int, binary: bytearray) -> None:
+    """Appends the numbers of an accessor to the binary ones as floats, and replaces it."""
+    accessor = _list(tree, "accessors")[index]
+    values = _float_values(tree, accessor, binary)
+    binary += bytes(-len(binary) % 4)
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes}
+    binary += values.tobytes()
+    tree["bufferViews"].append(view)
+    tree["accessors"][index] = {
+        "bufferView": len(tree["bufferViews"]) - 1,
+        "componentType": _FLOAT,
+        "count": len(values),
+        "type": accessor["type"],
+    }
+
+
+def _float_values(tree: _TREE, accessor: _TREE, binary: bytearray) -> np.ndarray:
+    """The float32 values (count, columns) of an accessor.
+
+    Normalised integers are divided by their largest value.
+    """
+    number_type = _NUMBERS[accessor["componentType"]]
+    columns = _COLUMNS[accessor["type"]]
+    count = accessor["count"]
+    if "bufferView" in accessor:
+        stored = _view_values(tree, accessor, binary, number_type, (count, columns))
+        values = stored.astype(np.float32)
+    else:
+        values = np.zeros((count, columns), np.float32)
+    sparse = accessor.get("sparse")
+    if sparse:
+        replaced = sparse["count"]
+        indices = sparse["indices"]
+        index_type = _NUMBERS[indices["componentType"]]
+        rows = _view_values(tree, indices, binary, index_type, (replaced, 1))[:, 0]
+        values[rows] = _view_values(
+            tree, sparse["values"], binary, number_type, (replaced, columns)
+        )
+    if accessor.get("normalized") and np.dtype(number_type).kind != "f":
+        largest = np.iinfo(number_type).max
+        values = np.maximum(values / largest, -1.0).astype(np.float32)
+    return values
+
+
+def _view_values(
+    tree: _TREE, part: _TREE, binary: bytearray, number_type: str, shape: tuple[int, int]
+) -> np.ndarray:
+    """Values of a buffer view, as an array of this shape.
+
+    Args:
+      tree: the scene.
+      part: has the index of the view, and the offset in it.
+      binary: the numbers of the file.
+      number_type: NumPy's type.
+      shape: rows and columns.
+    """
+    view = tree["bufferViews"][part["bufferView"]]
+    rows, columns = shape
+    if view.get("buffer", 0) or rows * columns == 0:
+        raise ValueError("its numbers are in another file")
+    start = view.get("byteOffset", 0) + part.get("byteOffset", 0)
+    number_bytes = np.dtype(number_type).itemsize
+    strides = (view.get("byteStride", number_bytes * columns), number_bytes)
+    return np.ndarray(shape, number_type, bytes(binary), start, strides)
+
+
+def _primitives(tree: _TREE) -> Iterator[_TREE]:
+    """Yields the primitives of all meshes."""
+    for mesh in _list(tree, "meshes"):
+        yield from _list(mesh, "primitives")
+
+
+def _triangles(primitive: _TREE, accessors: list[_TREE]) -> int:
+    """Number of indices of a primitive, which its triangles do not exceed."""
+    index = primitive.get("indices", primitive["attributes"]["POSITION"])
+    return int(accessors[index]["count"])
+
+
+def _list(tree: _TREE, name: str) -> list[_TREE]:
+    """The parts of a scene or a mesh by name, such as its nodes.
+
+    Raises:
+      ValueError: they are too many.
+    """
+    parts = tree.get(name, [])
+    if len(parts) > MAX_NODES:
         raise ValueError(f"it has more than {MAX_NODES} {name}")
-    return found
+    return parts
 
 
-def _check_counts(part: dict[str, Any], most: int) -> None:
+def _check_counts(part: _TREE, largest: int) -> None:
+    """Raises a ValueError unless the counts of a part are whole numbers up to the largest."""
     for name in ("count", "byteLength", "byteOffset", "byteStride"):
         value = part.get(name, 0)
-        if type(value) is not int or not 0 <= value <= most:
-            raise ValueError(f"it has a {name} of {value!r:.30}, not a whole number up to {most}")
-
-
-def _triangles(piece: dict[str, Any], accessors: list[dict[str, Any]]) -> int:
-    index = piece.get("indices", piece["attributes"]["POSITION"])
-    return int(accessors[index]["count"])
+        if type(value) is not int or not 0 <= value <= largest:
+            raise ValueError(
+                f"it has a {name} of {value!r:.30}, not a whole number up to {largest}"
+            )

@@ -10,7 +10,7 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.shapes import mass_properties, tessellate
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
+from congrasp.services.assets.objects.interior import Enclosed, enclosed
 from congrasp.services.assets.objects.repair import encloses
 
 DENSITIES = (500.0, 2500.0)
@@ -68,67 +68,71 @@ class Weight(NamedTuple):
 
 
 def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
-    """Material of each part, from a name, or from PART=NAME for each, separated by commas; a bare
-    name is for the rest.
+    """Returns the material of each part.
 
     Args:
-      text: such as "steel" or "head=steel,handle=wood".
+      text: a material such as "steel", or PART=NAME for parts, such as "head=steel,handle=wood"; a
+        name alone is for the other parts.
       parts: names of the object's parts, in the order of the result.
 
     Raises:
       CongraspError: unknown material or part, or a part without material.
     """
     entries = [_entry(entry) for entry in text.split(",")]
-    if len(named := dict(entries)) < len(entries):
+    by_part = dict(entries)
+    if len(by_part) < len(entries):
         raise CongraspError(
-            f"--material is '{text}', with two materials for a part.",
+            f"--material assigns two materials to one part: '{text}'.",
             "Name one, or PART=NAME for each.",
         )
-    if unknown := sorted(named.keys() - {"", *parts}):
-        known = ", ".join(filter(None, parts))
-        remedy = (
-            f"The parts are: {known}."
-            if known
-            else "Name the material alone: the object has no parts."
-        )
+    unknown = sorted(by_part.keys() - {"", *parts})
+    if unknown:
+        named_parts = [part for part in parts if part]
+        remedy = "Name the material alone: the object has no parts."
+        if named_parts:
+            remedy = f"The parts are: {', '.join(named_parts)}."
         raise CongraspError(f"--material names the part '{unknown[0]}'.", remedy)
-    missing = [part for part in parts if part not in named and "" not in named]
-    if missing:
-        raise CongraspError(
-            f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME."
-        )
-    return tuple(named[part if part in named else ""] for part in parts)
+    materials = []
+    for part in parts:
+        if part not in by_part and "" not in by_part:
+            raise CongraspError(f"--material leaves out the part '{part}'.", f"Add {part}=NAME.")
+        materials.append(by_part.get(part) or by_part[""])
+    return tuple(materials)
 
 
 def _entry(text: str) -> tuple[str, Material]:
-    """Part (empty for the rest) and material of one entry of `--material`."""
+    """Part (empty for the other parts) and material of one entry of `--material`."""
     part, _, name = text.strip().rpartition("=")
-    name = name if part else text.strip()  # of '=wood' too, which names no part
+    if not part:
+        name = text.strip()  # of '=wood' too, which names no part
     if name not in MATERIALS:
         raise CongraspError(f"--material is '{name}'.", f"Materials: {', '.join(MATERIALS)}.")
     return part, MATERIALS[name]
 
 
 def mean_thickness(mesh: trimesh.Trimesh) -> float:
-    """2 V / A in metres: of a wall its thickness, of a long rod half its diameter, of a ball a
-    third of it.
+    """Returns 2 V / A in m: the thickness of a wall, half the diameter of a long rod.
 
     An open mesh encloses the volume of the cones from its middle to its triangles.
     """
     corners = mesh.triangles - mesh.triangles.mean((0, 1))
-    return 2 * abs(float(np.linalg.det(corners).sum()) / 6) / float(mesh.area)
+    volume = abs(float(np.linalg.det(corners).sum()) / 6)
+    return 2 * volume / float(mesh.area)
 
 
 def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
-    """True for a body whose mass is that of its wall: thicker than objects of its material are, or
-    a sheet.
+    """Returns True for a body whose mass is that of its wall.
+
+    It is thicker than objects of its material are, or a sheet.
     """
     thickness = mean_thickness(mesh)
-    return thickness > material.thickest or (not encloses(mesh) and thickness < _SHEET)
+    if thickness > material.thickest:
+        return True
+    return not encloses(mesh) and thickness < _SHEET
 
 
 def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> Weight:
-    """Mass properties of several bodies together, each solid or `hollow`.
+    """Returns mass properties of several bodies together, each solid or `hollow`.
 
     Args:
       bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which
@@ -141,19 +145,22 @@ def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> W
     inertia = np.zeros((3, 3))
     for weight in weights:
         offset = weight.center - center
-        inertia += weight.inertia + weight.mass * (
-            offset @ offset * np.eye(3) - np.outer(offset, offset)
-        )
+        parallel_axis = offset @ offset * np.eye(3) - np.outer(offset, offset)
+        inertia += weight.inertia + weight.mass * parallel_axis
     return Weight(mass, center, inertia)
 
 
 def _weigh(mesh: trimesh.Trimesh, material: Material) -> Weight:
     """Mass properties of one body; those of an open one are distributed over its surface."""
+    is_closed = encloses(mesh)
     if hollow(mesh, material):
-        area = enclosed(np.asarray(mesh.triangles)).area if encloses(mesh) else float(mesh.area)
+        area = float(mesh.area)
+        if is_closed:
+            area = enclosed(np.asarray(mesh.triangles)).area
         return _on_surface(mesh, material.wall * material.density * area)
-    if not encloses(mesh):
-        return _on_surface(mesh, mean_thickness(mesh) * float(mesh.area) / 2 * material.density)
+    if not is_closed:
+        volume = mean_thickness(mesh) * float(mesh.area) / 2
+        return _on_surface(mesh, volume * material.density)
     solid = enclosed(np.asarray(mesh.triangles))
     return Weight(material.density * solid.volume, solid.center, material.density * solid.inertia)
 
@@ -166,11 +173,11 @@ def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
     total = corners.sum(1)
     # The integral of x x^T over a triangle is A / 12 (the sum of v v^T over its corners + s s^T of
     # their sum).
-    second = np.einsum("f,fki,fkj->ij", share, corners, corners) + np.einsum(
-        "f,fi,fj->ij", share, total, total
-    )
-    second *= mass / 12
-    return Weight(mass, center, np.trace(second) * np.eye(3) - second)
+    second_moment = np.einsum("f,fki,fkj->ij", share, corners, corners)
+    second_moment = second_moment + np.einsum("f,fi,fj->ij", share, total, total)
+    second_moment *= mass / 12
+    inertia = np.trace(second_moment) * np.eye(3) - second_moment
+    return Weight(mass, center, inertia)
 
 
 def weigh_parts(
@@ -179,7 +186,7 @@ def weigh_parts(
     material: str,
     names: Sequence[str],
 ) -> Weight:
-    """Mass properties of an object by its material, or by that of each part.
+    """Returns mass properties of an object by its material, or by that of each part.
 
     Args:
       whole: its surface, m.
@@ -198,7 +205,7 @@ def weigh_evenly(
     hulls: Sequence[np.ndarray],
     density: float | None,
 ) -> Weight:
-    """Mass properties of an evenly dense body.
+    """Returns mass properties of an evenly dense body.
 
     Args:
       mesh: its surface, m.
@@ -207,7 +214,10 @@ def weigh_evenly(
       density: kg/m^3; None guesses the mass.
     """
     if solid:
-        volume, area, center, inertia, _ = solid
+        volume = solid.volume
+        area = solid.area
+        center = solid.center
+        inertia = solid.inertia
     else:
         pieces = tuple(Piece("mesh", (0, 0, 0), vertices=hull) for hull in hulls)
         volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
@@ -217,13 +227,19 @@ def weigh_evenly(
 
 
 def guessed_mass(volume: float, area: float) -> float:
-    """Mass in kg of an object of unknown material, by its volume (m^3) and surface (m^2)."""
-    low, high = (density * volume for density in DENSITIES)
-    return min(max(PER_SURFACE * area, low), high, HEAVIEST_GUESS)
+    """Returns the mass in kg of an object of unknown material.
+
+    Args:
+      volume: m^3.
+      area: of its surface, m^2.
+    """
+    lowest, highest = DENSITIES
+    mass = max(PER_SURFACE * area, lowest * volume)
+    return min(mass, highest * volume, HEAVIEST_GUESS)
 
 
 def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObject:
-    """The object with another mass, and an inertia in proportion.
+    """Returns the object with another mass, and an inertia in proportion.
 
     Args:
       obj: an object of convex pieces, each of which is solid or `hollow`.
@@ -232,11 +248,9 @@ def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObjec
         is unchanged.
     """
     if mass is None and material:
-        of_part = materials_of(material, obj.part_names)
+        part_materials = materials_of(material, obj.part_names)
         bodies = [trimesh.Trimesh(*tessellate(piece), process=False) for piece in obj.pieces]
-        mass = weigh(bodies, [of_part[piece.part] for piece in obj.pieces]).mass
-    return (
-        obj
-        if mass is None
-        else dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass)
-    )
+        mass = weigh(bodies, [part_materials[piece.part] for piece in obj.pieces]).mass
+    if mass is None:
+        return obj
+    return dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass)

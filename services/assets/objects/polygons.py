@@ -1,28 +1,43 @@
-"""Cuts dented polygons of mesh files into triangles inside of them."""
+"""Dented polygons of mesh files, cut into triangles inside of them."""
 
 import numpy as np
 
-# Most corners of a dented polygon that is cut, and of all that have more than four
-_CORNERS, _CUT = (
-    64,
-    20_000,
-)
-_PART = 4096  # polygons at a time, whose corners stay in the processor's cache
-_DENT = 0.01  # sine of the least turn of a corner against the others
+_MAX_CORNERS = 64
+"""Corners of a dented polygon that is cut."""
+_MAX_CORNERS_IN_FILE = 20_000
+"""Corners of all cut polygons of more than four corners."""
+_POLYGONS_AT_A_TIME = 4096
+"""Polygons whose corners stay in the processor's cache."""
+_MIN_DENT = 0.01
+"""Sine of the least turn of a corner against the others."""
+
+Triangles = list[list[int]]
+"""Triangles of a polygon, by the places of their three corners."""
 
 
 def alike(counts: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """The numbers of corners from three on, ascending, each with the places (m,) of the faces that
-    have as many.
+    """Groups faces by their number of corners.
+
+    Args:
+      counts: (F,) number of corners of each face.
+
+    Returns:
+      The numbers of corners from three on, ascending, each with the places (m,) of the faces that
+      have as many.
     """
     order = np.argsort(counts, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(counts[order])) + 1)
-    return [(int(counts[some[0]]), some) for some in groups if counts[some[0]] > 2]
+    alike_groups = []
+    for places in groups:
+        count = int(counts[places[0]])
+        if count > 2:
+            alike_groups.append((count, places))
+    return alike_groups
 
 
 def cut_dented(
     points: np.ndarray, groups: list[np.ndarray], notes: list[str]
-) -> list[dict[int, list[list[int]]]]:
+) -> list[dict[int, Triangles]]:
     """Cuts the polygons that a fan from their first corner would not cut.
 
     Args:
@@ -31,34 +46,49 @@ def cut_dented(
       notes: the number of those that could not be cut is appended.
 
     Returns:
-      Triangles of the dented polygons of each group, by their row; each has the places of three
-      corners.
+      Triangles of the dented polygons of each group, by their row.
     """
-    cut, budget, uncut = list[dict[int, list[list[int]]]](), _CUT, 0
-    for group in groups:
-        count, found = group.shape[1], dict[int, list[list[int]]]()
-        turns = np.concatenate(
-            [_turns(points[part]) for part in np.array_split(group, len(group) // _PART + 1)]
-        )
-        for k in np.flatnonzero((turns < -_DENT).any(1)).tolist():
-            triangles: list[list[int]] = []
-            if count == 4:
-                dents = np.flatnonzero(turns[k] < -_DENT)
-                order = [(int(dents[0]) + j) % 4 for j in range(4)]
-                triangles = [order[:3], [order[0], *order[2:]]] if len(dents) == 1 else []
-            elif count <= min(_CORNERS, budget):
-                budget -= count
-                triangles = _ears(points[group[k]])
-            uncut += not triangles
+    cuts: list[dict[int, Triangles]] = []
+    corners_left = _MAX_CORNERS_IN_FILE
+    uncut = 0
+    for polygons in groups:
+        corner_count = polygons.shape[1]
+        is_dent = _dents(points, polygons)
+        group_cuts: dict[int, Triangles] = {}
+        for row in np.flatnonzero(is_dent.any(1)).tolist():
+            triangles: Triangles = []
+            if corner_count == 4:
+                triangles = _cut_quadrangle(is_dent[row])
+            elif corner_count <= min(_MAX_CORNERS, corners_left):
+                corners_left -= corner_count
+                triangles = _ears(points[polygons[row]])
             if triangles:
-                found[k] = triangles
-        cut.append(found)
+                group_cuts[row] = triangles
+            else:
+                uncut += 1
+        cuts.append(group_cuts)
     if uncut:
         notes.append(
             f"{uncut} of its dented polygons could not be cut and may be filled (export it as "
             f"triangles)"
         )
-    return cut
+    return cuts
+
+
+def _dents(points: np.ndarray, polygons: np.ndarray) -> np.ndarray:
+    """(m, n) bool, True for corners of polygons (m, n) that turn against the others."""
+    batches = np.array_split(polygons, len(polygons) // _POLYGONS_AT_A_TIME + 1)
+    turns = np.concatenate([_turns(points[batch]) for batch in batches])
+    return turns < -_MIN_DENT
+
+
+def _cut_quadrangle(is_dent: np.ndarray) -> Triangles:
+    """Two triangles that meet at the dent (4,) bool of a quadrangle; none if it has several."""
+    dents = np.flatnonzero(is_dent)
+    if len(dents) != 1:
+        return []
+    a, b, c, d = [(int(dents[0]) + j) % 4 for j in range(4)]
+    return [[a, b, c], [a, c, d]]
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:
@@ -70,10 +100,12 @@ def _normals(corners: np.ndarray) -> np.ndarray:
 @np.errstate(all="ignore")
 def _turns(corners: np.ndarray) -> np.ndarray:
     """(n, k) sines of the turns at the corners of polygons (n, k, 3), negative at dents."""
-    sides, normals = np.roll(corners, -1, 1) - corners, _normals(corners)
+    sides = np.roll(corners, -1, 1) - corners
     sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
+    normals = _normals(corners)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.einsum("nkd,nd->nk", np.cross(np.roll(sides, 1, 1), sides), normals)
+    turns = np.cross(np.roll(sides, 1, 1), sides)
+    return np.einsum("nkd,nd->nk", turns, normals)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -81,27 +113,45 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _ears(corners: np.ndarray) -> list[list[int]]:
+def _ears(corners: np.ndarray) -> Triangles:
     """Triangles of a polygon (n, 3), cut off ear by ear; none if it crosses itself.
 
     Its points may coincide, as where a bridge leads to the outline of a hole.
     """
-    (normal,) = _normals(corners[None])
-    axis = int(np.abs(normal).argmax())
-    first, second = ((axis + 1) % 3, (axis + 2) % 3)[:: 1 if normal[axis] > 0 else -1]
-    flat = corners[:, [first, second]]
-    left, found = np.arange(len(corners)), list[list[int]]()
-    while len(left) > 3:
-        here = flat[left]
-        ears = np.roll(here, 1, 0), here, np.roll(here, -1, 0)
-        others = np.ones((len(left), len(left)), bool)
-        for start, end in zip(ears, (*ears[1:], ears[0]), strict=True):
-            others &= _cross((end - start)[:, None], here - start[:, None]) >= 0
-            others &= (here != start[:, None]).any(-1)
-        free = np.flatnonzero((_cross(ears[1] - ears[0], ears[2] - ears[1]) > 0) & ~others.any(1))
+    flat = _flattened(corners)
+    remaining = np.arange(len(corners))
+    triangles: Triangles = []
+    while len(remaining) > 3:
+        free = np.flatnonzero(_are_ears(flat[remaining]))
         if not len(free):
             return []
         i = int(free[0])
-        found.append([int(left[i - 1]), int(left[i]), int(left[(i + 1) % len(left)])])
-        left = np.delete(left, i)
-    return [*found, left.tolist()]
+        following = (i + 1) % len(remaining)
+        ear = [remaining[i - 1], remaining[i], remaining[following]]
+        triangles.append([int(place) for place in ear])
+        remaining = np.delete(remaining, i)
+    triangles.append(remaining.tolist())
+    return triangles
+
+
+def _flattened(corners: np.ndarray) -> np.ndarray:
+    """(n, 2) a polygon (n, 3) seen along the axis of its largest projection, anticlockwise."""
+    (normal,) = _normals(corners[None])
+    axis = int(np.abs(normal).argmax())
+    first = (axis + 1) % 3
+    second = (axis + 2) % 3
+    if normal[axis] > 0:
+        return corners[:, [first, second]]
+    return corners[:, [second, first]]
+
+
+def _are_ears(corners: np.ndarray) -> np.ndarray:
+    """(n,) bool: corners (n, 2) that are convex, with no other corner in their triangle."""
+    before = np.roll(corners, 1, 0)
+    after = np.roll(corners, -1, 0)
+    is_inside = np.ones((len(corners), len(corners)), bool)
+    for start, end in ((before, corners), (corners, after), (after, before)):
+        is_inside &= _cross((end - start)[:, None], corners - start[:, None]) >= 0
+        is_inside &= (corners != start[:, None]).any(-1)
+    is_convex = _cross(corners - before, after - corners) > 0
+    return is_convex & ~is_inside.any(1)

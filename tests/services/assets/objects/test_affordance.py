@@ -18,7 +18,7 @@ from congrasp.services.assets.objects.affordance import (
     painted,
     two_parts,
 )
-from congrasp.services.assets.objects.meshes import UNLABELLED
+from congrasp.services.assets.objects.assembly import UNLABELLED
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load

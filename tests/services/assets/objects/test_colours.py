@@ -13,10 +13,10 @@ from congrasp.actors.episode import _geometry
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
-from congrasp.services.assets.objects.mesh_files import sample_colours
+from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.meshes import import_source
-from congrasp.services.assets.objects.named import find_sources
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import find_sources
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.shapes import Camera
 from congrasp.services.viz.views import _object

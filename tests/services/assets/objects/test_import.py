@@ -5,6 +5,7 @@ input.
 import base64
 import dataclasses
 import json
+import os
 import re
 import struct
 import threading
@@ -18,10 +19,11 @@ from congrasp.common.objects import shapes
 from congrasp.common.objects.resting import settle
 from congrasp.common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 from congrasp.common.objects.store import digest
-from congrasp.services.assets.objects import decompose, meshes
+from congrasp.services.assets.objects import assembly, collision, decompose, meshes
 from congrasp.services.assets.objects.mesh_files import read_mesh
-from congrasp.services.assets.objects.named import find_sources, objects_of
+from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import find_sources
 from tests.limits import limited
 from tests.solids import block, ell
 
@@ -72,7 +74,7 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
     block(SIDES).export(path)
     (first,) = objects_of(path, options)
     with monkeypatch.context() as patch:
-        patch.setattr(meshes, "_build", lambda *_: pytest.fail("built again"))
+        patch.setattr(meshes, "assemble", lambda *_, **__: pytest.fail("built again"))
         (second,) = objects_of(path, options)
     assert digest(second) == digest(first)
     (denser,) = objects_of(path, ImportOptions(density=900.0, cache_dir=options.cache_dir))
@@ -87,13 +89,13 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
 
 def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, monkeypatch):
     """Each of three imports waits for the others to begin."""
-    started, real = threading.Barrier(3), meshes._build
+    started, real = threading.Barrier(3), meshes.assemble
 
-    def build(*arguments):
+    def build(*arguments, **options):
         started.wait(20)
-        return real(*arguments)
+        return real(*arguments, **options)
 
-    monkeypatch.setattr(meshes, "_build", build)
+    monkeypatch.setattr(meshes, "assemble", build)
     monkeypatch.setattr(meshes, "cores", lambda: 3)
     monkeypatch.setattr(meshes, "memory", lambda: 1 << 40)
     for name, factor in (("a", 1.0), ("b", 1000.0), ("c", 0.5)):
@@ -106,7 +108,7 @@ def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, mo
 
 def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
     block(SIDES).export(tmp_path / "a.stl")
-    monkeypatch.setattr(meshes, "_build", lambda *_: 1 / 0)
+    monkeypatch.setattr(meshes, "assemble", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         list(meshes.import_sources(find_sources(tmp_path), options))
 
@@ -118,8 +120,8 @@ def hull_alone(monkeypatch):
     def hull(vertices, faces, **options):
         return decompose.Decomposition([shapes.hull_of(vertices).points], "hull", ["coacd failed"])
 
-    monkeypatch.setattr(decompose, "decompose", hull)
-    monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
+    monkeypatch.setattr(collision, "decompose", hull)
+    monkeypatch.setattr(assembly, "cut_to_hold", lambda obj: obj)
 
 
 def test_an_open_mesh_counts_its_hull(tmp_path, options, hull_alone):
@@ -161,8 +163,8 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
 
 
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
-    monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
-    monkeypatch.setattr(decompose, "decompose", lambda *_, **__: pytest.fail("cut"))
+    monkeypatch.setattr(assembly, "cut_to_hold", lambda obj: obj)
+    monkeypatch.setattr(collision, "decompose", lambda *_, **__: pytest.fail("cut"))
     (obj,) = objects_of(
         folder_of(tmp_path / "block", block(SIDES), block(SIDES - [0, 0, 0.0024])), options
     )
@@ -242,13 +244,13 @@ def test_a_busy_machine_changes_no_shape(monkeypatch):
         decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
 
 
-def test_a_decomposer_that_dies_is_reported(monkeypatch):
+def test_decomposer_that_dies_is_reported(monkeypatch):
+    monkeypatch.setattr(decompose, "write_pieces", os.abort)  # which its arguments end at once
     mesh = ell()
-    pieces, failure = decompose._in_child(
-        "no such method", {"vertices": mesh.vertices}, mesh.volume, 8, 60
-    )
-    assert pieces == []
-    assert failure.startswith("f")
+    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+    assert result.method == "hull"
+    assert result.notes[0].startswith("coacd failed (")
+    assert result.notes[1].startswith("vhacd failed (")
 
 
 # One whose own pieces are kept, one with holes, and two with parts.

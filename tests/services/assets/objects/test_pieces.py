@@ -8,8 +8,11 @@ import trimesh
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_VERTICES
-from congrasp.services.assets.objects import decompose
-from congrasp.services.assets.objects.fidelity import fidelity, interior, voxels
+from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.hulls import simplify, solid_hull
+from congrasp.services.assets.objects.interior import interior
+from congrasp.services.assets.objects.merging import merge
+from congrasp.services.assets.objects.voxels import voxels
 from tests.solids import block
 
 
@@ -31,9 +34,7 @@ def joined(blocks, max_pieces, triangles=None):
     if triangles is None:
         triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in blocks])
     volume = sum(mesh.volume for mesh in blocks)
-    return decompose.merge(
-        [np.asarray(mesh.vertices) for mesh in blocks], max_pieces, triangles, volume
-    )
+    return merge([np.asarray(mesh.vertices) for mesh in blocks], max_pieces, triangles, volume)
 
 
 def test_pieces_that_form_a_convex_one_are_joined_without_need():
@@ -67,7 +68,7 @@ def test_a_thin_step_is_joined_for_its_small_depth_but_not_for_a_large_volume(cl
         outline = [[0, 0], [0.04, 0], [0.04, high], [0.02, high], [0.02, height], [0, height]]
         surface, volume = prism(np.array(outline), 0.02), sum(block.volume for block in blocks)
         return len(
-            decompose.merge(
+            merge(
                 [np.asarray(block.vertices) for block in blocks],
                 4,
                 surface,
@@ -84,19 +85,19 @@ def test_bodies_apart_are_never_joined():
 
 def test_dust_of_the_cutting_is_no_piece():
     flat = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0.01, 0.01, 0]])
-    assert decompose.solid_hull(flat) is None
-    assert decompose.solid_hull(np.concatenate([flat, [[0, 0, 1e-8]]])) is None
+    assert solid_hull(flat) is None
+    assert solid_hull(np.concatenate([flat, [[0, 0, 1e-8]]])) is None
 
 
 def test_simplified_pieces_keep_shape_and_volume():
     ball = np.random.default_rng(0).normal(size=(800, 3)) * [1, 1.5, 0.5]
     ball = 0.03 * ball / np.linalg.norm(ball / [1, 1.5, 0.5], axis=-1, keepdims=True)
-    few = decompose.simplify(ball)
+    few = simplify(ball)
     assert len(few) == MAX_MESH_VERTICES
     np.testing.assert_allclose(shapes.hull_of(few).volume, shapes.hull_of(ball).volume, rtol=1e-9)
     np.testing.assert_allclose(np.ptp(few, axis=0), np.ptp(ball, axis=0), rtol=0.06)
     cube = np.array(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3)).reshape(3, -1).T
-    assert {tuple(abs(corner)) for corner in decompose.simplify(cube)} == {(1.0, 1.0, 1.0)}
+    assert {tuple(abs(corner)) for corner in simplify(cube)} == {(1.0, 1.0, 1.0)}
 
 
 @pytest.mark.parametrize("angle", [45, 90])
@@ -114,13 +115,13 @@ def test_pieces_of_a_bent_wall_are_as_thin_as_the_wall(angle):
         [np.concatenate(some).reshape(-1, 3) for some in np.split(np.array(sections), 6)],
     )
     volume = np.radians(angle) * 0.040 * 0.002 * 0.03
-    merged = decompose.merge(blocks, 2, wall, volume)
+    merged = merge(blocks, 2, wall, volume)
     assert len(merged) == 2
     errors = fidelity(wall, merged, closed=True)
     assert abs(errors.volume) < 0.05
     # The bend of a half is r (1 - cos(angle / 4)) deep.
     assert errors.surface < 0.041 * (1 - np.cos(np.radians(angle / 4)))
-    as_thick = decompose.merge(blocks, 2, wall, None)
+    as_thick = merge(blocks, 2, wall, None)
     assert sum(shapes.hull_of(piece).volume for piece in as_thick) > 1.2 * volume
 
 

@@ -8,10 +8,12 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.bodies import largest_body, without_table
+from congrasp.services.assets.objects.hollows import without_hollows
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.repair import closed, largest_body, reduced, without_hollows
+from congrasp.services.assets.objects.repair import closed, reduced
 
 RADIUS = 0.03
 
@@ -58,7 +60,7 @@ def test_a_flat_object_is_no_table(radius, depth, knob, at):
     whole = trimesh.util.concatenate(
         [flat, trimesh.creation.cylinder(*knob).apply_translation([0.0, 0.0, at])]
     )
-    assert repair.without_table(whole, 1.0, []) is whole
+    assert without_table(whole, 1.0, []) is whole
 
 
 def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
@@ -313,7 +315,7 @@ def test_a_hollow_without_an_opening_is_filled():
 
 @pytest.mark.slow
 def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
-    monkeypatch.setattr(repair, "_REDUCED", 20_000)
+    monkeypatch.setattr(repair, "MAX_UNMERGED_FACES", 20_000)
     monkeypatch.setattr(repair, "MAX_FACES", 2_000)
     fine = trimesh.creation.icosphere(subdivisions=6, radius=RADIUS)
     fine.export(tmp_path / "fine.stl")

@@ -1,0 +1,349 @@
+"""Assembly of an object: from the meshes of a source to a `GraspObject`."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError, cKDTree
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes
+from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.shapes import halves, sample_mesh
+from congrasp.common.objects.spec import Colours, GraspObject, Piece
+from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
+from congrasp.services.assets.objects.bodies import largest_body, without_table
+from congrasp.services.assets.objects.collision import Collision, Surfaces, convex_pieces
+from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.hollows import without_hollows
+from congrasp.services.assets.objects.interior import Enclosed, enclosed
+from congrasp.services.assets.objects.materials import Weight, weigh_evenly, weigh_parts
+from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
+from congrasp.services.assets.objects.options import METRES, ImportOptions, metres_per_unit
+from congrasp.services.assets.objects.repair import encloses
+from congrasp.services.assets.objects.sources import Source
+
+UNLABELLED = ("near half", "far half")
+"""Parts of an object without part files."""
+_MAX_OFFSET = 100
+"""Distance of an object's middle from the origin, in its sizes, up to which products of its
+coordinates are exact enough.
+"""
+_GRASPABLE_SHARES = (0.1, 0.9)
+"""Shares of the surface that a graspable region has without a note."""
+_PART_SAMPLES = 4000
+"""Points of a part's surface, which label the object's points."""
+
+
+class _Files(NamedTuple):
+    """The meshes of a source, in the files' unit, z up."""
+
+    pieces: list[np.ndarray]
+    """Vertices (V, 3) of the convex pieces in its folder."""
+    visuals: list[trimesh.Trimesh]
+    """Its repaired surfaces."""
+    parts: list[trimesh.Trimesh]
+    """Those of its parts, unless they are the surfaces."""
+    up: Literal["y", "z"]
+    """The files' axis that was up."""
+    coloured: list[pathlib.Path]
+    """Files of the surfaces that may have colours."""
+
+
+class _Scale(NamedTuple):
+    """Conversion from the files' unit to metres, relative to a point near the object."""
+
+    factor: float
+    """Metres per unit."""
+    middle: np.ndarray
+    """(3,) the point, m: zeros unless the object is far from its origin."""
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in metres."""
+        return self.factor * points - self.middle
+
+    def mesh(self, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        """A mesh in metres that faces outwards."""
+        mesh = mesh.copy()
+        mesh.apply_scale(self.factor)
+        mesh.apply_translation(-self.middle)
+        if mesh.volume < 0:
+            mesh.invert()
+        return mesh
+
+
+class _Labels(NamedTuple):
+    """Parts of an object."""
+
+    names: tuple[str, ...]
+    graspable: np.ndarray
+    """(P,) bool, True for parts of the graspable region."""
+    of_points: np.ndarray
+    """(N,) part of each surface point."""
+
+
+def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
+    """Builds the object of a source.
+
+    Args:
+      source: the files.
+      options: options of the import.
+      seed: seed of its surface points.
+
+    Raises:
+      CongraspError: a mesh cannot be used.
+    """
+    notes: list[str] = []
+    files = _read(source, options, notes)
+    scale = _scale(source, files, options, notes)
+    meshes = [scale.mesh(mesh) for mesh in files.visuals]
+    parts = [scale.mesh(mesh) for mesh in files.parts]
+    surface = trimesh.util.concatenate(meshes).copy()
+    closed = all(encloses(mesh) for mesh in meshes)
+    if not closed and not options.material:
+        replacement = "pieces" if source.pieces else "hull"
+        notes.append(
+            f"its surface is open: mass and inertia are those of its convex {replacement} "
+            "(--material weighs its wall, and --mass sets the mass)"
+        )
+    solid = enclosed(np.asarray(surface.triangles)) if closed else None
+    if solid and solid.overlaps:
+        notes.append("its bodies overlap: what lies in several of them weighs once")
+    surfaces = _surfaces(meshes, solid, notes)
+    weight_by_material = None
+    if options.material:  # before the cut, which takes long: the material may be unknown
+        part_names = [part.part for part in source.parts]
+        weight_by_material = weigh_parts(meshes, parts or meshes, options.material, part_names)
+    own_pieces = [scale.points(piece) for piece in files.pieces]
+    collision = _collision(source, own_pieces, surfaces, options, notes)
+    solid_hulls = collision.hulls if source.pieces else [np.asarray(surface.vertices)]
+    weight = weight_by_material or weigh_evenly(surface, solid, solid_hulls, options.density)
+    if options.mass is not None:
+        inertia = weight.inertia * (options.mass / weight.mass)
+        weight = Weight(options.mass, weight.center, inertia)
+    pieces = tuple(
+        _piece(hull, weight.center, owner)
+        for hull, owner in zip(collision.hulls, collision.owners, strict=True)
+    )
+    surface.apply_translation(-weight.center)
+    points, normals, faces = sample_mesh(
+        np.asarray(surface.triangles), pieces, np.random.default_rng(seed), oriented=closed
+    )
+    if source.parts:
+        if parts:
+            of_points = _nearest_part(parts, weight.center, points)
+        else:
+            of_points = _part_of_faces(meshes, faces)
+        labels = _labels_of_parts(source, of_points)
+    else:
+        labels = _labels_of_halves(points)
+    if not source.parts_are_pieces:
+        pieces = with_labels(pieces, points, labels.of_points)
+    _note_graspable_share(labels, notes)
+    picture = repair.with_few_faces(surface)
+    origin = weight.center + scale.middle
+    colours = _colours(files, scale.factor, origin, seed, options, notes)
+    obj = GraspObject(
+        name=source.name,
+        family="imported",
+        pieces=pieces,
+        part_names=labels.names,
+        graspable=labels.graspable,
+        mass=weight.mass,
+        inertia=weight.inertia,
+        points=points.astype(np.float32),
+        normals=normals.astype(np.float32),
+        labels=labels.of_points.astype(np.int32),
+        rest_poses=np.zeros((0, 7)),
+        visual_vertices=np.asarray(picture.vertices, np.float32),
+        visual_faces=np.asarray(picture.faces, np.int32),
+        origin=tuple((-weight.center - scale.middle).tolist()),
+        file_scale=scale.factor,
+        file_up=files.up,
+        notes=tuple(dict.fromkeys(notes)),
+        surface_error=collision.errors.surface,
+        volume_error=collision.errors.volume,
+        colours=colours,
+    )
+    obj = dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    return obj if source.parts else cut_to_hold(obj)
+
+
+def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
+    """The meshes of a source, repaired."""
+    up = options.up
+    piece_meshes = [read_mesh(file.path, up=up) for file in source.pieces]
+    visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
+    parts: list[trimesh.Trimesh] = []
+    if not source.parts_are_pieces:
+        parts = [read_mesh(file.path, up=up) for file in source.parts]
+    axis = up_of((visuals or piece_meshes)[0], up)
+    if axis == "y":
+        notes.append(
+            "its y axis, which points up in the file, became its z axis (--up z leaves the axes)"
+        )
+    coloured = [
+        file.path
+        for file, mesh in zip(source.visuals, visuals, strict=True)
+        if mesh.metadata["kind"] != "stl"
+    ]
+    pieces = [np.asarray(mesh.vertices, np.float64) for mesh in piece_meshes]
+    if not visuals:
+        visuals = [shapes.triangulate(piece) for piece in pieces]
+    if not pieces and not source.parts:
+        visuals = [_object_of_scan(mesh, options, notes) for mesh in visuals]
+    if not source.parts:
+        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+    return _Files(pieces, visuals, parts, axis, coloured)
+
+
+def _object_of_scan(
+    mesh: trimesh.Trimesh, options: ImportOptions, notes: list[str]
+) -> trimesh.Trimesh:
+    """The mesh of a scan without its table and other bodies."""
+    if options.unit in METRES:
+        metres = METRES[options.unit] * options.scale
+        mesh = without_table(mesh, metres, notes)
+    return largest_body(mesh, notes)
+
+
+def _scale(source: Source, files: _Files, options: ImportOptions, notes: list[str]) -> _Scale:
+    """The conversion of the files to metres.
+
+    Raises:
+      CongraspError: no hand can grasp an object of that size.
+    """
+    surface = trimesh.util.concatenate(files.visuals)
+    sides = tuple(surface.extents.tolist())
+    factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
+    low, high = surface.bounds
+    middle = np.zeros(3)
+    if np.abs(low + high).max() / 2 > _MAX_OFFSET * (high - low).max():
+        middle = (low + high) / 2
+    return _Scale(factor, factor * middle)
+
+
+def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list[str]) -> Surfaces:
+    """The surfaces of meshes, closed ones without hollows that no finger enters."""
+    if solid is None:
+        triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in meshes])
+        return Surfaces(meshes, meshes, triangles, None)
+    approximated = [without_hollows(mesh, notes) for mesh in meshes]
+    triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in approximated])
+    if any(new is not old for new, old in zip(approximated, meshes, strict=True)):
+        solid = enclosed(triangles)
+    return Surfaces(meshes, approximated, triangles, solid.volume)
+
+
+def _collision(
+    source: Source,
+    own_pieces: Sequence[np.ndarray],
+    surfaces: Surfaces,
+    options: ImportOptions,
+    notes: list[str],
+) -> Collision:
+    """Convex pieces of an object (`collision.convex_pieces`).
+
+    Raises:
+      CongraspError: it has no volume.
+    """
+    has_surface = bool(source.visuals)
+    try:
+        return convex_pieces(own_pieces, surfaces, options, notes, has_surface=has_surface)
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.",
+            "Give it a thickness in a modelling program.",
+        ) from None
+
+
+def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
+    """A convex piece of vertices (V, 3), with its origin at their mean, relative to `center`."""
+    middle = hull.mean(0)
+    return Piece(
+        "mesh",
+        (0.0, 0.0, 0.0),
+        tuple((middle - center).tolist()),
+        vertices=hull - middle,
+        part=part,
+    )
+
+
+def _labels_of_halves(points: np.ndarray) -> _Labels:
+    """Two halves of surface points (N, 3), the slimmer one graspable."""
+    of_points = halves(points, 0.5)
+    widths = []
+    for half in (0, 1):
+        half_points = points[of_points == half]
+        centered = half_points - half_points.mean(0)
+        singular_values = np.linalg.svd(centered, compute_uv=False)
+        widths.append(singular_values[2] / np.sqrt(len(half_points)))
+    graspable = np.arange(2) == int(np.argmin(widths))
+    return _Labels(UNLABELLED, graspable, of_points)
+
+
+def _nearest_part(
+    parts: Sequence[trimesh.Trimesh], center: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(N,) the part nearest to each surface point (N, 3), which are relative to `center`."""
+    distances = []
+    for part in parts:
+        samples = trimesh.sample.sample_surface(part, _PART_SAMPLES, seed=0)[0]
+        distances.append(cKDTree(samples - center).query(points)[0])
+    return np.argmin(distances, axis=0)
+
+
+def _part_of_faces(meshes: Sequence[trimesh.Trimesh], faces: np.ndarray) -> np.ndarray:
+    """(N,) the mesh of faces (N,) of all meshes together."""
+    ends = np.cumsum([len(mesh.faces) for mesh in meshes])
+    return np.searchsorted(ends, faces, side="right")
+
+
+def _labels_of_parts(source: Source, of_points: np.ndarray) -> _Labels:
+    """Parts by their files; the largest is graspable if otherwise all or none are."""
+    graspable = np.array([bool(part.graspable) for part in source.parts])
+    if graspable.all() or not graspable.any():
+        counts = np.bincount(of_points, minlength=len(source.parts))
+        graspable = np.arange(len(source.parts)) == counts.argmax()
+    names = tuple(part.part for part in source.parts)
+    return _Labels(names, graspable, of_points)
+
+
+def _note_graspable_share(labels: _Labels, notes: list[str]) -> None:
+    """Appends a note if the graspable region is a small or a large share of the surface."""
+    low, high = _GRASPABLE_SHARES
+    share = labels.graspable[labels.of_points].mean()
+    if not low <= share <= high:
+        notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
+
+
+def _colours(
+    files: _Files,
+    factor: float,
+    origin: np.ndarray,
+    seed: int,
+    options: ImportOptions,
+    notes: list[str],
+) -> Colours | None:
+    """Colours of the files, in the object frame; None without colours, or if they are unreadable.
+
+    Args:
+      files: the meshes of the source.
+      factor: metres per unit.
+      origin: (3,) origin of the object frame, m, in the axes of the files.
+      seed: seed of the points.
+      options: options of the import.
+      notes: unreadable colours are appended.
+    """
+    try:
+        colours = sample_colours(files.coloured, seed, options.up, notes)
+    except CongraspError as error:
+        notes.append(f"its colours are left out: {str(error).rstrip('.')}")
+        return None
+    if colours is None:
+        return None
+    return colours._replace(points=(factor * colours.points - origin).astype(np.float32))

@@ -1,0 +1,161 @@
+"""Collision shape of an object: the convex pieces of its folder, or those cut from its meshes.
+
+Pieces of the folder are used if they are close enough to the surface, or closer than the cut ones.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from congrasp.common.objects import shapes
+from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
+from congrasp.services.assets.objects.hulls import corners_of, simplify
+from congrasp.services.assets.objects.merging import merge
+from congrasp.services.assets.objects.options import ImportOptions
+
+
+class Surfaces(NamedTuple):
+    """The surfaces of an object."""
+
+    meshes: Sequence[trimesh.Trimesh]
+    """One of the whole, or one of each part, m."""
+    shown: Sequence[trimesh.Trimesh]
+    """The same without hollows that no finger enters."""
+    triangles: np.ndarray
+    """(F, 3, 3) of all that are shown."""
+    volume: float | None
+    """Volume that they enclose (`interior.enclosed`), m^3; None if one is open."""
+
+
+class Collision(NamedTuple):
+    """Convex pieces and their errors."""
+
+    hulls: list[np.ndarray]
+    """Vertices (V, 3) of each piece, m."""
+    owners: list[int]
+    """Mesh of each piece."""
+    errors: Fidelity
+    """Errors relative to the object's surfaces."""
+
+    def __str__(self) -> str:
+        """Number of pieces, and their errors."""
+        count = len(self.hulls)
+        pieces = "piece stands" if count == 1 else "pieces stand"
+        return f"{count} convex {pieces} for it: {self.errors}"
+
+
+def convex_pieces(
+    own_pieces: Sequence[np.ndarray],
+    surfaces: Surfaces,
+    options: ImportOptions,
+    notes: list[str],
+    *,
+    has_surface: bool = True,
+) -> Collision:
+    """Returns the pieces of the object's folder if they are close enough, else the closer ones.
+
+    Args:
+      own_pieces: vertices (V, 3) of the convex pieces in the object's folder, m.
+      surfaces: the object's surfaces.
+      options: options of the import.
+      notes: the selected pieces and their errors are appended.
+      has_surface: False if the surfaces are those of the pieces.
+
+    Raises:
+      scipy.spatial.QhullError: the object has no volume.
+    """
+    if not own_pieces:
+        cut = _cut(surfaces, options, notes)
+        notes.append(str(cut))
+        return cut
+    hulls = merge(list(own_pieces), options.max_pieces, surfaces.triangles, surfaces.volume)
+    if len(hulls) < len(own_pieces):
+        notes.append(
+            f"its {len(own_pieces)} convex pieces were merged into {len(hulls)} (--max-pieces)"
+        )
+    merged = _simplified(surfaces, hulls, [0] * len(hulls))
+    if merged.errors.excess <= 1 or not has_surface:
+        notes.append(f"its own {merged}")
+        return merged
+    cut_notes: list[str] = []
+    try:
+        cut = _cut(surfaces, options, cut_notes)
+    except QhullError:
+        cut = merged  # the surface lies in a plane
+    if cut.errors.excess < merged.errors.excess:
+        notes.extend(cut_notes)
+        notes.append(
+            f"{cut}; they were cut from its mesh, for its own {len(merged.hulls)} are coarser: "
+            f"{merged.errors}"
+        )
+        return cut
+    notes.append(f"its own {merged}; pieces cut from its mesh are no closer")
+    return merged
+
+
+def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collision:
+    """A decomposition of each mesh, or the hulls of the meshes if those are closer.
+
+    Each mesh may have pieces according to its share of the volume.
+    """
+    mesh_hulls = [shapes.hull_of(mesh.vertices) for mesh in surfaces.meshes]
+    volumes = np.array([hull.volume for hull in mesh_hulls])
+    limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
+    hulls: list[np.ndarray] = []
+    owners: list[int] = []
+    for owner, limit in enumerate(limits):
+        pieces = _cut_mesh(surfaces, owner, limit, options.time_limit, notes)
+        hulls += pieces
+        owners += [owner] * len(pieces)
+    cut = _simplified(surfaces, hulls, owners)
+    if cut.errors.excess <= 1 or len(hulls) == len(mesh_hulls):
+        return cut
+    filled = _filled(surfaces, mesh_hulls)
+    if filled.errors.excess < cut.errors.excess:
+        notes.append(
+            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): "
+            f"hollows are filled"
+        )
+        return filled
+    return cut
+
+
+def _cut_mesh(
+    surfaces: Surfaces, owner: int, max_pieces: int, time_limit: float, notes: list[str]
+) -> list[np.ndarray]:
+    """Vertices (V, 3) of the pieces of one of the meshes."""
+    mesh = surfaces.meshes[owner]
+    shown = surfaces.shown[owner]
+    small = repair.with_few_faces(mesh)
+    volume = None
+    if surfaces.volume is not None and (small is mesh or repair.encloses(small)):
+        is_only_mesh = len(surfaces.meshes) == 1
+        volume = surfaces.volume if is_only_mesh else float(shown.volume)
+    decomposition = decompose(
+        np.asarray(small.vertices),
+        np.asarray(small.faces),
+        shown=None if shown is mesh else np.asarray(shown.triangles),
+        volume=volume,
+        time_limit=time_limit,
+        max_pieces=max_pieces,
+    )
+    notes += decomposition.notes
+    return decomposition.pieces
+
+
+def _filled(surfaces: Surfaces, mesh_hulls: Sequence[ConvexHull]) -> Collision:
+    """The hull of each mesh."""
+    corners = [corners_of(hull) for hull in mesh_hulls]
+    return _simplified(surfaces, corners, list(range(len(corners))))
+
+
+def _simplified(surfaces: Surfaces, pieces: list[np.ndarray], owners: list[int]) -> Collision:
+    """Pieces (V, 3) of few vertices, and their errors."""
+    hulls = [simplify(piece) for piece in pieces]
+    errors = fidelity(surfaces.triangles, hulls, surfaces.volume is not None)
+    return Collision(hulls, owners, errors)

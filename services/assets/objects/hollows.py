@@ -1,0 +1,53 @@
+"""Hollows that no finger enters, which the collision shape of an object fills."""
+
+import numpy as np
+import trimesh
+from scipy.ndimage import binary_propagation, distance_transform_edt, label
+
+from congrasp.services.assets.objects.holes import fill, hole_loops
+from congrasp.services.assets.objects.repair import encloses
+from congrasp.services.assets.objects.voxels import voxels
+
+OPENING = 0.01
+"""Width of an opening that no finger enters, m."""
+_PROBE_STEPS = (1.0, 1.5, 2.0)
+"""Steps from a triangle to the cubes before it, in sides of a cube."""
+_VOLUME_RATIOS = (0.8, 1.2)
+"""Volume added by filling relative to that of the hollow by cubes."""
+
+
+def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """Returns a closed mesh without the walls of hollows, whose openings are closed.
+
+    A hollow is where a ball as wide as `OPENING` fits that cannot get out; it ends where one from
+    outside gets to. The mesh is returned unchanged if its openings cannot be closed.
+    """
+    cubes = voxels(np.asarray(mesh.triangles), OPENING)
+    outside = ~cubes.inside
+    fits_ball = distance_transform_edt(outside, cubes.spacing) > OPENING / 2
+    spaces, count = label(fits_ball)
+    if count < 2:
+        return mesh
+    outer = spaces == spaces[0, 0, 0]
+    reached = distance_transform_edt(~outer, cubes.spacing) < OPENING / 2 + cubes.spacing
+    hollow = binary_propagation((spaces > 0) & ~outer, mask=outside & ~reached)
+    centers = np.asarray(mesh.triangles_center)
+    normals = np.asarray(mesh.face_normals)
+    is_wall = np.zeros(len(centers), bool)
+    for step in _PROBE_STEPS:
+        is_wall |= hollow[cubes.at(centers + step * cubes.spacing * normals)]
+    filled = trimesh.Trimesh(mesh.vertices, mesh.faces[~is_wall], process=False)
+    loops = hole_loops(filled)
+    if loops:
+        filled = fill(filled, loops)
+    if not encloses(filled):
+        return mesh
+    volume = float(hollow.sum()) * cubes.spacing**3
+    low, high = _VOLUME_RATIOS
+    if not low < (filled.volume - mesh.volume) / volume < high:
+        return mesh
+    notes.append(
+        f"its hollow of {1e6 * volume:.0f} cm^3, which no finger enters, is filled in its "
+        f"collision shape"
+    )
+    return filled
