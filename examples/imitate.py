@@ -22,7 +22,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.mano import read_mano
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.captures.build import Options, import_sets
+from congrasp.services.assets.captures.build import import_sets
+from congrasp.services.assets.captures.options import Options
 from congrasp.services.assets.captures.sequence import Meshes
 from congrasp.services.viz.render import episode_strip
 from congrasp.services.viz.sheets import contact_sheet, save_png

@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 import congrasp
 from congrasp.common.hands import get_hand
-from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.approach import approach
 from congrasp.services.assets.captures.references import followed
+from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.grasp.wrist_paths import read_wrist_path
 from congrasp.services.viz.render import episode_sheet

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.inputs import numbers_in, read_npz
 from congrasp.common.runtime.physics_library import mujoco
-from congrasp.services.assets.hands.compile import confined, robot_spec, robot_text
+from congrasp.services.assets.hands.compile import robot_spec
+from congrasp.services.assets.hands.reading import confined
+from congrasp.services.assets.hands.robot_texts import robot_text
 
 SPEED = 3.14
 """Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""

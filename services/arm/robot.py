@@ -14,7 +14,7 @@ from congrasp.common.objects.mjcf import add_object
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm.description import Arm
-from congrasp.services.assets.hands.links import geom_mesh
+from congrasp.services.assets.hands.link_geometry import geom_mesh
 from congrasp.services.record.episode import UNLIMITED, MovedArm
 from congrasp.services.viz.shapes import upright
 

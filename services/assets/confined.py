@@ -1,5 +1,6 @@
-"""Functions in a child process under limits of memory and time: for strangers' files, and for
-native code.
+"""Functions in a child process under limits of memory and time.
+
+They read strangers' files, or call native code.
 
 Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources.
 `python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS` is that process:
@@ -25,6 +26,8 @@ from congrasp.common.runtime.environment import child_environment
 
 _ANSWER = "answer.json"
 _MODULE = "congrasp.services.assets.confined"
+_PARENT_CHECK_S = 0.5
+"""Time between two checks whether the parent is still there."""
 
 
 def call_confined(
@@ -51,16 +54,15 @@ def call_confined(
     Raises:
       CongraspError: of the function.
       TimeoutError: it did not end within `patience`.
-      ChildProcessError: it ended without an answer; the text is a reason in the past tense.
+      ChildProcessError: it ended without an answer; the message states the reason.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
     command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
-    given = json.dumps(options).encode()
     try:
         child = subprocess.run(
             command,
-            input=given,
+            input=json.dumps(options).encode(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             timeout=patience,
@@ -74,10 +76,11 @@ def call_confined(
     try:
         answer = json.loads((folder / _ANSWER).read_text())
     except (OSError, ValueError):
-        last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [
-            f"exit code {child.returncode}"
-        ]
-        raise ChildProcessError(f"failed ({last[0]})") from None
+        reason = f"exit code {child.returncode}"
+        lines = child.stderr.decode(errors="replace").strip().splitlines()
+        if lines:
+            reason = lines[-1]
+        raise ChildProcessError(f"failed ({reason})") from None
     if "error" in answer:
         raise CongraspError(answer["error"])
     return answer["result"]
@@ -86,7 +89,8 @@ def call_confined(
 def _child(called: str, folder: str, memory: str, seconds: str) -> None:
     """Calls the function; ends at a limit, or when the parent is gone."""
     module, _, name = called.partition(":")
-    function, options = getattr(importlib.import_module(module), name), json.load(sys.stdin)
+    function = getattr(importlib.import_module(module), name)
+    options = json.load(sys.stdin)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     signal.setitimer(signal.ITIMER_PROF, float(seconds))  # its signal ends the process
     resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
@@ -101,7 +105,7 @@ def _child(called: str, folder: str, memory: str, seconds: str) -> None:
 def _end_with(parent: int) -> None:
     """Ends this process after its parent, whose id is given."""
     while os.getppid() == parent:
-        time.sleep(0.5)
+        time.sleep(_PARENT_CHECK_S)
     os._exit(1)
 
 

@@ -30,7 +30,7 @@ from congrasp.services.cli.console import (
 if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
     from congrasp.common.objects.spec import GraspObject
-    from congrasp.services.assets.captures.build import Report
+    from congrasp.services.assets.captures.report import Report
     from congrasp.services.cli.console import Track
 
 REPORT = "import.json"
@@ -197,7 +197,8 @@ class Import:
     def __call__(self) -> int:
         """Imports the sets, and prints what was dropped."""
         from congrasp.common.task.sampling.set_file import save
-        from congrasp.services.assets.captures.build import Options, import_sets
+        from congrasp.services.assets.captures.build import import_sets
+        from congrasp.services.assets.captures.options import Options
         from congrasp.services.assets.captures.sequence import Meshes
 
         if self.format not in IMPORTERS:

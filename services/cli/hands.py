@@ -145,7 +145,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     """Writes a hand's file and picture, by default to the folder of custom hands, and prints a
     description.
     """
-    from congrasp.services.assets.hands.model_files import describe
+    from congrasp.services.assets.hands.summary import describe
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
 
@@ -185,6 +185,7 @@ def check(
       congrasp hands check my_hand --png check.png --json check.json
     """
     from congrasp.services.assets.hands import check as self_check
+    from congrasp.services.assets.hands.findings import write_findings
     from congrasp.services.train.presets import recipe
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
@@ -197,7 +198,7 @@ def check(
         print(finding)
     save_png(picture, hand_sheets.check_sheet(found, checked.grips))
     if json is not None:
-        self_check.write_findings(json, checked.findings)
+        write_findings(json, checked.findings)
     print(picture)
     return int(checked.failed)
 

@@ -105,7 +105,7 @@ class Report:
 
 def _checked(file: pathlib.Path) -> "HandCheck":
     """Returns the self-check of a file, with its picture."""
-    from congrasp.services.assets.hands.check import read_findings
+    from congrasp.services.assets.hands.findings import read_findings
     from congrasp.services.evaluate.report import HandCheck
 
     picture = file.with_suffix(".png")

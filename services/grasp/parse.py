@@ -25,9 +25,10 @@ from congrasp.common.task.constraints.heading import ABOVE
 from congrasp.common.task.constraints.specs import Option, Part
 from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.approach import approach
 from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.affordance import from_part
 from congrasp.services.assets.objects.mesh_files import upright
 from congrasp.services.assets.objects.options import size_in_words

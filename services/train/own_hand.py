@@ -19,7 +19,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import own_policy_file, pretrained_hands
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
-from congrasp.services.assets.hands.check import Finding, read_findings
+from congrasp.services.assets.hands.findings import Finding, read_findings
 from congrasp.services.ops.lifetime import Child, command, run_child
 from congrasp.services.train.presets import FULL, get_preset
 from congrasp.services.train.processes import train_in_background, trained, training_seconds

@@ -30,38 +30,31 @@ from congrasp.services.assets.captures.sequence import (
     read_or_drop,
 )
 
-_LARGEST_YAML, _DEEPEST_YAML = 64 << 10, 16
+_MAX_YAML_BYTES = 64 << 10
+_MAX_YAML_DEPTH = 16
 HOLDS = "<date>-subject-01/<session>/meta.yml"
 OBJECTS = (
-    *(
-        "002_master_chef_can",
-        "003_cracker_box",
-        "004_sugar_box",
-        "005_tomato_soup_can",
-        "006_mustard_bottle",
-    ),
-    *(
-        "007_tuna_fish_can",
-        "008_pudding_box",
-        "009_gelatin_box",
-        "010_potted_meat_can",
-        "011_banana",
-    ),
-    *(
-        "019_pitcher_base",
-        "021_bleach_cleanser",
-        "024_bowl",
-        "025_mug",
-        "035_power_drill",
-        "036_wood_block",
-    ),
-    *(
-        "037_scissors",
-        "040_large_marker",
-        "051_large_clamp",
-        "052_extra_large_clamp",
-        "061_foam_brick",
-    ),
+    "002_master_chef_can",
+    "003_cracker_box",
+    "004_sugar_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "007_tuna_fish_can",
+    "008_pudding_box",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+    "011_banana",
+    "019_pitcher_base",
+    "021_bleach_cleanser",
+    "024_bowl",
+    "025_mug",
+    "035_power_drill",
+    "036_wood_block",
+    "037_scissors",
+    "040_large_marker",
+    "051_large_clamp",
+    "052_extra_large_clamp",
+    "061_foam_brick",
 )
 """Names by DexYCB's ids, from 1."""
 
@@ -79,13 +72,19 @@ def read(
             "DexYCB's hand poses need your copy of MANO_RIGHT.pkl.",
             f"Pass it with --mano, or set {VARIABLE}.",
         )
-    root = next(
-        (folder for folder in (path, *path.parents) if (folder / "calibration").is_dir()), path
-    )
-    found = meshes.beside(root / "models")
+    root = _root(path)
+    all_meshes = meshes.beside(root / "models")
     for file in sorted(path.glob("**/meta.yml")):
         name = f"{file.parent.parent.name}/{file.parent.name}"
-        yield read_or_drop(name, _sequence, name, file.parent, root, found, model)
+        yield read_or_drop(name, _sequence, name, file.parent, root, all_meshes, model)
+
+
+def _root(path: pathlib.Path) -> pathlib.Path:
+    """Folder that holds `calibration`, at or above the path."""
+    for folder in (path, *path.parents):
+        if (folder / "calibration").is_dir():
+            return folder
+    return path
 
 
 def _sequence(
@@ -96,7 +95,8 @@ def _sequence(
     sides = _value(name, meta, "mano_sides")
     if sides != ["right"]:
         raise Dropped(name, "left hand", f"the hand is the {', '.join(map(str, sides))} one")
-    ids, grasped = _value(name, meta, "ycb_ids"), int(_value(name, meta, "ycb_grasp_ind"))
+    ids = _value(name, meta, "ycb_ids")
+    grasped = int(_value(name, meta, "ycb_grasp_ind"))
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
         raise Dropped(
             name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}"
@@ -113,14 +113,17 @@ def _sequence(
             "wrong layout",
             f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not match meta.yml",
         )
-    place, hand = objects[:, grasped], hands[:, 0]
-    present = np.isfinite(place).all(-1) & (place[:, 4:] != 0).any(-1) & is_unit(place[:, :4])
-    present &= np.isfinite(hand).all(-1) & (hand != 0).any(-1)
-    place, hand = known_frames(name, present, place, hand)
+    object_pose = objects[:, grasped]
+    hand = hands[:, 0]
+    has_position = (object_pose[:, 4:] != 0).any(-1)
+    has_object = np.isfinite(object_pose).all(-1) & has_position & is_unit(object_pose[:, :4])
+    has_hand = np.isfinite(hand).all(-1) & (hand != 0).any(-1)
+    present = has_object & has_hand
+    object_pose, hand = known_frames(name, present, object_pose, hand)
     skeleton = human.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
     angles = model.hand_mean + hand[:, 3:48] @ model.components
     wrist, joints = skeleton.posed(
-        *map(Rotation.from_rotvec, (hand[:, :3], angles.reshape(-1, 15, 3)))
+        Rotation.from_rotvec(hand[:, :3]), Rotation.from_rotvec(angles.reshape(-1, 15, 3))
     )
     object_name = OBJECTS[ids[grasped] - 1]
     return Sequence(
@@ -130,8 +133,8 @@ def _sequence(
         wrist_position=skeleton.wrist + hand[:, 48:],
         wrist_rotation=wrist,
         joints=joints,
-        object_position=place[:, 4:],
-        object_rotation=Rotation.from_quat(place[:, :4]).as_matrix(),
+        object_position=object_pose[:, 4:],
+        object_rotation=Rotation.from_quat(object_pose[:, :4]).as_matrix(),
         present=present,
     )
 
@@ -141,7 +144,7 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
     try:
-        text = read_file(path, _LARGEST_YAML)
+        text = read_file(path, _MAX_YAML_BYTES)
         _check_structure(text)
         content = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -157,11 +160,12 @@ def _check_structure(text: bytes) -> None:
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError("it repeats its values")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
-            event, yaml.CollectionEndEvent
-        )
-        if depth > _DEEPEST_YAML:
-            raise ValueError(f"its values are more than {_DEEPEST_YAML} deep inside one another")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _MAX_YAML_DEPTH:
+            raise ValueError(f"its values are more than {_MAX_YAML_DEPTH} deep inside one another")
 
 
 def _value(name: str, meta: dict[str, Any], key: str) -> Any:
@@ -173,9 +177,8 @@ def _value(name: str, meta: dict[str, Any], key: str) -> Any:
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
     """Shape parameters (10,) of a calibration."""
-    content = _yaml(
-        name, root / "calibration" / file_name(f"mano_{calibration}", "a calibration") / "mano.yml"
-    )
+    folder = root / "calibration" / file_name(f"mano_{calibration}", "a calibration")
+    content = _yaml(name, folder / "mano.yml")
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):
         raise Dropped(

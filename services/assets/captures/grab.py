@@ -27,7 +27,7 @@ from congrasp.services.assets.captures.sequence import (
 )
 
 HOLDS = "s1/*.npz and the other subjects"
-_LABELS = {
+_CONTACT_LABELS = {
     "thumb": (53, 55),
     "index": (41, 43),
     "middle": (44, 46),
@@ -35,6 +35,21 @@ _LABELS = {
     "little": (47, 49),
 }
 """First and last contact label of each right finger."""
+_WRIST_ROTATION = "rhand/params/global_orient"
+_WRIST_TRANSLATION = "rhand/params/transl"
+_FINGER_ROTATIONS = "rhand/params/fullpose"
+_OBJECT_TRANSLATION = "object/params/transl"
+_OBJECT_ROTATION = "object/params/global_orient"
+_FIELD_WIDTHS = {
+    _WRIST_ROTATION: 3,
+    _WRIST_TRANSLATION: 3,
+    _FINGER_ROTATIONS: 45,
+    _OBJECT_TRANSLATION: 3,
+    _OBJECT_ROTATION: 3,
+}
+"""Numbers of a frame in each array that is read."""
+_GraspingFrames = dict[tuple[str, str], int]
+"""First grasping frame of each (subject, sequence)."""
 
 
 def read(
@@ -42,26 +57,32 @@ def read(
 ) -> Iterator[Sequence | Dropped]:
     """Yields the sequences of a file, or of all subjects' folders in a folder."""
     root = _root(path)
-    found = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
-    files = sorted(file for file in path.glob("**/s*/*.npz")) if path.is_dir() else [path]
-    named = _grasping_frames(root)
+    all_meshes = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
+    grasping_frames = _grasping_frames(root)
+    files = sorted(path.glob("**/s*/*.npz")) if path.is_dir() else [path]
     for file in files:
-        yield read_or_drop(file.stem, _sequence, file, root, found, model, named)
+        yield read_or_drop(file.stem, _sequence, file, root, all_meshes, model, grasping_frames)
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
     """Folder that holds `tools`, at or above the path."""
-    return next((folder for folder in (path, *path.parents) if (folder / "tools").is_dir()), path)
+    for folder in (path, *path.parents):
+        if (folder / "tools").is_dir():
+            return folder
+    return path
 
 
-def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
-    """First grasping frame of each (subject, sequence) named by GrabNet."""
-    first: dict[tuple[str, str], int] = {}
-    for file in sorted(root.glob("**/frame_names.npz")) if root.is_dir() else []:
+def _grasping_frames(root: pathlib.Path) -> _GraspingFrames:
+    """The grasping frames named by GrabNet."""
+    if not root.is_dir():
+        return {}
+    first: _GraspingFrames = {}
+    for file in sorted(root.glob("**/frame_names.npz")):
         for name in np.ravel(read_archive(file).get("frame_names", [])):
             *_, subject, sequence, frame = str(name).split("/")
-            number = int("".join(filter(str.isdigit, frame.removesuffix(".npz"))))
-            key = subject, sequence
+            digits = filter(str.isdigit, frame.removesuffix(".npz"))
+            number = int("".join(digits))
+            key = (subject, sequence)
             first[key] = min(first.get(key, number), number)
     return first
 
@@ -71,48 +92,50 @@ def _sequence(
     root: pathlib.Path,
     meshes: Meshes,
     model: ManoModel | None,
-    named: dict[tuple[str, str], int],
+    grasping_frames: _GraspingFrames,
 ) -> Sequence:
     """Reads the sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
-    parts = {key.partition("/")[0] for key in data}
-    if "rhand" not in parts and "lhand" in parts:
+    bodies = {key.partition("/")[0] for key in data}
+    if "rhand" not in bodies and "lhand" in bodies:
         raise Dropped(name, "left hand", "it has no right hand")
-    arrays = frames_of(name, "the file", data, {key: (width,) for key, width in _WIDTHS.items()})
+    shapes = {field: (width,) for field, width in _FIELD_WIDTHS.items()}
+    arrays = frames_of(name, "the file", data, shapes)
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
     skeleton = _skeleton(model, _template(root, data))
-    frames, grasp = len(arrays[0]), named.get((file.parent.name, file.stem))
+    frame_count = len(arrays[0])
     present = np.isfinite(np.concatenate(arrays, 1)).all(-1)
-    turn, shift, fingers, object_shift, object_turn = known_frames(name, present, *arrays)
-    wrist, joints = skeleton.posed(*map(Rotation.from_rotvec, (turn, fingers.reshape(-1, 15, 3))))
+    fields = dict(zip(shapes, known_frames(name, present, *arrays), strict=True))
+    finger_rotations = fields[_FINGER_ROTATIONS].reshape(-1, 15, 3)
+    wrist, joints = skeleton.posed(
+        Rotation.from_rotvec(fields[_WRIST_ROTATION]), Rotation.from_rotvec(finger_rotations)
+    )
+    grasp = grasping_frames.get((file.parent.name, file.stem))
+    if grasp is not None and grasp >= frame_count:
+        grasp = None
     return Sequence(
         name=name,
         object_name=object_name,
         mesh=meshes.find(name, object_name),
-        wrist_position=skeleton.wrist + shift,
+        wrist_position=skeleton.wrist + fields[_WRIST_TRANSLATION],
         wrist_rotation=wrist,
         joints=joints,
-        object_position=object_shift,
-        object_rotation=Rotation.from_rotvec(object_turn).inv().as_matrix(),
+        object_position=fields[_OBJECT_TRANSLATION],
+        object_rotation=Rotation.from_rotvec(fields[_OBJECT_ROTATION]).inv().as_matrix(),
         present=present,
-        grasp=grasp if grasp is not None and grasp < frames else None,
-        touching=_touching(data, frames),
+        grasp=grasp,
+        touching=_touching(data, frame_count),
     )
 
 
-_WIDTHS = {
-    **{"rhand/params/global_orient": 3, "rhand/params/transl": 3, "rhand/params/fullpose": 45},
-    **{"object/params/transl": 3, "object/params/global_orient": 3},
-}
-
-
 def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path | None:
-    """Mesh of the subject's right hand, if it exists."""
-    text = data.get("rhand/vtemp")
-    path = root / str(text) if text is not None else None
-    inside = path is not None and path.resolve().is_relative_to(root.resolve())
-    return path if path is not None and inside and path.is_file() else None
+    """Mesh of the subject's right hand, if it exists in the folder."""
+    if "rhand/vtemp" not in data:
+        return None
+    path = root / str(data["rhand/vtemp"])
+    is_inside = path.resolve().is_relative_to(root.resolve())
+    return path if is_inside and path.is_file() else None
 
 
 @functools.lru_cache(maxsize=32)
@@ -121,15 +144,13 @@ def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> human.S
     return human.skeleton(model, template=template)
 
 
-def _touching(data: dict[str, np.ndarray], frames: int) -> np.ndarray | None:
-    """Contact flags (T, 5), from the labels of the object's contacts."""
+def _touching(data: dict[str, np.ndarray], frame_count: int) -> np.ndarray | None:
+    """Contact flags (T, 5), from the labels of the object's contacts; None without labels."""
     labels = data.get("contact/object")
-    if labels is None or labels.ndim != 2 or len(labels) != frames:
+    if labels is None or labels.ndim != 2 or len(labels) != frame_count:
         return None
-    return np.stack(
-        [
-            ((labels >= low) & (labels <= high)).any(-1)
-            for low, high in (_LABELS[f] for f in FINGERS)
-        ],
-        -1,
-    )
+    touching = []
+    for finger in FINGERS:
+        low, high = _CONTACT_LABELS[finger]
+        touching.append(((labels >= low) & (labels <= high)).any(-1))
+    return np.stack(touching, -1)

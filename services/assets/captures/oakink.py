@@ -13,7 +13,7 @@ import collections
 import functools
 import pathlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,9 +35,30 @@ from congrasp.services.assets.captures.sequence import (
 from congrasp.services.assets.objects.mesh_files import read_mesh
 
 HOLDS = "anno/seq_all.json"
-_LARGEST_JSON = 256 << 20
+_MAX_JSON_BYTES = 256 << 20
 _REMEDY = "Download the file again."
+_OBJECT_POSE = "obj_anno"
+_HAND_SHAPES = {
+    "hand_anno/hand_pose": (16, 4),
+    "hand_anno/hand_shape": (10,),
+    "hand_anno/hand_tsl": (3,),
+}
+"""Shapes of the arrays of a hand."""
 _Frames = list[tuple[int, str]]
+"""Frame and file stem of each annotation, sorted."""
+
+
+class _Frame(NamedTuple):
+    """Annotation of a frame."""
+
+    hand_pose: np.ndarray
+    """(16, 4) quaternions."""
+    hand_shape: np.ndarray
+    """(10,)."""
+    wrist: np.ndarray
+    """(3,) m."""
+    object_pose: np.ndarray
+    """(4, 4)."""
 
 
 def read(
@@ -55,27 +76,26 @@ def read(
             f"There is no {index}.", "Pass the folder that holds OakInk-Image's 'anno'."
         )
     try:
-        sequences = _sequences(read_json(index, _LARGEST_JSON, _REMEDY))
+        sequences = _sequences(read_json(index, _MAX_JSON_BYTES, _REMEDY))
     except (TypeError, ValueError):
         raise CongraspError(
             f"{index} holds other rows than [sequence, subject, frame, camera].", _REMEDY
         ) from None
-    found = meshes.beside(root / "obj", path / "obj")
+    all_meshes = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
+    folder = root / "anno" / "general_info"
     for (name, _), frames in sorted(sequences.items()):
-        folder = root / "anno" / "general_info"
-        yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
+        yield read_or_drop(name, _sequence, name, frames, folder, all_meshes, model, names, path)
 
 
 def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
-    """(frame, file stem) of each sequence and subject, sorted, of the camera with the lowest
-    number.
-    """
+    """Frames of each sequence and subject, of the camera with the lowest number."""
     cameras: dict[tuple[str, int], dict[int, _Frames]] = collections.defaultdict(
         lambda: collections.defaultdict(list)
     )
     for sequence, subject, frame, camera in rows:
-        stem = "__".join([str(sequence).replace("/", "__"), str(subject), str(frame), str(camera)])
+        words = [str(sequence).replace("/", "__"), str(subject), str(frame), str(camera)]
+        stem = "__".join(words)
         cameras[str(sequence), int(subject)][int(camera)].append((int(frame), stem))
     return {key: sorted(of_camera[min(of_camera)]) for key, of_camera in cameras.items()}
 
@@ -84,10 +104,8 @@ def _names(path: pathlib.Path) -> dict[str, str]:
     """Names of objects by id."""
     names: dict[str, str] = {}
     for file in sorted(path.glob("**/metaV2/*object_id.json")):
-        names |= {
-            key: str(value.get("name", key))
-            for key, value in read_json(file, _LARGEST_JSON, _REMEDY).items()
-        }
+        for key, value in read_json(file, _MAX_JSON_BYTES, _REMEDY).items():
+            names[key] = str(value.get("name", key))
     return names
 
 
@@ -105,60 +123,69 @@ def _sequence(
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id, object_name)
     files = [folder / f"{file_name(stem, 'a frame')}.pkl" for _, stem in frames]
-    there = [file for file in files if file.is_file()]
-    contents = dict(
-        zip(
-            there,
-            read_pickles((str(file), read_file(file, MAX_BYTES)) for file in there),
-            strict=True,
-        )
-    )
-    rows = [_frame(name, file.name, contents[file]) if file in contents else None for file in files]
-    known = next((row for row in rows if row is not None), None)
+    annotations = _annotations(name, files)
+    known = next((frame for frame in annotations if frame is not None), None)
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
-    pose, shape, wrist, place = (np.stack([(row or known)[i] for row in rows]) for i in range(4))
-    if (wrong := np.isfinite(pose).all(-1) & ~is_unit(pose)).any():
-        length = np.linalg.norm(pose[wrong][0])
-        raise Dropped(
-            name, "wrong layout", f"a quaternion of 'hand_pose' has the length {length:.3g}"
-        )
-    palm, fingers = (
-        Rotation.from_quat(part, scalar_first=True) for part in (pose[:, 0], pose[:, 1:])
-    )
-    wrist_turn, joints = human.skeleton(model, shape[0]).posed(palm, fingers)
-    turn = place[:, :3, :3]
+    filled = [frame or known for frame in annotations]
+    pose = np.stack([frame.hand_pose for frame in filled])
+    object_pose = np.stack([frame.object_pose for frame in filled])
+    _check_unit(name, pose)
+    palm = Rotation.from_quat(pose[:, 0], scalar_first=True)
+    fingers = Rotation.from_quat(pose[:, 1:], scalar_first=True)
+    skeleton = human.skeleton(model, filled[0].hand_shape)
+    wrist_rotation, joints = skeleton.posed(palm, fingers)
+    object_rotation = object_pose[:, :3, :3]
     return Sequence(
         name=name,
         object_name=object_name,
         mesh=mesh,
-        wrist_position=wrist,
-        wrist_rotation=wrist_turn,
+        wrist_position=np.stack([frame.wrist for frame in filled]),
+        wrist_rotation=wrist_rotation,
         joints=joints,
-        object_position=place[:, :3, 3] - turn @ _middle(mesh),
-        object_rotation=turn,
-        present=np.array([row is not None for row in rows]),
+        object_position=object_pose[:, :3, 3] - object_rotation @ _middle(mesh),
+        object_rotation=object_rotation,
+        present=np.array([frame is not None for frame in annotations]),
         parts=_parts(root, object_name, object_id),
     )
 
 
-_HAND = {"hand_anno/hand_pose": (16, 4), "hand_anno/hand_shape": (10,), "hand_anno/hand_tsl": (3,)}
+def _annotations(name: str, files: list[pathlib.Path]) -> list[_Frame | None]:
+    """Annotations of a sequence's frames; None for missing ones."""
+    existing = [file for file in files if file.is_file()]
+    pickles = read_pickles((str(file), read_file(file, MAX_BYTES)) for file in existing)
+    contents = dict(zip(existing, pickles, strict=True))
+    annotations = []
+    for file in files:
+        frame = None
+        if file in contents:
+            frame = _frame(name, file.name, contents[file])
+        annotations.append(frame)
+    return annotations
 
 
-def _frame(name: str, file: str, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
-    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None without a hand or
-    object.
-    """
-    known = {key.partition("/")[0] for key in content}
-    for key in ("hand_anno", "obj_anno"):
-        if key not in known:
+def _check_unit(name: str, pose: np.ndarray) -> None:
+    """Drops a sequence of hand poses (T, 16, 4) whose quaternions are not of length one."""
+    is_wrong = np.isfinite(pose).all(-1) & ~is_unit(pose)
+    if is_wrong.any():
+        length = np.linalg.norm(pose[is_wrong][0])
+        raise Dropped(
+            name, "wrong layout", f"a quaternion of 'hand_pose' has the length {length:.3g}"
+        )
+
+
+def _frame(name: str, file: str, content: dict[str, np.ndarray]) -> _Frame | None:
+    """The annotation in a file; None without a hand or object."""
+    bodies = {key.partition("/")[0] for key in content}
+    for key in ("hand_anno", _OBJECT_POSE):
+        if key not in bodies:
             raise Dropped(name, "wrong layout", f"{file} has no '{key}'")
         if key in content and not content[key].size:
             return None
-    return tuple(
-        array_of(name, file, content, key, *shape)
-        for key, shape in (_HAND | {"obj_anno": (4, 4)}).items()
-    )
+    hand = [array_of(name, file, content, key, *shape) for key, shape in _HAND_SHAPES.items()]
+    hand_pose, hand_shape, wrist = hand
+    object_pose = array_of(name, file, content, _OBJECT_POSE, 4, 4)
+    return _Frame(hand_pose, hand_shape, wrist, object_pose)
 
 
 @functools.lru_cache(maxsize=64)
@@ -170,18 +197,23 @@ def _middle(mesh: pathlib.Path) -> np.ndarray:
 @functools.lru_cache(maxsize=64)
 def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
     """Labelled parts of an object in OakBase; empty if it is missing."""
-    folder = next(
-        (f for name in names for f in sorted(root.glob(f"**/OakBase/*/{name}")) if f.is_dir()), None
-    )
+    folder = _part_folder(root, names)
     if folder is None:
         return ()
     parts = []
     for file in sorted(folder.glob("part_*.ply")):
         labels = file.with_suffix(".json")
-        label = (
-            read_json(labels, _LARGEST_JSON, _REMEDY).get("name", file.stem)
-            if labels.is_file()
-            else file.stem
-        )
-        parts.append(Part(str(label), human.read_vertices(file)))
+        label = file.stem
+        if labels.is_file():
+            label = str(read_json(labels, _MAX_JSON_BYTES, _REMEDY).get("name", file.stem))
+        parts.append(Part(label, human.read_vertices(file)))
     return tuple(parts) if len(parts) > 1 else ()
+
+
+def _part_folder(root: pathlib.Path, names: tuple[str, ...]) -> pathlib.Path | None:
+    """Folder of an object's parts, by the first of its names that has one."""
+    for name in names:
+        for folder in sorted(root.glob(f"**/OakBase/*/{name}")):
+            if folder.is_dir():
+                return folder
+    return None

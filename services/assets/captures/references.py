@@ -1,5 +1,4 @@
-"""References of a hand from demonstrations: those that it cannot take are refused, and overlapping
-fingers separated.
+"""References of a hand from demonstrations: checked, transferred, and with separated fingers.
 
 A human's finger angles and wrist do not apply to a robot hand. Its hand centre is placed at the
 human one, with the grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones;
@@ -37,9 +36,10 @@ DEEPEST = 0.01
 """Tolerated depth of skin in the object, similar to the error of captured hands, m."""
 OVERLAP = 0.001
 """Tolerated overlap of two links, as skin and flesh give way, m."""
-_ITERATIONS = 100
+_MAX_ITERATIONS = 100
 _ALONG = np.linspace(0.0, 1.0, 5)[:, None]
-_AT_ONCE = 20
+"""Shares of a capsule's axis at which its depth is computed."""
+_POSES_AT_ONCE = 20
 """Number of poses closed in one compiled call."""
 
 
@@ -55,30 +55,34 @@ def check_reference(
       obj: the unscaled object.
       scale: factor on the object's lengths for the hand.
     """
-    wide, opening = scale * width(demonstration), widest_gap(hand)
-    if wide > opening:
+    touched_width = scale * width(demonstration)
+    opening = widest_gap(hand)
+    if touched_width > opening:
         reason = (
-            f"thumb and fingers touch it {100 * wide:.1f} cm apart, but the hand opens only "
-            f"{100 * opening:.1f} cm"
+            f"thumb and fingers touch it {100 * touched_width:.1f} cm apart, but the hand opens "
+            f"only {100 * opening:.1f} cm"
         )
         raise Dropped(demonstration.name, "too wide", reason)
-    deep = depth(demonstration, obj) if hand is HUMAN else 0.0
-    if deep > DEEPEST:
+    skin_depth = depth(demonstration, obj) if hand is HUMAN else 0.0
+    if skin_depth > DEEPEST:
         reason = (
-            f"the hand is {1000 * deep:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm at most)"
+            f"the hand is {1000 * skin_depth:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm "
+            f"at most)"
         )
         raise Dropped(demonstration.name, "too deep", reason)
 
 
 def width(demonstration: Demonstration) -> float:
-    """Extent of the touched points along the cross-finger axis, m."""
+    """Returns the extent of the touched points along the cross-finger axis, m."""
     turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
     along = demonstration.contact @ turn.apply(grasp_frame(HUMAN).cross)
     return float(np.ptp(along)) if len(along) else 0.0
 
 
 def depth(demonstration: Demonstration, obj: GraspObject) -> float:
-    """Depth in m of the human hand's skin in a piece of the object; negative without contact.
+    """Returns the depth of the human hand's skin in a piece of the object, m.
+
+    It is negative without contact.
 
     It is exact if a finger's axis is in the piece, and an upper bound beyond its edges.
     """
@@ -97,38 +101,37 @@ def _capsules(hand: Hand, q: Array) -> Array:
 
 
 def _above_faces(piece: Piece, points: np.ndarray) -> np.ndarray:
-    """Greatest height (N,) of points (N, 3) above the planes of a piece's faces, m; negative
-    inside.
-    """
+    """Signed distances (N,) of points (N, 3) to the planes of a piece, negative inside, m."""
     vertices, _ = tessellate(piece)
     planes = hull_of(vertices).equations
     return np.asarray((points @ planes[:, :3].T + planes[:, 3]).max(-1))
 
 
 def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float) -> Headings:
-    """Hand centres (M, 3) m, heading axes and cross-finger axes (M, 3) of the captured grasps,
-    object frame.
+    """Returns the headings of the captured grasps: M hand centres, m, and axes, object frame.
 
     Args:
       demonstrations: M demonstrations on one object.
       scale: factor on the object's lengths.
     """
     frame = grasp_frame(HUMAN)
-    turns = Rotation.from_quat([d.quaternion[-1] for d in demonstrations], scalar_first=True)
-    center = turns.apply(_centers(demonstrations)) + [d.position[-1] for d in demonstrations]
-    rows = scale * center, turns.apply(frame.heading), turns.apply(frame.cross)
-    return Headings(*(row.astype(np.float32) for row in rows))
+    quaternions = [demonstration.quaternion[-1] for demonstration in demonstrations]
+    positions = [demonstration.position[-1] for demonstration in demonstrations]
+    turns = Rotation.from_quat(quaternions, scalar_first=True)
+    centers = scale * (turns.apply(_centers(demonstrations)) + positions)
+    heading_axes = turns.apply(frame.heading)
+    cross_axes = turns.apply(frame.cross)
+    return Headings(*(rows.astype(np.float32) for rows in (centers, heading_axes, cross_axes)))
 
 
 def transferred(
     hand: Hand, demonstrations: Sequence[Demonstration], obj: GraspObject, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Reference poses and wrist trajectories of another hand that follow M demonstrations on one
-    object.
+    """Returns reference poses and wrist trajectories of another hand that follow demonstrations.
 
     Args:
       hand: any hand.
-      demonstrations: demonstrations on one object.
+      demonstrations: M demonstrations on one object.
       obj: object scaled for the hand.
       scale: factor of this scaling.
 
@@ -137,32 +140,42 @@ def transferred(
       (M, K, 4) of its wrist in the object frame.
     """
     headings = demonstrated_headings(demonstrations, scale)
-    surface = obj.points.astype(np.float32), obj.normals.astype(np.float32)
-    rows = np.resize(
-        np.arange(len(demonstrations)), (-(-len(demonstrations) // _AT_ONCE), _AT_ONCE)
-    )
-    parts = [closed_poses(hand, *surface, *(field[some] for field in headings)) for some in rows]
-    q, end = (
-        np.concatenate([np.asarray(part[i]) for part in parts])[: len(demonstrations)]
-        for i in (0, 1)
-    )
-    onto = _onto_human(hand)
-    positions, quaternions = [], []
-    for demonstration, center, last in zip(
-        demonstrations, _centers(demonstrations), end, strict=True
-    ):
+    q, last_positions = _closed_at(hand, headings, obj)
+    onto_human = _onto_human(hand)
+    centers = _centers(demonstrations)
+    positions = []
+    quaternions = []
+    for i, demonstration in enumerate(demonstrations):
         human = Rotation.from_quat(demonstration.quaternion, scalar_first=True)
-        turn = human * onto
-        path = scale * (human.apply(center) + demonstration.position)
+        turn = human * onto_human
+        center_path = scale * (human.apply(centers[i]) + demonstration.position)
         # The hand centre of the closed hand in the wrist frame follows from the last pose.
-        positions.append(path - turn.apply(turn[-1].inv().apply(path[-1] - last)))
+        center = turn[-1].inv().apply(center_path[-1] - last_positions[i])
+        positions.append(center_path - turn.apply(center))
         quaternions.append(continuous(turn.as_quat(scalar_first=True)))
     return q, np.array(positions), np.array(quaternions)
 
 
+def _closed_at(hand: Hand, headings: Headings, obj: GraspObject) -> tuple[np.ndarray, np.ndarray]:
+    """Finger angles (M, F) and wrist positions (M, 3) m of a hand that closes at M headings."""
+    points = obj.points.astype(np.float32)
+    normals = obj.normals.astype(np.float32)
+    count = len(headings[0])
+    batches = -(-count // _POSES_AT_ONCE)
+    q = []
+    positions = []
+    for rows in np.resize(np.arange(count), (batches, _POSES_AT_ONCE)):
+        fields = [field[rows] for field in headings]
+        closed = closed_poses(hand, points, normals, *fields)
+        q.append(np.asarray(closed[0]))
+        positions.append(np.asarray(closed[1]))
+    return np.concatenate(q)[:count], np.concatenate(positions)[:count]
+
+
 def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
-    """Path of the wrist of a hand whose open grasp moves like that of a human hand, for captures
-    without fingers.
+    """Returns the path of a hand's wrist whose open grasp moves like that of a human hand.
+
+    It is for captures without fingers.
 
     Args:
       hand: any hand.
@@ -170,14 +183,14 @@ def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.n
       rotation: T orientations of its frame, that of the `human` hand.
     """
     turn = rotation * _onto_human(hand)
-    return position + rotation.apply(grasp_frame(HUMAN).center) - turn.apply(
-        grasp_frame(hand).center
-    ), turn
+    centers = position + rotation.apply(grasp_frame(HUMAN).center)
+    return centers - turn.apply(grasp_frame(hand).center), turn
 
 
 def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
-    """Centres (M, 3) of the human hand in its wrist frame, m: between the thumb's tip and the mean
-    of the others.
+    """Centres (M, 3) of the human hand in its wrist frame, m.
+
+    They are between the thumb's tip and the mean of the others.
     """
     tips = joint_positions(np.stack([d.q for d in demonstrations]))[:, :, 3]
     return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
@@ -205,53 +218,70 @@ def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
       hand: any hand.
       q: (M, F) rad, within the limits; poses within the limit are returned unchanged.
     """
-    deep = np.asarray(deepest(hand, q)) > OVERLAP
-    return np.stack(
-        [_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)]
-    )
+    overlap = np.asarray(deepest(hand, q)) > OVERLAP
+    poses = []
+    for pose, overlaps_too_far in zip(q, overlap, strict=True):
+        poses.append(_apart(hand, pose) if overlaps_too_far else pose)
+    return np.stack(poses)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def deepest(hand: Hand, q: Array) -> Array:
-    """Greatest overlap (M,) of two links at finger angles (M, F), m; 0 if there is none."""
+    """Returns the greatest overlap (M,) of two links at finger angles (M, F), m; 0 if none."""
     return jnp.maximum(overlaps(hand, link_transforms(hand, q)).max(-1), 0.0)
 
 
 def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
     """Separates one pose (F,)."""
-    own, motors = transmission(hand), range(len(hand.motors))
-    # Range of each motor until the first of its joints is at a limit.
-    ends = np.sort([(limit - q) / own.ratio for limit in (hand.lower, hand.upper)], axis=0)
-    bounds = [
-        (min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0))
-        for m in motors
-    ]
-    weight = np.bincount(own.motor, own.ratio**2)
-    found = minimize(
+    drive = transmission(hand)
+    weight = np.bincount(drive.motor, drive.ratio**2)
+    result = minimize(
         lambda way: (0.5 * weight @ way**2, weight * way),
         np.zeros(len(weight)),
         jac=True,
         method="SLSQP",
-        bounds=bounds,
+        bounds=_motor_bounds(hand, q),
         constraints={
             "type": "ineq",
             "fun": lambda way: np.asarray(_room(hand, q, way), float),
             # For two intersecting axes the direction of separation is undefined.
             "jac": lambda way: np.nan_to_num(np.asarray(_room_change(hand, q, way), float)),
         },
-        options={"maxiter": _ITERATIONS},
+        options={"maxiter": _MAX_ITERATIONS},
     )
-    apart = np.clip(q + own.ratio * found.x[own.motor], hand.lower, hand.upper).astype(q.dtype)
+    moved = q + drive.ratio * result.x[drive.motor]
+    apart = np.clip(moved, hand.lower, hand.upper).astype(q.dtype)
     before, after = deepest(hand, np.stack([q, apart]))
     return apart if after < before else q
 
 
-def _room_of(hand: Hand, q: Array, way: Array) -> Array:
-    """Remaining clearance (Q,) in mm of pairs of links after a motion (M,) of the motors from
-    angles (F,).
+def _motor_bounds(hand: Hand, q: np.ndarray) -> list[tuple[float, float]]:
+    """Range of each motor's motion from a pose (F,), until the first of its joints is at a limit.
+
+    Zero is always within it.
     """
-    own = transmission(hand)
-    return 1e3 * (OVERLAP - overlaps(hand, link_transforms(hand, q + own.ratio * way[own.motor])))
+    drive = transmission(hand)
+    ends = np.sort([(limit - q) / drive.ratio for limit in (hand.lower, hand.upper)], axis=0)
+    bounds = []
+    for motor in range(len(hand.motors)):
+        is_moved = drive.motor == motor
+        low = min(ends[0][is_moved].max(), 0.0)
+        high = max(ends[1][is_moved].min(), 0.0)
+        bounds.append((low, high))
+    return bounds
+
+
+def _room_of(hand: Hand, q: Array, way: Array) -> Array:
+    """Remaining clearance (Q,) in mm of pairs of links after a motion of the motors.
+
+    Args:
+      hand: any hand.
+      q: (F,) finger angles before it, rad.
+      way: (M,) the motion.
+    """
+    drive = transmission(hand)
+    moved = q + drive.ratio * way[drive.motor]
+    return 1e3 * (OVERLAP - overlaps(hand, link_transforms(hand, moved)))
 
 
 _room = jax.jit(_room_of, static_argnums=0)

@@ -1,5 +1,4 @@
-"""Output of importers: one captured grasp of one object by a right hand, in metres, in any world
-frame.
+"""Output of importers: a captured grasp of one object by a right hand, in any world frame, m.
 
 Importers share `frames_of`, `array_of`, `known_frames` and `Meshes`.
 
@@ -20,6 +19,17 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
 from congrasp.services.assets.objects.file_kinds import SUFFIXES
 
+_MAX_REASON_LENGTH = 200
+_UNIT_TOLERANCE = 0.05
+"""Largest deviation of a quaternion's length from one."""
+_FRAME_FIELDS = (
+    "wrist_position",
+    "wrist_rotation",
+    "joints",
+    "object_position",
+    "object_rotation",
+)
+"""Fields of a sequence that have a value for each frame."""
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
@@ -34,7 +44,9 @@ class Dropped(Exception):
 
     def __init__(self, name: str, rule: str, reason: str):
         super().__init__(f"{name}: {reason}")
-        self.name, self.rule, self.reason = name, rule, reason
+        self.name = name
+        self.rule = rule
+        self.reason = reason
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +60,9 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """T frames of a hand and an object. Rotations are matrices from a body's frame to the world
-    frame.
+    """T frames of a hand and an object.
+
+    Rotations are matrices from a body's frame to the world frame.
     """
 
     name: str
@@ -81,13 +94,7 @@ class Sequence:
 
     def __post_init__(self) -> None:
         frames = len(self.present)
-        for field in (
-            "wrist_position",
-            "wrist_rotation",
-            "joints",
-            "object_position",
-            "object_rotation",
-        ):
+        for field in _FRAME_FIELDS:
             values = getattr(self, field)
             if len(values) != frames:
                 raise Dropped(
@@ -100,8 +107,12 @@ class Sequence:
 
 
 def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
-    """Returns the result of `read(*arguments)`, or the reason why the sequence of this name cannot
-    be used.
+    """Reads a sequence, or returns the reason why it cannot be used.
+
+    Args:
+      name: name of the sequence.
+      read: function that reads it.
+      arguments: arguments of the function.
     """
     try:
         return read(*arguments)
@@ -109,15 +120,9 @@ def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> S
         return dropped
     except (CongraspError, OSError) as error:
         return Dropped(name, "unreadable", " ".join(str(error).split()))
-    except (
-        AttributeError,
-        LookupError,
-        TypeError,
-        ValueError,
-    ) as error:  # values of other types than expected
-        return Dropped(
-            name, "wrong layout", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        )
+    except (AttributeError, LookupError, TypeError, ValueError) as error:  # values of other types
+        message = " ".join(str(error).split())[:_MAX_REASON_LENGTH]
+        return Dropped(name, "wrong layout", f"{type(error).__name__}: {message}")
 
 
 def array_of(
@@ -144,17 +149,24 @@ def array_of(
         raise Dropped(
             name, "wrong layout", f"'{key}' of {where} holds no numbers of one shape"
         ) from None
-    known = [size for size in shape if isinstance(size, int)]
-    if len(known) == len(shape) and array.size == math.prod(known):
-        return array.reshape(known)
-    pairs = zip(shape, array.shape, strict=False)
-    if array.ndim != len(shape) or any(
-        wanted != size for wanted, size in pairs if isinstance(wanted, int)
-    ):
+    fixed_sizes = [size for size in shape if isinstance(size, int)]
+    if len(fixed_sizes) == len(shape) and array.size == math.prod(fixed_sizes):
+        return array.reshape(fixed_sizes)
+    if not _fits(array, shape):
         raise Dropped(
             name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}"
         )
     return array
+
+
+def _fits(array: np.ndarray, shape: tuple[int | str, ...]) -> bool:
+    """True for an array of these sizes, where a letter matches any."""
+    if array.ndim != len(shape):
+        return False
+    for expected, size in zip(shape, array.shape, strict=True):
+        if isinstance(expected, int) and size != expected:
+            return False
+    return True
 
 
 def frames_of(
@@ -171,17 +183,17 @@ def frames_of(
     Raises:
       Dropped: an array is missing, or has another shape or number of frames.
     """
-    found = [array_of(name, where, values, key, "T", *shape) for key, shape in shapes.items()]
-    counts = [len(array) for array in found]
+    arrays = [array_of(name, where, values, key, "T", *shape) for key, shape in shapes.items()]
+    counts = [len(array) for array in arrays]
     if len(set(counts)) > 1:
         text = ", ".join(f"'{key}' {count}" for key, count in zip(shapes, counts, strict=True))
         raise Dropped(name, "wrong layout", f"the numbers of frames in {where} differ: {text}")
-    return found
+    return arrays
 
 
 def is_unit(quaternions: np.ndarray) -> np.ndarray:
-    """(...) bool: quaternions (..., 4) that are of length one, but for rounding."""
-    return np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < 0.05
+    """Returns (...) bool: quaternions (..., 4) of length one, except for rounding."""
+    return np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < _UNIT_TOLERANCE
 
 
 def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
@@ -192,7 +204,8 @@ def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np
     """
     if not present.any():
         raise Dropped(name, "frames missing", "hand and object are in no frame together")
-    return [array[np.where(present, np.arange(len(present)), present.argmax())] for array in arrays]
+    frames = np.where(present, np.arange(len(present)), present.argmax())
+    return [array[frames] for array in arrays]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,8 +219,7 @@ class Meshes:
         return Meshes((*self.folders, *folders))
 
     def find(self, sequence: str, *names: str, inside: str = "") -> pathlib.Path:
-        """Finds the mesh file `<name>.*`, or the folder `<name>` with one, of the first name that
-        has either.
+        """Finds the mesh file `<name>.*`, or the folder `<name>`, of the first name with either.
 
         Args:
           sequence: name of the sequence that needs it.
@@ -220,14 +232,17 @@ class Meshes:
         for name in names:
             file_name(name, "the mesh of an object")
             for folder in self.folders:
-                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES] + [
-                    folder / name / inside
-                ] * bool(inside)
-                if mesh := next((file for file in files if file.is_file()), None):
-                    return mesh
+                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+                if inside:
+                    files.append(folder / name / inside)
+                for file in files:
+                    if file.is_file():
+                        return file
                 if (folder / name).is_dir():
                     return folder / name
-        where = f" in {', '.join(map(str, self.folders))}" if self.folders else ""
+        where = ""
+        if self.folders:
+            where = f" in {', '.join(map(str, self.folders))}"
         raise Dropped(
             sequence,
             "no mesh",

@@ -1,5 +1,4 @@
-"""Trials of a hand without a policy: motors follow a step, the empty hand closes, objects are
-gripped, lifted, pushed.
+"""Trials of a hand without a policy: steps of its motors, closing in free air, and grips.
 
 In free air, motors follow steps of their targets, and the empty hand closes. In a grip, a hand
 closes around a ball, a cylinder or a box and lifts it, and the object is then pushed.
@@ -42,21 +41,26 @@ wide.
 """
 DENSITY = 650.0
 """Density of the objects, the median of procedural ones, kg/m^3."""
-_PLACES = (0.0, 0.5, 1.0)
+_DEPTHS = (0.0, 0.5, 1.0)
 """Distances of the object from the hand centre towards the palm, in half widths."""
 _FIRMNESS = (0.3, 0.8)
 """Shares of the torque limits with which fingers press."""
 _SPEED = 0.06
 """Greatest closing speed of motors, rad per control step."""
-_CLOSE, _HOLD = 100, 50
-"""Durations in control steps."""
-
-
+_CLOSING_STEPS = 100
+"""Control steps in which the hand closes."""
+_HOLD_STEPS = 50
+"""Control steps without support before the lift."""
 STEP = 0.1
 """Step of a target in a control step, rad."""
-_STEPS = 60
-_SETTLED = 10  # last control steps, in which a joint should be at rest
-_FAR = (0.0, 0.0, -5.0)  # distance at which the scene's object is out of reach, m
+_RESPONSE_STEPS = 60
+"""Control steps of a response, and of the empty hand's closing."""
+_SETTLED_STEPS = 10
+"""Last control steps, in which a joint should be at rest."""
+_OUT_OF_REACH = (0.0, 0.0, -5.0)
+"""Position of the scene's object for a hand in free air, m."""
+_ANY_WIDTH = 0.04
+"""Width of that object, m."""
 
 
 class Grip(NamedTuple):
@@ -84,185 +88,6 @@ class Grip(NamedTuple):
         return (self.held, *map(int, self.survived.values()), int(self.touching.sum()))
 
 
-def grip_objects(width: float) -> list[GraspObject]:
-    """Returns a ball, a cylinder and a box of a width in metres; their length is along y."""
-    half = width / 2
-    pieces = (
-        draft.ellipsoid((half, half, half)),
-        draft.cylinder((0, -width, 0), (0, width, 0), half),
-        draft.box((half, width, half)),
-    )
-    return [
-        plain_object(name, (piece,), DENSITY) for name, piece in zip(OBJECTS, pieces, strict=True)
-    ]
-
-
-def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
-    """Returns the best attempt at each of `OBJECTS`, of the larger size, and of the smaller one
-    unless all survive.
-
-    Args:
-      hand: the hand.
-      task: the task, for its physics: time step, contacts, collisions.
-      threads: threads of the physics.
-    """
-    found: dict[str, Grip] = {}
-    for share in SIZES:
-        for grip in _attempts(hand, task, share * grasp_frame(hand).opening, threads):
-            if grip.obj.name not in found or grip.rank > found[grip.obj.name].rank:
-                found[grip.obj.name] = grip
-        if all(all(grip.survived.values()) for grip in found.values()):
-            break
-    return [found[name] for name in OBJECTS]
-
-
-def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[Grip]:
-    """Runs all attempts at objects of one width."""
-    objects = grip_objects(width)
-    tried = list(itertools.product(range(len(objects)), _PLACES, _FIRMNESS))
-    index, places, firmness = (np.array(column) for column in zip(*tried, strict=True))
-    physics = NativePhysics(hand, task, objects, threads)
-    try:
-        start = _start(hand, index, places * width / 2)
-        target = _close(physics, hand, start, firmness)
-        states = _shake(physics, hand, task, start, target, objects)
-    finally:
-        physics.close()
-    return _judged(task, start, states, objects, width)
-
-
-def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
-    """Open hands above objects fixed at the origin of the world frame, `depth` (B,) m from the hand
-    centre.
-    """
-    frame, count = grasp_frame(hand), len(index)
-    # To x, y and z
-    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])
-    ones, turn = np.ones(count), np.asarray(rotations.from_matrix(jnp.asarray(own)))
-    return ResetState(
-        object_index=index,
-        mass_scale=ones,
-        friction=ones,
-        gain_scale=ones,
-        base_position=-(frame.center - depth[:, None] * frame.heading) @ own.T,
-        base_quaternion=np.tile(turn, (count, 1)),
-        u_velocity=np.zeros((count, 6)),
-        q=np.tile(hand.q_open, (count, 1)),
-        object_position=np.zeros((count, 3)),
-        object_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        stationary=ones > 0,
-    )
-
-
-def _close(
-    physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray
-) -> np.ndarray:
-    """Targets (B, M) of fingers closed around the fixed object, which is then released."""
-    physics.start(start)
-    reach = firmness[:, None] * np.array([motor.torque_limit / motor.kp for motor in hand.motors])
-    q = target = motor_positions(hand, np.asarray(start.q))
-    goal = motor_positions(hand, hand.q_closed)
-    still, away = np.zeros((len(q), 6)), np.zeros(len(q), bool)
-    for _ in range(_CLOSE):
-        target = np.clip(target + np.clip(goal - target, -_SPEED, _SPEED), q - reach, q + reach)
-        _, state = physics.step(physics, np.concatenate([still, target], -1), away)
-        q = motor_positions(hand, np.asarray(state.q))
-    for instance in physics.instances:
-        instance.data.eq_active[instance.model.equality("hold").id] = False
-    return target
-
-
-def _shake(
-    physics: NativePhysics,
-    hand: Hand,
-    task: TaskConfig,
-    start: ResetState,
-    target: np.ndarray,
-    objects: Sequence[GraspObject],
-) -> PhysicsState:
-    """Simulates half a second without support, the lift, and the pushes; the states have a leading
-    axis T.
-    """
-    task = dataclasses.replace(task, approach_steps=0)
-    protocol, time = (
-        protocols.stress(task, objects, _HOLD),
-        np.arange(_HOLD + protocols.stress_steps(task)),
-    )
-    base = np.tile(np.asarray(start.base_quaternion, np.float32)[:1], (len(time), 1))
-    wrist, pushes = map(np.asarray, _disturbances(hand, task, len(objects), protocol, time, base))
-    states, away = [], np.zeros(len(target), bool)
-    for u, force in zip(wrist, pushes[:, start.object_index], strict=True):
-        _, state = physics.step(
-            physics, np.concatenate([np.tile(u, (len(target), 1)), target], -1), away, force
-        )
-        states.append(jax.tree.map(np.asarray, state))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _disturbances(
-    hand: Hand, task: TaskConfig, count: int, protocol: protocols.Protocol, time: Array, base: Array
-) -> tuple[Array, Array]:
-    """Targets (T, 6) of a carried wrist and pushes (T, N, 3) of N objects, in N, at control steps
-    `time` (T,).
-
-    Args:
-      hand: the hand.
-      task: the task.
-      count: number N of objects.
-      protocol: times of lift and pushes.
-      time: (T,) control steps.
-      base: (T, 4) orientations of the wrist's base.
-    """
-    frame = protocols.frame(protocol, task, time + 0.5)
-    wrist = protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame)
-    which = [jnp.full(len(time), n) for n in range(count)]
-    return wrist, jnp.stack(
-        [protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1
-    )
-
-
-@jax.jit
-def _in_wrist_frame(start: ResetState, states: PhysicsState) -> tuple[Array, Array]:
-    """Positions (T, B, 3) and orientations (T, B, 4) of the objects in the wrist frame."""
-    wrist = rotations.compose_pose(
-        start.base_position,
-        start.base_quaternion,
-        states.u[..., :3],
-        rotations.euler_to_quaternion(states.u[..., 3:]),
-    )
-    return rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
-
-
-def _judged(
-    task: TaskConfig,
-    start: ResetState,
-    states: PhysicsState,
-    objects: Sequence[GraspObject],
-    width: float,
-) -> list[Grip]:
-    """Results of the attempts."""
-    position, quaternion = map(np.asarray, _in_wrist_frame(start, states))
-    last = _HOLD - 1
-    moved = np.linalg.norm(states.object_position[last], axis=-1)  # it was released at the origin
-    held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)
-    survived = protocols.survival(position[last:], quaternion[last:], held, task)
-    touching = states.contact_found[last].any(-1)
-    return [
-        Grip(
-            obj=objects[index],
-            width=width,
-            held=bool(held[i]),
-            survived={name: bool(column[i]) for name, column in survived.items()},
-            touching=touching[i],
-            q=states.q[last, i],
-            object_position=position[last, i],
-            object_quaternion=quaternion[last, i],
-        )
-        for i, index in enumerate(np.asarray(start.object_index))
-    ]
-
-
 class Response(NamedTuple):
     """Response of a motor to a step of its target."""
 
@@ -278,41 +103,260 @@ class Response(NamedTuple):
     """True if the simulation diverged."""
 
 
+def grip_objects(width: float) -> list[GraspObject]:
+    """Returns a ball, a cylinder and a box of a width in metres; their length is along y."""
+    half = width / 2
+    pieces = (
+        draft.ellipsoid((half, half, half)),
+        draft.cylinder((0, -width, 0), (0, width, 0), half),
+        draft.box((half, width, half)),
+    )
+    return [
+        plain_object(name, (piece,), DENSITY) for name, piece in zip(OBJECTS, pieces, strict=True)
+    ]
+
+
+def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
+    """Returns the best attempt at each of `OBJECTS`.
+
+    Smaller objects are tried unless the hand survives all parts with all of the larger ones.
+
+    Args:
+      hand: the hand.
+      task: the task, for its physics: time step, contacts, collisions.
+      threads: threads of the physics.
+    """
+    best: dict[str, Grip] = {}
+    for share in SIZES:
+        width = share * grasp_frame(hand).opening
+        for grip in _attempts(hand, task, width, threads):
+            name = grip.obj.name
+            if name not in best or grip.rank > best[name].rank:
+                best[name] = grip
+        if all(all(grip.survived.values()) for grip in best.values()):
+            break
+    return [best[name] for name in OBJECTS]
+
+
 def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
-    """Responses (M) of the motors to steps, in turn.
+    """Returns the responses (M) of the motors to steps, in turn.
 
     A step is `STEP` or half of the range, from the open pose towards the side with more room. The
     other motors stay, and links do not collide.
     """
     task = dataclasses.replace(task, hand_self_collision=False, hand_table_collision=False)
-    (lower, upper), opened = motor_limits(hand), motor_positions(hand, hand.q_open)
+    lower, upper = motor_limits(hand)
+    opened = motor_positions(hand, hand.q_open)
     size = np.minimum(STEP, (upper - lower) / 2)
-    way = np.where(upper - opened >= opened - lower, size, -size)
-    states = _states(hand, task, np.tile(opened + np.diag(way), (_STEPS, 1, 1)), threads)
-    each = np.arange(len(hand.motors))
-    gone = (
-        motor_positions(hand, states.q)[:, each, each] - opened
-    ) / way  # (T, M) as shares of the step
-    speed = motor_positions(hand, states.q_velocity)[-_SETTLED:, each, each]
+    steps = np.where(upper - opened >= opened - lower, size, -size)
+    targets = np.tile(opened + np.diag(steps), (_RESPONSE_STEPS, 1, 1))
+    states = _states(hand, task, targets, threads)
+    motors = np.arange(len(hand.motors))
+    moved = motor_positions(hand, states.q)[:, motors, motors] - opened
+    shares = moved / steps  # (T, M)
+    speeds = motor_positions(hand, states.q_velocity)[-_SETTLED_STEPS:, motors, motors]
     return [
         Response(
-            float(max(gone[:, j].max() - 1, 0.0)),
-            float(speed[:, j].std()),
-            float(abs(gone[-1, j] - 1)),
-            bool(states.diverged[:, j].any()),
+            overshoot=float(max(shares[:, motor].max() - 1, 0.0)),
+            unrest=float(speeds[:, motor].std()),
+            error=float(abs(shares[-1, motor] - 1)),
+            diverged=bool(states.diverged[:, motor].any()),
         )
-        for j in each
+        for motor in motors
     ]
 
 
 def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
-    """Greatest overlap in m of links after the empty hand has closed, as far as its contacts
-    allow.
+    """Returns the greatest overlap of links after the empty hand has closed, m.
+
+    It closes as far as its contacts allow.
     """
-    share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
-    opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
+    steps = np.arange(1, 2 * _RESPONSE_STEPS + 1)
+    share = np.minimum(steps / _RESPONSE_STEPS, 1.0)[:, None, None]
+    opened = motor_positions(hand, hand.q_open)
+    closed = motor_positions(hand, hand.q_closed)
     states = _states(hand, task, opened + share * (closed - opened), threads)
     return float(_overlap(hand, states.q[-1].astype(np.float32))[0])
+
+
+def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[Grip]:
+    """Runs all attempts at objects of one width, m."""
+    objects = grip_objects(width)
+    attempts = list(itertools.product(range(len(objects)), _DEPTHS, _FIRMNESS))
+    index, depths, firmness = (np.array(column) for column in zip(*attempts, strict=True))
+    physics = NativePhysics(hand, task, objects, threads)
+    try:
+        start = _start(hand, index, depths * width / 2)
+        target = _close(physics, hand, start, firmness)
+        states = _shake(physics, hand, task, start, target, objects)
+    finally:
+        physics.close()
+    return _results(task, start, states, objects, width)
+
+
+def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
+    """Open hands above objects fixed at the origin of the world frame.
+
+    Args:
+      hand: the hand.
+      index: (B,) objects.
+      depth: (B,) distances of the objects from the hand centre towards the palm, m.
+    """
+    frame = grasp_frame(hand)
+    count = len(index)
+    to_world = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])
+    ones = np.ones(count)
+    orientation = np.asarray(rotations.from_matrix(jnp.asarray(to_world)))
+    object_position = frame.center - depth[:, None] * frame.heading
+    return ResetState(
+        object_index=index,
+        mass_scale=ones,
+        friction=ones,
+        gain_scale=ones,
+        base_position=-object_position @ to_world.T,
+        base_quaternion=np.tile(orientation, (count, 1)),
+        u_velocity=np.zeros((count, 6)),
+        q=np.tile(hand.q_open, (count, 1)),
+        object_position=np.zeros((count, 3)),
+        object_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        stationary=ones > 0,
+    )
+
+
+def _close(
+    physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray
+) -> np.ndarray:
+    """Closes the fingers around the fixed object, which is then released.
+
+    Args:
+      physics: the physics.
+      hand: the hand.
+      start: B open hands.
+      firmness: (B,) shares of the torque limits.
+
+    Returns:
+      (B, M) motor targets.
+    """
+    physics.start(start)
+    full_torque_errors = np.array([motor.torque_limit / motor.kp for motor in hand.motors])
+    reach = firmness[:, None] * full_torque_errors
+    positions = motor_positions(hand, np.asarray(start.q))
+    target = positions
+    goal = motor_positions(hand, hand.q_closed)
+    wrist = np.zeros((len(positions), 6))
+    ended = np.zeros(len(positions), bool)
+    for _ in range(_CLOSING_STEPS):
+        target = target + np.clip(goal - target, -_SPEED, _SPEED)
+        target = np.clip(target, positions - reach, positions + reach)
+        _, state = physics.step(physics, np.concatenate([wrist, target], -1), ended)
+        positions = motor_positions(hand, np.asarray(state.q))
+    for instance in physics.instances:
+        instance.data.eq_active[instance.model.equality("hold").id] = False
+    return target
+
+
+def _shake(
+    physics: NativePhysics,
+    hand: Hand,
+    task: TaskConfig,
+    start: ResetState,
+    target: np.ndarray,
+    objects: Sequence[GraspObject],
+) -> PhysicsState:
+    """Simulates half a second without support, the lift, and the pushes.
+
+    Args:
+      physics: the physics.
+      hand: the hand.
+      task: the task.
+      start: the B open hands of the attempts.
+      target: (B, M) motor targets of the closed hands.
+      objects: the objects.
+
+    Returns:
+      The states, with a leading axis T.
+    """
+    task = dataclasses.replace(task, approach_steps=0)
+    protocol = protocols.stress(task, objects, _HOLD_STEPS)
+    time = np.arange(_HOLD_STEPS + protocols.stress_steps(task))
+    base = np.tile(np.asarray(start.base_quaternion, np.float32)[:1], (len(time), 1))
+    wrists, pushes = _disturbances(hand, task, len(objects), protocol, time, base)
+    attempt_pushes = np.asarray(pushes)[:, start.object_index]
+    ended = np.zeros(len(target), bool)
+    states = []
+    for wrist, forces in zip(np.asarray(wrists), attempt_pushes, strict=True):
+        command = np.concatenate([np.tile(wrist, (len(target), 1)), target], -1)
+        _, state = physics.step(physics, command, ended, forces)
+        states.append(jax.tree.map(np.asarray, state))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _disturbances(
+    hand: Hand, task: TaskConfig, count: int, protocol: protocols.Protocol, time: Array, base: Array
+) -> tuple[Array, Array]:
+    """Targets (T, 6) of a carried wrist, and pushes (T, N, 3) of N objects, N.
+
+    Args:
+      hand: the hand.
+      task: the task.
+      count: number N of objects.
+      protocol: times of lift and pushes.
+      time: (T,) control steps.
+      base: (T, 4) orientations of the wrist's base.
+    """
+    frame = protocols.frame(protocol, task, time + 0.5)
+    wrist = protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame)
+    everywhere = jnp.ones(len(time))
+    pushes = []
+    for n in range(count):
+        index = jnp.full(len(time), n)
+        pushes.append(protocols.push(protocol, task, time, index, everywhere))
+    return wrist, jnp.stack(pushes, 1)
+
+
+@jax.jit
+def _in_wrist_frame(start: ResetState, states: PhysicsState) -> tuple[Array, Array]:
+    """Positions (T, B, 3) and orientations (T, B, 4) of the objects in the wrist frame."""
+    wrist = rotations.compose_pose(
+        start.base_position,
+        start.base_quaternion,
+        states.u[..., :3],
+        rotations.euler_to_quaternion(states.u[..., 3:]),
+    )
+    return rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
+
+
+def _results(
+    task: TaskConfig,
+    start: ResetState,
+    states: PhysicsState,
+    objects: Sequence[GraspObject],
+    width: float,
+) -> list[Grip]:
+    """Results of the attempts at objects of a width, m."""
+    positions, quaternions = map(np.asarray, _in_wrist_frame(start, states))
+    last_hold = _HOLD_STEPS - 1
+    # It was released at the origin
+    moved = np.linalg.norm(states.object_position[last_hold], axis=-1)
+    held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)
+    survived = protocols.survival(positions[last_hold:], quaternions[last_hold:], held, task)
+    touching = states.contact_found[last_hold].any(-1)
+    results = []
+    for i, index in enumerate(np.asarray(start.object_index)):
+        results.append(
+            Grip(
+                obj=objects[index],
+                width=width,
+                held=bool(held[i]),
+                survived={name: bool(attempts[i]) for name, attempts in survived.items()},
+                touching=touching[i],
+                q=states.q[last_hold, i],
+                object_position=positions[last_hold, i],
+                object_quaternion=quaternions[last_hold, i],
+            )
+        )
+    return results
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -324,16 +368,17 @@ def _overlap(hand: Hand, q: Array) -> Array:
 def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:
     """States, with leading axis T, for motor targets (T, B, M) from the open pose on."""
     count = targets.shape[1]
-    start = _start(hand, np.zeros(count, int), np.zeros(count))._replace(
-        object_position=np.tile(_FAR, (count, 1))
-    )
-    physics, found = NativePhysics(hand, task, grip_objects(0.04)[:1], threads), []
+    start = _start(hand, np.zeros(count, int), np.zeros(count))
+    start = start._replace(object_position=np.tile(_OUT_OF_REACH, (count, 1)))
+    physics = NativePhysics(hand, task, grip_objects(_ANY_WIDTH)[:1], threads)
+    wrist = np.zeros((count, 6))
+    ended = np.zeros(count, bool)
+    states = []
     try:
         physics.start(start)
         for target in targets:
-            command = np.concatenate([np.zeros((count, 6)), target], -1)
-            _, state = physics.step(physics, command, np.zeros(count, bool))
-            found.append(jax.tree.map(np.asarray, state))
+            _, state = physics.step(physics, np.concatenate([wrist, target], -1), ended)
+            states.append(jax.tree.map(np.asarray, state))
     finally:
         physics.close()
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)

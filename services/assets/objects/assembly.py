@@ -105,11 +105,7 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     surface = trimesh.util.concatenate(meshes).copy()
     closed = all(encloses(mesh) for mesh in meshes)
     if not closed and not options.material:
-        replacement = "pieces" if source.pieces else "hull"
-        notes.append(
-            f"its surface is open: mass and inertia are those of its convex {replacement} "
-            "(--material weighs its wall, and --mass sets the mass)"
-        )
+        notes.append(_open_surface_note(source))
     solid = enclosed(np.asarray(surface.triangles)) if closed else None
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
@@ -120,11 +116,11 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         weight_by_material = weigh_parts(meshes, parts or meshes, options.material, part_names)
     own_pieces = [scale.points(piece) for piece in files.pieces]
     collision = _collision(source, own_pieces, surfaces, options, notes)
-    solid_hulls = collision.hulls if source.pieces else [np.asarray(surface.vertices)]
-    weight = weight_by_material or weigh_evenly(surface, solid, solid_hulls, options.density)
-    if options.mass is not None:
-        inertia = weight.inertia * (options.mass / weight.mass)
-        weight = Weight(options.mass, weight.center, inertia)
+    weight = weight_by_material
+    if weight is None:
+        solid_hulls = collision.hulls if source.pieces else [np.asarray(surface.vertices)]
+        weight = weigh_evenly(surface, solid, solid_hulls, options.density)
+    weight = _with_mass(weight, options.mass)
     pieces = tuple(
         _piece(hull, weight.center, owner)
         for hull, owner in zip(collision.hulls, collision.owners, strict=True)
@@ -133,14 +129,7 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     points, normals, faces = sample_mesh(
         np.asarray(surface.triangles), pieces, np.random.default_rng(seed), oriented=closed
     )
-    if source.parts:
-        if parts:
-            of_points = _nearest_part(parts, weight.center, points)
-        else:
-            of_points = _part_of_faces(meshes, faces)
-        labels = _labels_of_parts(source, of_points)
-    else:
-        labels = _labels_of_halves(points)
+    labels = _labels(source, meshes, parts, weight.center, points, faces)
     if not source.parts_are_pieces:
         pieces = with_labels(pieces, points, labels.of_points)
     _note_graspable_share(labels, notes)
@@ -171,6 +160,22 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     )
     obj = dataclasses.replace(obj, rest_poses=rest_poses(obj))
     return obj if source.parts else cut_to_hold(obj)
+
+
+def _open_surface_note(source: Source) -> str:
+    """Note on an object whose surface encloses no volume."""
+    replacement = "pieces" if source.pieces else "hull"
+    return (
+        f"its surface is open: mass and inertia are those of its convex {replacement} "
+        "(--material weighs its wall, and --mass sets the mass)"
+    )
+
+
+def _with_mass(weight: Weight, mass: float | None) -> Weight:
+    """Mass properties for a mass, kg; unchanged if it is None."""
+    if mass is None:
+        return weight
+    return Weight(mass, weight.center, weight.inertia * (mass / weight.mass))
 
 
 def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
@@ -271,6 +276,31 @@ def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
         vertices=hull - middle,
         part=part,
     )
+
+
+def _labels(
+    source: Source,
+    meshes: Sequence[trimesh.Trimesh],
+    parts: Sequence[trimesh.Trimesh],
+    center: np.ndarray,
+    points: np.ndarray,
+    faces: np.ndarray,
+) -> _Labels:
+    """Parts of an object: those of its part files, or two halves.
+
+    Args:
+      source: the files.
+      meshes: the object's surfaces, m.
+      parts: those of its parts, unless they are the surfaces.
+      center: (3,) centre of mass, in the frame of the meshes.
+      points: (N, 3) surface points, relative to the centre of mass.
+      faces: (N,) triangle of each surface point, among those of all surfaces.
+    """
+    if not source.parts:
+        return _labels_of_halves(points)
+    if parts:
+        return _labels_of_parts(source, _nearest_part(parts, center, points))
+    return _labels_of_parts(source, _part_of_faces(meshes, faces))
 
 
 def _labels_of_halves(points: np.ndarray) -> _Labels:

@@ -31,8 +31,7 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes, store
 from congrasp.services.arm.description import load_arm
-from congrasp.services.assets.hands import compile as compiling
-from congrasp.services.assets.hands import model_files
+from congrasp.services.assets.hands import model_files, reading
 from congrasp.services.assets.hands.model_files import import_hand
 from congrasp.services.cli import main
 from congrasp.services.viz import hand_sheets
@@ -135,7 +134,7 @@ def test_a_confined_process_reads_what_this_one_does(name, tmp_path):
 
 def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkeypatch):
     """By the processor time of the confined process, however busy the machine is."""
-    monkeypatch.setattr(compiling, "SECONDS", 2)
+    monkeypatch.setattr(reading, "SECONDS", 2)
     geom = '<body><geom size="0.1"/></body>'
     nested = '<replicate count="999">' * 3 + geom + "</replicate>" * 3
     (tmp_path / "a.xml").write_text(f"<mujoco><worldbody>{nested}</worldbody></mujoco>")

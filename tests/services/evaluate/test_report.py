@@ -18,7 +18,7 @@ from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import SensingConfig, TaskConfig
-from congrasp.services.assets.hands.check import Finding, write_findings
+from congrasp.services.assets.hands.findings import Finding, write_findings
 from congrasp.services.cli import main
 from congrasp.services.evaluate.pictures import turntable
 from congrasp.services.evaluate.report import (

@@ -18,7 +18,7 @@ from congrasp.common.hands.files import hand_text
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import own_policy_file, policy_file
 from congrasp.learner.run_directory import CHECKPOINTS, CONFIG_FILE, open_run
-from congrasp.services.assets.hands.check import Finding, write_findings
+from congrasp.services.assets.hands.findings import Finding, write_findings
 from congrasp.services.cli import main
 from congrasp.services.train import own_hand
 from congrasp.services.train.command import untrained

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from congrasp.common.task.sampling.set_file import load as load_set
-from congrasp.services.assets.captures.build import Report
+from congrasp.services.assets.captures.report import Report
 from congrasp.services.cli.main import load
 
 

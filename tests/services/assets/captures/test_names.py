@@ -37,7 +37,9 @@ def test_objects_of_one_name_and_different_meshes_get_different_names(tmp_path, 
     for file in files[:2]:
         file.parent.mkdir()
         file.write_text("v 0 0 0\n")
-    build._shapes([types.SimpleNamespace(mesh=file, object_name="cup") for file in files], print)
+    build.import_shapes(
+        [types.SimpleNamespace(mesh=file, object_name="cup") for file in files], print
+    )
     assert [(source.path, source.name) for source in named] == [
         (files[0], "cup"),
         (files[1], "cup-2"),
@@ -53,11 +55,11 @@ def test_settings_that_are_none_are_dropped(tmp_path, text):
 
 def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
     with pytest.raises(CongraspError, match="holds no STL"):
-        build._source(tmp_path)
+        build.source_of(tmp_path)
     for name in "ab":
         (tmp_path / f"{name}.stl").write_bytes(b"")
     with pytest.raises(CongraspError, match="holds 2 objects"):
-        build._source(tmp_path)
+        build.source_of(tmp_path)
 
 
 @pytest.mark.parametrize("value", ["a", "[1]", "{b: 1}", "null"])

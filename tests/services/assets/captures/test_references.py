@@ -25,8 +25,12 @@ from congrasp.common.task.sampling.object_headings import HEADINGS
 from congrasp.common.task.sampling.set_bank import bank_of
 from congrasp.common.task.sampling.set_description import describe
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.captures.build import Report, _from_below, _resting_poses
-from congrasp.services.assets.captures.extract import LATER, Surface, _before_carried, _opposed
+from congrasp.services.assets.captures.constraint_sets import (
+    References,
+    from_below,
+    usable_resting_poses,
+)
+from congrasp.services.assets.captures.contact import LATER, before_carried, opposed_frame
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.references import (
     DEEPEST,
@@ -37,7 +41,9 @@ from congrasp.services.assets.captures.references import (
     separated,
     width,
 )
+from congrasp.services.assets.captures.report import Report
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
+from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.cli.constraints import _print_report
 from tests.scenes import pointing
 from tests.services.assets.captures import known
@@ -88,7 +94,7 @@ def opposed(thumb, index, lift=0.0, present=True, surface=None):
     joints = np.full((FRAMES, 5, 4, 3), 0.3)  # other fingers stay away
     joints[:, 0, :, 0] = (0.02 + THUMB + thumb * np.ones(FRAMES))[:, None]
     joints[:, 1, :, 0] = -(0.02 + INDEX + index * np.ones(FRAMES))[:, None]
-    return _opposed(moving(joints, lift, present=present), surface or Slab(), joints, FIRST)
+    return opposed_frame(moving(joints, lift, present=present), surface or Slab(), joints, FIRST)
 
 
 AT = np.arange(FRAMES)
@@ -127,7 +133,7 @@ LIFT = np.concatenate([np.zeros(11), 0.006 * np.arange(1, 11)])
 def picked(wrist, lift, present=True):
     """Frame found for a grasp that is noticed at frame 20."""
     motion = moving(np.zeros((21, 5, 4, 3)), lift, wrist, present)
-    return _before_carried(motion, np.outer(wrist, [0.0, 0.0, 1.0]), 20)
+    return before_carried(motion, np.outer(wrist, [0.0, 0.0, 1.0]), 20)
 
 
 def test_a_grasp_that_is_noticed_late_belongs_to_where_the_object_was_picked_up():
@@ -324,12 +330,12 @@ def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
     quaternion = np.broadcast_to(np.asarray(turn), (3, 4, 4))
     rest = np.array([[0, 0, -depth, 1, 0, 0, 0] for depth in (0.001, 0.015, 0.045)], np.float32)
     q = np.stack([HUMAN.q_open] * 3).astype(np.float32)
-    allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
+    allowed = usable_resting_poses(HUMAN, References(q, path, quaternion), rest)
     np.testing.assert_array_equal(
         allowed, [[True, False, False], [True, False, False], [False, False, False]]
     )
     rest[1, 2] = 0.02
-    allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
+    allowed = usable_resting_poses(HUMAN, References(q, path, quaternion), rest)
     np.testing.assert_array_equal(
         allowed, [[True, True, False], [False, True, False], [False, True, False]]
     )
@@ -350,7 +356,7 @@ def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
         "pose/quaternion": np.stack([np.stack(turns)] * 2),
         "rest": np.array([[0, 0, 0.1, 1, 0, 0, 0]], np.float32),
     }
-    np.testing.assert_array_equal(_from_below(HUMAN, Message(arrays, {})), [False, True, False])
+    np.testing.assert_array_equal(from_below(HUMAN, Message(arrays, {})), [False, True, False])
 
 
 def test_the_report_names_them(capsys):

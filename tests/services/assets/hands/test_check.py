@@ -14,7 +14,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import faults, hand_text
 from congrasp.common.hands.spec import Coupling
-from congrasp.services.assets.hands import check, trials
+from congrasp.services.assets.hands import check, geometry_checks, physics_checks, trials
 from congrasp.services.assets.hands.check import check_hand
 from congrasp.services.assets.hands.model_files import propose
 from congrasp.services.cli import main
@@ -82,7 +82,7 @@ def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, ve
     opened = {name: angle for name, angle in CLAW.open_pose.items() if name != "opposing_middle"}
     follows = (Coupling("opposing_middle", "opposing_root", ratio, 0.0),)
     hand = dataclasses.replace(CLAW, couplings=follows, open_pose=opened, closed_pose=pose)
-    (finding,) = (one for one in check._joints(hand) if one.check == "joint")
+    (finding,) = (one for one in geometry_checks.joint_findings(hand) if one.check == "joint")
     assert finding.verdict == verdict and "'opposing_middle'" in finding.measured
     assert ("parallel" in finding.remedy) == (verdict == "doubt")
 
@@ -91,7 +91,7 @@ def test_both_pads_of_a_gripper_of_one_motor_stay_parallel():
     hand = propose(pathlib.Path(__file__).parents[3] / "hands" / "pincher.urdf").hand
     found = {
         one.measured.split("'")[1]: one.verdict
-        for one in check._joints(hand)
+        for one in geometry_checks.joint_findings(hand)
         if one.check == "joint"
     }
     assert found == {"left_parallel": "doubt", "right_parallel": "doubt"}
@@ -125,14 +125,14 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
     hand = dataclasses.replace(
         CLAW, links=(dataclasses.replace(palm, capsules=away), *CLAW.links[1:])
     )
-    finding = check._palm(hand)
+    finding = geometry_checks.palm_finding(hand)
     assert (
         finding.verdict == "failed" and "20.1 cm" in finding.measured and "--palm" in finding.remedy
     )
     # All of the hand at the end of a forearm of 40 cm, whose wrist does not move.
     by = np.array([0, 0, 0.4])
     links = tuple(shifted(link, by) for link in CLAW.links)
-    finding = check._palm(dataclasses.replace(CLAW, links=links))
+    finding = geometry_checks.palm_finding(dataclasses.replace(CLAW, links=links))
     assert finding.verdict == "failed" and re.search(
         r" 5\.\d fingers' lengths from the wrist", finding.measured
     )
@@ -144,13 +144,13 @@ def test_gains_that_shake_are_found_and_named():
         lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0),
         only="left_middle",
     )
-    found = check._servos(loose, trials.responses(loose, recipe(loose).task, 2))
+    found = physics_checks.servo_findings(loose, trials.responses(loose, recipe(loose).task, 2))
     assert [finding.verdict for finding in found] == ["failed"] and "'left_middle'" in found[
         0
     ].measured
     assert "raise kv" in found[0].remedy
     soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
-    found = check._servos(soft, trials.responses(soft, recipe(soft).task, 2))
+    found = physics_checks.servo_findings(soft, trials.responses(soft, recipe(soft).task, 2))
     assert len(found) == 6 and all("raise kp" in finding.remedy for finding in found)
 
 
@@ -168,12 +168,12 @@ def test_torques_that_are_too_weak_are_found_and_hold_nothing():
 
 
 def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
-    finding = check._opening(dataclasses.replace(CLAW, object_scale=3.0))
+    finding = geometry_checks.opening_finding(dataclasses.replace(CLAW, object_scale=3.0))
     assert finding.verdict == "failed" and re.match(r"object_scale 1\.\d \(import", finding.remedy)
     wide = dataclasses.replace(CLAW, open_pose={}, closed_pose={})  # never closes
     assert (
-        check._joints(wide)[0].verdict == "failed"
-        and "closed_pose" in check._joints(wide)[0].remedy
+        geometry_checks.joint_findings(wide)[0].verdict == "failed"
+        and "closed_pose" in geometry_checks.joint_findings(wide)[0].remedy
     )
     by = np.array([0.0, 0.05, 0.0])
     links = tuple(
@@ -181,8 +181,8 @@ def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     )
     crossed = dataclasses.replace(CLAW, links=links)
     assert (
-        check._open_overlap(crossed).verdict == "failed"
-        and "left_lower" in check._open_overlap(crossed).measured
+        geometry_checks.open_overlap_finding(crossed).verdict == "failed"
+        and "left_lower" in geometry_checks.open_overlap_finding(crossed).measured
     )
 
 

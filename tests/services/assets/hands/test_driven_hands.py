@@ -19,7 +19,8 @@ from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.skin import skin_of_meshes
 from congrasp.common.hands.spec import chain_of
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands.model_files import Choices, describe, propose
+from congrasp.services.assets.hands.model_files import Choices, propose
+from congrasp.services.assets.hands.summary import describe
 from congrasp.services.cli import main
 from congrasp.services.viz.hand_sheets import hands_sheet
 

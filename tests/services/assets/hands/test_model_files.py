@@ -3,6 +3,7 @@
 import itertools
 import pathlib
 import re
+import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
@@ -13,9 +14,13 @@ from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.mjcf import add_hand
-from congrasp.services.assets.hands import compile
-from congrasp.services.assets.hands.actuators import Drive, servos
-from congrasp.services.assets.hands.model_files import Choices, describe, propose
+from congrasp.services.assets.hands.actuators import Drive
+from congrasp.services.assets.hands.compile import robot_spec
+from congrasp.services.assets.hands.model_files import Choices, propose
+from congrasp.services.assets.hands.reading import FaultyFile
+from congrasp.services.assets.hands.servos import servos
+from congrasp.services.assets.hands.summary import describe
+from congrasp.services.assets.hands.urdf_joints import check_joints
 from congrasp.services.cli import main
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
@@ -126,7 +131,10 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
 
 
 def test_long_numbers_are_searched_in_linear_time():
-    assert not compile._DECIMAL.findall("1" * 1_000_000 + "x")
+    origin = f'<origin rpy="{"1" * 1_000_000}x"/>'
+    robot = ET.fromstring(f'<robot><joint type="fixed">{origin}</joint></robot>')
+    with pytest.raises(FaultyFile, match="parent"):  # the frame is accepted
+        check_joints(robot, [])
 
 
 def test_a_zero_axis_of_inertia_gets_the_least_and_keeps_the_others(tmp_path):
@@ -134,7 +142,7 @@ def test_a_zero_axis_of_inertia_gets_the_least_and_keeps_the_others(tmp_path):
     text = re.sub("<inertia [^>]*>", inertia, (PINCH / "pinch.urdf").read_text(), count=1)
     (tmp_path / "hand.urdf").write_text(text)
     notes = []
-    _, model = compile.robot_spec(tmp_path / "hand.urdf", notes)
+    _, model = robot_spec(tmp_path / "hand.urdf", notes)
     np.testing.assert_allclose(model.body("palm").inertia, [3e-5, 2e-5, 1.01e-5])
     assert notes == [
         "links with inertia about two axes get the least possible about the third: palm"
@@ -149,7 +157,7 @@ def test_an_obj_of_points_is_a_hull(tmp_path):
     corners = itertools.product((-0.03, 0.03), (-0.05, 0.05), (0.0, 0.03))
     (tmp_path / "points.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners))
     notes = []
-    _, model = compile.robot_spec(tmp_path / "hand.urdf", notes)
+    _, model = robot_spec(tmp_path / "hand.urdf", notes)
     assert not notes and model.nmesh == 1 and model.nmeshvert == 8
 
 
@@ -185,7 +193,7 @@ def test_any_number_of_meshes_may_be_missing(tmp_path):
     meshes = "".join(f'<mesh file="{i}.stl"/>' for i in range(301))
     text = (PINCH / "pinch.xml").read_text()
     (tmp_path / "hand.xml").write_text(text.replace("<asset/>", f"<asset>{meshes}</asset>"))
-    compile.robot_spec(tmp_path / "hand.xml", notes := [])
+    robot_spec(tmp_path / "hand.xml", notes := [])
     assert len(notes) == 1 and notes[0].endswith(" and 296 more")
 
 
