@@ -129,7 +129,7 @@ def _unit_normals(triangles: np.ndarray) -> np.ndarray:
 
 
 def _hits(triangles: np.ndarray, normals: np.ndarray) -> _Hits:
-    """Where rays through integers cross triangles (F, 3, 3) of normals (F, 3).
+    """Crossings of rays through integers with triangles (F, 3, 3) of normals (F, 3).
 
     The lines of integers along the second axis are intersected with the triangles first, and the
     integers between both intersections are the rays.
