@@ -80,7 +80,7 @@ class _Surface(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """Volume enclosed by triangles."""
+    """The space that triangles enclose."""
 
     volume: float
     """m^3, the mean of three axes."""

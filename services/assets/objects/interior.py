@@ -105,7 +105,7 @@ def interior(triangles: np.ndarray, count: int) -> np.ndarray:
 
 
 def _overlap(crossings: Crossings, spacing: float) -> _Overlap:
-    """Sections of rays along an axis that are inside two or more bodies."""
+    """Spans of rays along an axis in two bodies or more."""
     # Entries precede exits at the same place.
     order = np.lexsort(
         (
