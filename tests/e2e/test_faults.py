@@ -12,6 +12,7 @@ import time
 import pytest
 
 from congrasp.common.io.journal import AUDIT, read_journal
+from congrasp.learner.hub.write_ahead import FOLDER
 from tests.benchmarks.attackers import throttled
 from tests.cluster import assert_books_balance
 
@@ -30,6 +31,17 @@ def taken_up(folder):
     """Rollouts that sessions of the learner took up from those before them."""
     lines = read_journal(folder / AUDIT / "learner-0.jsonl").intact
     return [tuple(rollout) for line in lines for rollout in line.get("taken", ())]
+
+
+def stop_with_rollouts(cluster, learner):
+    """Stops the learner (SIGSTOP) while it has accepted rollouts on disk that it has not used."""
+    while True:
+        cluster.wait(lambda status: status["queue"]["length"])
+        learner.send_signal(signal.SIGSTOP)
+        if any((cluster.folder / FOLDER).rglob("*.safetensors")):
+            return
+        # On a busy machine it used them after it had answered.
+        learner.send_signal(signal.SIGCONT)
 
 
 def test_a_killed_learner_costs_no_rollout(cluster):
@@ -81,8 +93,8 @@ def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together
     learner = cluster.start_learner(every=2)
     started = [cluster.start_actor(name) for name in "ab"]
     cluster.wait_for_updates(4)
-    cluster.wait(lambda status: status["queue"]["length"])
-    for process in (learner, *started):  # the learner first, with what is in its queue
+    stop_with_rollouts(cluster, learner)
+    for process in (learner, *started):
         process.kill()
     learner.wait(5)
     learner = cluster.start_learner()
