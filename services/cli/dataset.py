@@ -71,8 +71,9 @@ class Dataset:
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.common.task.constraints import require_known
+        from congrasp.services.dataset.card import write_card
         from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
-        from congrasp.services.dataset.shards import Shards, write_card
+        from congrasp.services.dataset.shards import CARD, Shards
         from congrasp.services.evaluate.experiment import Experiment
         from congrasp.services.evaluate.plan import ALIGNED
         from congrasp.services.evaluate.pools import most_objects
@@ -109,13 +110,17 @@ class Dataset:
             shard=self.shard or shard_objects(self.per_object),
         )
         pools = pools_of(recipe)
-        shards = Shards(self.out, len(pools.make))
+        shards = Shards(self.out, len(pools.make), recipe.columns)
+        facts = {"licence": self.licence, **provenance()}
         finished = shards.finished(recipe.about)
+        if (self.out / CARD).exists():
+            # Drops the checksums of deleted shards: on a GPU a shard made again may differ.
+            write_card(shards, recipe.about, facts)
         wanted = [number for number in range(turn, shards.total, parts) if number not in finished]
         with tracked() as track:
             total = min(len(found), pools.size * len(wanted)) * self.per_object
             make(recipe, shards, pools, wanted, track("Episodes", total))
-        card = write_card(shards, recipe.about, {"licence": self.licence, **provenance()})
+        card = write_card(shards, recipe.about, facts)
         episodes, kept = (
             sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept")
         )

@@ -23,15 +23,16 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.named import ObjectAt
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.dataset.shards import (
+from congrasp.services.dataset.columns import (
     VERDICTS,
-    Shards,
+    Column,
     grasp_columns,
     grasp_rows,
     object_columns,
     object_rows,
     table,
 )
+from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import batches, plan_row
@@ -74,6 +75,12 @@ class Recipe:
         """The experiment of each shard, without its objects."""
         episodes = self.per_object * min(self.shard, len(self.objects))
         return dataclasses.replace(self.experiment, episodes=episodes)
+
+    @property
+    def columns(self) -> dict[str, list[Column]]:
+        """Columns of the grasps and of the objects."""
+        grasps = grasp_columns(self.experiment.hand, self.experiment.task)
+        return {"grasps": grasps, "objects": object_columns()}
 
     @functools.cached_property
     def about(self) -> dict[str, Any]:

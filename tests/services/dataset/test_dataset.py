@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -224,3 +225,114 @@ def test_a_range_of_the_generator_is_many_objects():
     assert len({one.digest() for one in found}) == 3
     with pytest.raises(CongraspError, match="ends before it begins"):
         objects_at(pathlib.Path("box:7-5"))
+
+
+def rename_column(table: pa.Table) -> pa.Table:
+    return table.rename_columns({"start_q": "start_r"})
+
+
+def drop_column(table: pa.Table) -> pa.Table:
+    return table.drop_columns(["start_q"])
+
+
+def add_column(table: pa.Table) -> pa.Table:
+    return table.append_column("start_r", table.column("mass"))
+
+
+def change_field(table: pa.Table, field: pa.Field) -> pa.Table:
+    number = table.schema.get_field_index("start_q")
+    return table.cast(table.schema.set(number, field))
+
+
+def lose_metadata(table: pa.Table) -> pa.Table:
+    return change_field(table, table.schema.field("start_q").remove_metadata())
+
+
+def change_unit(table: pa.Table) -> pa.Table:
+    facts = {b"meaning": b"deg, finger joints at the start"}
+    field = table.schema.field("start_q")
+    return change_field(table, field.with_metadata({**field.metadata, **facts}))
+
+
+def change_shape(table: pa.Table) -> pa.Table:
+    field = table.schema.field("start_q")
+    return change_field(table, field.with_metadata({**field.metadata, b"shape": b"[1]"}))
+
+
+COLUMN_CHANGES = [rename_column, drop_column, add_column, lose_metadata, change_unit, change_shape]
+
+
+def change_columns(shard: pathlib.Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    table = pq.ParquetFile(shard).read()
+    changed = change(table).replace_schema_metadata(table.schema.metadata)
+    pq.write_table(changed, shard, compression="zstd", write_page_checksum=True)
+
+
+@pytest.fixture
+def copied(whole, tmp_path) -> pathlib.Path:
+    """A copy of the dataset that a test may damage."""
+    return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
+
+
+def refused(folder: pathlib.Path, shard: pathlib.Path) -> None:
+    """Asserts that the command names the shard in one line, and changes no file."""
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(CongraspError, match=re.escape(str(shard))) as error:
+        made(folder)
+    assert "\n" not in str(error.value) and "elete it" in str(error.value)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("change", COLUMN_CHANGES)
+def test_changed_columns_are_refused(copied, change):
+    shard = copied / "grasps" / "00001-of-00002.parquet"
+    change_columns(shard, change)
+    (copied / CARD).unlink()
+    refused(copied, shard)
+
+
+@pytest.mark.parametrize("change", COLUMN_CHANGES)
+def test_loader_refuses_changed_columns(copied, change):
+    change_columns(copied / "grasps" / "00001-of-00002.parquet", change)
+    with pytest.raises(ValueError, match=r"00001-of-00002\.parquet"):
+        list(loader()(copied))
+
+
+@pytest.mark.parametrize("kind", ["grasps", "objects"])
+def test_flipped_bit_is_refused(copied, kind):
+    """The bit is in the name of the file's writer, which no checksum of a page covers."""
+    shard = copied / kind / "00001-of-00002.parquet"
+    data = bytearray(shard.read_bytes())
+    data[data.rindex(b"parquet-cpp")] ^= 1
+    shard.write_bytes(data)
+    refused(copied, shard)
+
+
+def test_other_content_is_refused(copied):
+    """A readable shard with another value is not the one in the card."""
+    shard = copied / "objects" / "00000-of-00002.parquet"
+    change_columns(shard, lambda table: table.slice(0, 0))
+    refused(copied, shard)
+
+
+def test_deleted_shard_may_differ_when_remade(copied):
+    """The card forgets a deleted shard before it is made, even if the run is then killed."""
+    shard = copied / "grasps" / "00001-of-00002.parquet"
+    content = shard.read_bytes()
+    shard.unlink()
+    assert len(made(copied, "--part", "1/2")["sha256"]) == 2
+    shard.write_bytes(content)
+    change_columns(shard, lambda table: table.slice(0, 1))
+    assert made(copied)["sha256"][f"grasps/{shard.name}"] == sha256(shard)
+    change_columns(shard, lambda table: table.slice(0, 0))
+    refused(copied, shard)
+
+
+def test_damaged_card_is_refused(copied):
+    card = copied / CARD
+    card.write_bytes(card.read_bytes()[:100])
+    refused(copied, card)
+
+
+def sha256(file: pathlib.Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,6 +1,7 @@
 """A viewer that connects gets channels, what came before it, and frames in their time."""
 
 import collections
+import contextlib
 import itertools
 import json
 import pathlib
@@ -169,3 +170,13 @@ def test_a_busy_port_is_said_in_words() -> None:
         pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"),
     ):
         LiveServer(server.port)
+
+
+def test_the_33rd_connection_is_refused() -> None:
+    """Connections are admitted in their order, before they send anything."""
+    with LiveServer(0) as server, contextlib.ExitStack() as stack:
+        address = ("127.0.0.1", server.port)
+        for _ in range(32):
+            stack.enter_context(socket.create_connection(address, timeout=10.0))
+        newest = stack.enter_context(socket.create_connection(address, timeout=10.0))
+        assert newest.recv(1 << 12).startswith(b"HTTP/1.1 503 ")
