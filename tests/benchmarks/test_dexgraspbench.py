@@ -380,7 +380,7 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
     """A box that a scripted grip holds: squeezed it stays through the pushes, from afar nothing
     holds it.
     """
-    for name, value in (("SIZES", (0.4,)), ("_PLACES", (0.5,)), ("_FIRMNESS", (0.8,))):
+    for name, value in (("SIZES", (0.4,)), ("_DEPTHS", (0.5,)), ("_FIRMNESS", (0.8,))):
         monkeypatch.setattr(trials, name, value)
     grip = next(grip for grip in trials.grips(HAND, TaskConfig(), 1) if grip.obj.name == "box")
     still = Rotation.identity()

@@ -174,7 +174,7 @@ def test_help_names_every_command_and_every_command_exists():
         ),
         (
             ["objects", "import", MESH, "--material", "wood", "--density", "3"],
-            "--material and --density both say",
+            "--material and --density are mutually exclusive",
         ),
         (["objects", "list", "/nonexistent-folder"], "no folder"),
         (
