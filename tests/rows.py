@@ -1,7 +1,7 @@
 """Rows of an evaluation that no evaluation made, for what shows and compares them."""
 
-from congrasp.services.evaluate.paper import paper_row
-from congrasp.services.evaluate.scores import ERRORS, Row
+from congrasp.services.evaluate.paper.figures import paper_row
+from congrasp.services.evaluate.scores import ERRORS, Row, RowDescription, summarise
 
 FORCES = {
     f"{name}_{of}": 1.0
@@ -9,6 +9,11 @@ FORCES = {
     for of in ("mean", "p95")
 }
 FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
+
+
+def summarised(name, hand, sample, *, objects, held_2s=True, **facts):
+    """The row of a sample's episodes."""
+    return summarise(RowDescription(name, hand, objects, held_2s, **facts), sample)
 
 
 def row(  # noqa: PLR0913

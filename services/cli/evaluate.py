@@ -18,14 +18,26 @@ from congrasp.common.runtime.engines import engine_title
 from congrasp.services.assets.objects import named
 from congrasp.services.cli.console import in_range, say, tracked
 from congrasp.services.evaluate import pools, tables
-from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.lineup import Lineup, Table, facts, line_up, read_entrants
+from congrasp.services.evaluate.captured import captured_objects
+from congrasp.services.evaluate.columns import object_table, tables_of
+from congrasp.services.evaluate.experiment import Experiment, Track, Variation
+from congrasp.services.evaluate.lineup import (
+    Entrant,
+    Lineup,
+    Table,
+    facts,
+    line_up,
+    read_entrants,
+)
 from congrasp.services.evaluate.results import provenance
 from congrasp.services.evaluate.scores import Row, write_json
-from congrasp.services.evaluate.table import object_table, tables_of
+from congrasp.services.evaluate.variations import Noise
 from congrasp.services.viz.sheets import save_png
 
-_PICTURED = 4
+_PICTURES_OF_EACH_KIND = 4
+"""Most failures, and most successes, drawn for a row."""
+_PIPE_WIDTH = 160
+"""Width of tables that are not printed to a terminal, characters."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,78 +113,103 @@ class Evaluate:
     (GraspXL) simulates 3.
     """
 
-    def __call__(self) -> int:  # noqa: C901
+    def __call__(self) -> int:
         """Evaluates, and prints and writes the results."""
+        self._check()
+        given = read_entrants(self.policy, self.method)
+        lineup = line_up(self.table, given, self.hand, self.method)
+        engine = resolve_physics(self.physics)
+        many_objects = self._many_objects(engine)
+        with tracked() as track:
+            experiment, without_set = self._experiment(lineup, engine, track)
+            evaluations = []
+            for entrant, requested in lineup.entrants:
+                evaluations.append(
+                    tables.evaluate_tables(
+                        dataclasses.replace(experiment, policy=entrant.policy),
+                        requested,
+                        many_objects,
+                        self._folder_of_rows(entrant),
+                        keep=self.pictures is not None,
+                    )
+                )
+        self._print(evaluations, lineup, engine)
+        if without_set:
+            print(
+                f"Left out: objects without a constraint set, or a heading in it ({self.split}): "
+                f"{', '.join(without_set)}."
+            )
+        if self.json is not None:
+            self._write(self.json, evaluations, lineup, engine)
+            shutil.rmtree(_partial_results(self.json), ignore_errors=True)
+        if self.pictures is not None:
+            self._draw(self.pictures, evaluations, lineup)
+        return 0
+
+    def _check(self) -> None:
+        """Raises a CongraspError for options that are out of range or need another."""
         in_range(1, episodes=self.episodes)
         in_range(0, pool=self.pool, batch=self.batch)
         in_range(0.05, 10.0, friction=self.friction)
-        lineup = line_up(
-            self.table, read_entrants(self.policy, self.method), self.hand, self.method
-        )
         if self.pictures is not None and {"noise", "all"} & set(self.table):
             need_package("--pictures", "matplotlib")
         if self.constraints is not None and not self.objects:
             raise CongraspError(
                 "--constraints needs the sets' objects.", "Pass their folder with --objects."
             )
-        engine = resolve_physics(self.physics)
-        kept = self.json and self.json.with_name(f"{self.json.name}.parts")
-        divided = None
-        if {"objects", "all"} & set(self.table):
-            many = self.pool or min(self.episodes, pools.MANY)
-            if self.objects:
-                divided = pools.folder_pools(self.objects, engine)
-            else:
-                divided = pools.procedural_pools(many, engine, self.exam)
-        without: list[str] = []
-        with tracked() as track:
-            given: list[GraspObject] = []
-            if self.constraints is not None or set(self.table) != {"objects"}:
-                if self.objects:
-                    given = named.objects_of(self.objects, track=track)
-                else:
-                    given = pools.exam_pool(self.exam, self.pool)
-            experiment = Experiment(
-                lineup.entrants[0][0].policy,
-                given,
-                episodes=self.episodes,
-                track=track,
-                **self._settings(engine),
-            )
-            if self.constraints is not None:
-                sets = tables.captured(self.constraints, self.split, given)
-                lineup.require(sets.hand)
-                without = sorted({obj.name for obj in given} - {obj.name for obj in sets.objects})
-                experiment = dataclasses.replace(
-                    experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper
-                )
-            results = []
-            for one, wanted in lineup.entrants:
-                own = dataclasses.replace(experiment, policy=one.policy)
-                folder = kept and kept / f"{one.hand}-{one.method}"
-                results.append(
-                    tables.evaluate_tables(
-                        own, wanted, divided, folder, keep=self.pictures is not None
-                    )
-                )
-        self._show(results, lineup, engine)
-        if without:
-            words = f"objects without a constraint set, or a heading in it ({self.split})"
-            print(f"Left out: {words}: {', '.join(without)}.")
-        if self.json and kept:
-            self._write(results, lineup, engine)
-            shutil.rmtree(kept, ignore_errors=True)
-        if self.pictures is not None:
-            for (one, _), found in zip(lineup.entrants, results, strict=True):
-                _draw(
-                    found,
-                    self.pictures
-                    if len(results) == 1
-                    else self.pictures / f"{one.hand}-{one.method}",
-                )
-        return 0
 
-    def _settings(self, engine: str) -> dict[str, Any]:
+    def _many_objects(self, engine: PhysicsName) -> pools.Pools | None:
+        """Returns the pools of the table `objects`; None if it is not requested."""
+        if not {"objects", "all"} & set(self.table):
+            return None
+        if self.objects:
+            return pools.folder_pools(self.objects, engine)
+        count = self.pool or min(self.episodes, pools.MANY)
+        return pools.procedural_pools(count, engine, self.exam)
+
+    def _experiment(
+        self, lineup: Lineup, engine: PhysicsName, track: Track
+    ) -> tuple[Experiment, list[str]]:
+        """Returns the experiment of the first policy, and names of objects without a constraint
+        set.
+        """
+        objects: list[GraspObject] = []
+        if self.constraints is not None or set(self.table) != {"objects"}:
+            objects = self._objects(track)
+        first, _ = lineup.entrants[0]
+        experiment = Experiment(
+            first.policy,
+            objects,
+            episodes=self.episodes,
+            track=track,
+            **self._settings(engine),
+        )
+        if self.constraints is None:
+            return experiment, []
+        captured = captured_objects(self.constraints, self.split, objects)
+        lineup.require(captured.hand)
+        without_set = {obj.name for obj in objects} - {obj.name for obj in captured.objects}
+        experiment = dataclasses.replace(
+            experiment,
+            objects=captured.objects,
+            constraints=captured.bank,
+            paper=captured.paper,
+        )
+        return experiment, sorted(without_set)
+
+    def _objects(self, track: Track) -> list[GraspObject]:
+        """Returns the objects of all tables but `objects`."""
+        if self.objects:
+            return named.objects_of(self.objects, track=track)
+        return pools.exam_pool(self.exam, self.pool)
+
+    def _folder_of_rows(self, entrant: Entrant) -> pathlib.Path | None:
+        """Folder for a policy's rows, from which a stopped evaluation resumes."""
+        if self.json is None:
+            return None
+        return _partial_results(self.json) / f"{entrant.hand}-{entrant.method}"
+
+    def _settings(self, engine: PhysicsName) -> dict[str, Any]:
         """Settings of all episodes."""
         return {
             "physics": engine,
@@ -181,76 +218,105 @@ class Evaluate:
             "friction": self.friction,
         }
 
-    def _show(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
+    def _print(
+        self, evaluations: Sequence[tables.Evaluation], lineup: Lineup, engine: PhysicsName
+    ) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and
         skipped rows.
         """
-        console, rows = (
-            Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 160),
-            _rows(results),
+        width = None if sys.stdout.isatty() else _PIPE_WIDTH
+        console = Console(highlight=False, markup=False, width=width)
+        rows = _rows(evaluations)
+        title = (
+            f"{lineup.title}, on {lineup.objects(self.objects, self.exam)}, "
+            f"{engine_title(engine)}, friction {self.friction:g}"
         )
-        where = (
-            f"{lineup.objects(self.objects, self.exam)}, {engine_title(engine)}, friction "
-            f"{self.friction:g}"
-        )
-        what = f"{lineup.title}, on {where}"
-        for shown in tables_of(rows, what, lineup.missing) + (
-            [object_table(rows)] if self.by == "object" else []
-        ):
-            console.print(shown.terminal())
-        for (one, _), found in zip(lineup.entrants, results, strict=True):
-            if found.heading_rules:
-                say(found.heading_rules.sentence(one.hand))
-        say(*dict.fromkeys(found.references for found in results if found.references))
-        say(*dict.fromkeys(f"Left out: {error}" for found in results for error in found.left_out))
+        printed_tables = tables_of(rows, title, lineup.missing)
+        if self.by == "object":
+            printed_tables.append(object_table(rows))
+        for table in printed_tables:
+            console.print(table.terminal())
+        for (entrant, _), evaluation in zip(lineup.entrants, evaluations, strict=True):
+            if evaluation.heading_rules:
+                say(evaluation.heading_rules.sentence(entrant.hand))
+        references = [evaluation.references for evaluation in evaluations]
+        say(*dict.fromkeys(filter(None, references)))
+        left_out = []
+        for evaluation in evaluations:
+            left_out += [f"Left out: {error}" for error in evaluation.left_out]
+        say(*dict.fromkeys(left_out))
 
-    def _write(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
-        """Writes the rows, with policies, settings and provenance, to the JSON file."""
-        policies = [facts(one) for one, _ in lineup.entrants]
-        rules = {
-            one.hand: dataclasses.asdict(found.heading_rules)
-            for (one, _), found in zip(lineup.entrants, results, strict=True)
-            if found.heading_rules
-        }
+    def _write(
+        self,
+        file: pathlib.Path,
+        evaluations: Sequence[tables.Evaluation],
+        lineup: Lineup,
+        engine: PhysicsName,
+    ) -> None:
+        """Writes the rows, with policies, settings and provenance, to a JSON file."""
+        policies = [facts(entrant) for entrant, _ in lineup.entrants]
+        heading_rules = {}
+        for (entrant, _), evaluation in zip(lineup.entrants, evaluations, strict=True):
+            if evaluation.heading_rules:
+                heading_rules[entrant.hand] = dataclasses.asdict(evaluation.heading_rules)
         about = {
             **provenance(),
             "policy": policies[0],
             "policies": policies,
-            "missing": [one._asdict() for one in lineup.missing],
+            "missing": [missing._asdict() for missing in lineup.missing],
             "headings": lineup.entrants[0][0].policy.task.headings,
-            "heading_rules": rules,
+            "heading_rules": heading_rules,
             "objects": lineup.objects(self.objects, self.exam),
             "exam": None if self.objects else self.exam,
             "constraints": str(self.constraints) if self.constraints else None,
             "split": self.split if self.constraints else None,
             **self._settings(engine),
         }
-        assert self.json is not None
-        write_json(_rows(results), self.json, about)
+        write_json(_rows(evaluations), file, about)
+
+    def _draw(
+        self, folder: pathlib.Path, evaluations: Sequence[tables.Evaluation], lineup: Lineup
+    ) -> None:
+        """Draws the episodes of each policy, of several into a folder each."""
+        for (entrant, _), evaluation in zip(lineup.entrants, evaluations, strict=True):
+            policy_folder = folder
+            if len(evaluations) > 1:
+                policy_folder = folder / f"{entrant.hand}-{entrant.method}"
+            _draw_evaluation(evaluation, policy_folder)
 
 
-def _rows(results: Sequence[tables.Found]) -> list[Row]:
+def _partial_results(file: pathlib.Path) -> pathlib.Path:
+    """Folder of the rows of an unfinished evaluation that writes a JSON file."""
+    return file.with_name(f"{file.name}.parts")
+
+
+def _rows(evaluations: Sequence[tables.Evaluation]) -> list[Row]:
     """The rows of all policies."""
-    return [row for found in results for row in found.rows]
+    return [row for evaluation in evaluations for row in evaluation.rows]
 
 
-def _draw(found: tables.Found, pictures: pathlib.Path) -> None:
+def _draw_evaluation(evaluation: tables.Evaluation, folder: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the rows without a change."""
     from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
     from congrasp.services.evaluate.plots import draw_noise
 
-    policy = found.experiment.policy
-    if noisy := found.of(tables.Noise):
-        who = f"{policy.spec.hand_name} hand, version {policy.version}"
-        title = f"{who}: {found.experiment.episodes} episodes a level"
-        draw_noise([result.row for result in noisy], pictures / "noise.png", title)
-        save_noise_examples(noisy, pictures / "noise_examples.png")
-        print(f"Curves and examples of noisy references are drawn in {pictures}.")
-    for name, sheet, _ in failure_sheets(
-        found.experiment, found.of(Variation), _PICTURED, _PICTURED
-    ):
-        save_png(pictures / f"{name}.png", sheet)
-        print(f"Episodes of '{name}' are drawn in {pictures}.")
+    experiment = evaluation.experiment
+    policy = experiment.policy
+    noisy = evaluation.of(Noise)
+    if noisy:
+        title = (
+            f"{policy.spec.hand_name} hand, version {policy.version}: {experiment.episodes} "
+            f"episodes a level"
+        )
+        draw_noise([result.row for result in noisy], folder / "noise.png", title)
+        save_noise_examples(noisy, folder / "noise_examples.png")
+        print(f"Curves and examples of noisy references are drawn in {folder}.")
+    sheets = failure_sheets(
+        experiment, evaluation.of(Variation), _PICTURES_OF_EACH_KIND, _PICTURES_OF_EACH_KIND
+    )
+    for name, sheet, _ in sheets:
+        save_png(folder / f"{name}.png", sheet)
+        print(f"Episodes of '{name}' are drawn in {folder}.")
 
 
 COMMAND = Evaluate

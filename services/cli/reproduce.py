@@ -11,16 +11,25 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.services.cli.console import in_range, tracked
 from congrasp.services.evaluate.lineup import Entrant, read_entrants
+from congrasp.services.evaluate.paper.comparison import summary
+from congrasp.services.evaluate.paper.evaluation import PartSettings
+from congrasp.services.evaluate.paper.page import JSON, LATEX, PAGE, page_template
+from congrasp.services.evaluate.paper.parts import BASELINES, RequiredPolicy, required_policies
+from congrasp.services.evaluate.paper.reproduction import Request, reproduce
 from congrasp.services.ops.lifetime import command
-from congrasp.services.reproduce.comparison import JSON, LATEX, PAGE, summary
-from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, policies
-from congrasp.services.reproduce.run import Request, reproduce, to_train
 from congrasp.services.train import processes
+from congrasp.services.train.reproduction import PolicyRequest, get_policies, policies_to_train
 
-_QUICK, _FULL = (48, 24), (1000, 64)
-"""Episodes of a row, and procedural objects."""
-_MANY = {True: 2, False: 50}
-"""Episodes of the table of many objects per episode of a row, by --quick."""
+_RUNS_FOLDER = "policies"
+"""Folder of trainings within the output folder."""
+_QUICK_EPISODES = 48
+_QUICK_POOL = 24
+_FULL_EPISODES = 1000
+_FULL_POOL = 64
+"""Episodes of a row, and procedural objects, with and without --quick."""
+_QUICK_MANY = 2
+_FULL_MANY = 50
+"""Episodes of the table of many objects per episode of a row."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,40 +85,56 @@ class Reproduce:
         """Trains, evaluates, and prints a summary."""
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        chosen, compared = (
-            tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()),
-            self.methods or BASELINES,
+        hands = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands())
+        methods = self.methods or BASELINES
+        _check_names(hands, methods)
+        policy_request = PolicyRequest(
+            hands=hands,
+            methods=methods,
+            given=_given(self.policy, required_policies(hands, methods)),
+            pretrained=self.quick,
+            runs=self.out / _RUNS_FOLDER,
+            options=tuple(shlex.split(self.training)),
+            timeout_s=60.0 * self.patience,
         )
-        _check_names(chosen, compared)
-        usual_episodes, usual_pool = _QUICK if self.quick else _FULL
         request = Request(
             out=self.out,
-            hands=chosen,
-            methods=compared,
-            given=_given(self.policy, policies(chosen, compared)),
+            hands=hands,
+            methods=methods,
             captured=self.captured,
-            quick=self.quick,
-            options=tuple(shlex.split(self.training)),
-            patience=60.0 * self.patience,
+            noise=not self.quick,
             command=self._command(),
-            episodes=self.episodes or usual_episodes,
-            pool=self.pool or usual_pool,
-            many=_MANY[self.quick] * (self.episodes or usual_episodes),
+            settings=self._settings(),
+        )
+        _check_device([policy.name for policy in policies_to_train(policy_request)])
+        page_template()  # fails before the trainings if a package is missing
+        with tracked() as track:
+            # First: trainings have the whole device memory until this process has an engine.
+            policies = get_policies(policy_request, track)
+            for failure in policies.failures:
+                print(failure, flush=True)
+            reproduction = reproduce(request, policies, track, lambda text: print(text, flush=True))
+        print(summary(reproduction.cells))
+        print(f"The page is {self.out / PAGE}, next to {JSON} and {LATEX}.")
+        return 1 if reproduction.failures else 0
+
+    def _settings(self) -> PartSettings:
+        """Numbers of episodes and objects, engine and seed."""
+        episodes = self.episodes or (_QUICK_EPISODES if self.quick else _FULL_EPISODES)
+        many = _QUICK_MANY if self.quick else _FULL_MANY
+        return PartSettings(
+            episodes=episodes,
+            pool=self.pool or (_QUICK_POOL if self.quick else _FULL_POOL),
+            many=many * episodes,
             physics=self.physics,
             seed=self.seed,
         )
-        _check_device([one.name for one in to_train(request)])
-        with tracked() as track:
-            account = reproduce(request, track, lambda text: print(text, flush=True))
-        print(summary(account.cells))
-        print(f"The page is {self.out / PAGE}, next to {JSON} and {LATEX}.")
-        return 1 if account.failures else 0
 
     def _command(self) -> str:
         """The command line, with the options that are set."""
-        usual = vars(Reproduce())
-        given = {name: value for name, value in vars(self).items() if value != usual[name]}
-        return shlex.join(command("congrasp", "reproduce", **given))
+        defaults = vars(Reproduce())
+        changed = {name: value for name, value in vars(self).items() if value != defaults[name]}
+        return shlex.join(command("congrasp", "reproduce", **changed))
 
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
@@ -127,22 +152,24 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
 
 def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-    found = {RequiredPolicy(one.hand, one.method): one for one in read_entrants(texts)}
-    for policy, one in found.items():
+    given = {
+        RequiredPolicy(entrant.hand, entrant.method): entrant for entrant in read_entrants(texts)
+    }
+    for policy, entrant in given.items():
         if policy not in needed:
             raise CongraspError(
-                f"The policy {one.file.name} is of the hand '{policy.hand}' and the method "
+                f"The policy {entrant.file.name} is of the hand '{policy.hand}' and the method "
                 f"'{policy.method}'.",
                 "Name that hand with --hands, the first one for methods, or leave the policy out.",
             )
-    return found
+    return given
 
 
-def _check_device(wanted: list[str]) -> None:
+def _check_device(names: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-    if wanted and processes.accelerators()[0] == "cpu":
+    if names and processes.accelerators()[0] == "cpu":
         raise CongraspError(
-            f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",
+            f"{', '.join(names)} must be trained first, and this machine has no GPU.",
             "Use --quick, which takes the pretrained policies, or name policies with --policy.",
         )
 

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from congrasp.common.io.files import write_atomically
 from congrasp.services.dataset.columns import VERDICTS
 from congrasp.services.dataset.shards import CARD, Shards
-from congrasp.services.evaluate.table import Table, percent
+from congrasp.services.evaluate.text_table import Table, percent
 
 README = "README.md"
 

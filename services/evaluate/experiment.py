@@ -45,7 +45,7 @@ from congrasp.services.evaluate.plan import (
     two_seconds,
 )
 from congrasp.services.evaluate.references import References
-from congrasp.services.evaluate.scores import Row, summarise
+from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
 STRESSED = 200
 """Episodes of a row that continue after the hold with lift and pushes."""
@@ -133,7 +133,7 @@ class Experiment:
     hold: int | None = None
     """Control steps without the table; two seconds if None."""
     paper: str = "hands"
-    """Table of the paper for comparison (`services.evaluate.paper`); empty for none."""
+    """Table of the paper for comparison (`services.evaluate.paper.figures`); empty for none."""
     pool: int = 0
     """Number of the pool of these objects, added to the seed of sampled constraints."""
     measured: bool = True
@@ -426,14 +426,14 @@ class Experiment:
 
     def row(self, variation: Variation, sample: Sample) -> Row:
         """Returns the row of a variation's episodes."""
-        return summarise(
+        description = RowDescription(
             variation.constraint,
             self.hand.name,
-            sample,
+            [obj.name for obj in self.objects],
             held_2s=self.steps == two_seconds(self.task),
             by_reference=self.constraints is not None and from_references(variation.constraint),
             group=variation.label,
             method=self.task.method,
             paper=self.paper,
-            objects=[obj.name for obj in self.objects],
         )
+        return summarise(description, sample)

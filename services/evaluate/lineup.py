@@ -5,7 +5,7 @@ a policy.
 import dataclasses
 import hashlib
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from congrasp.common.errors import CongraspError
@@ -33,6 +33,13 @@ ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-
 """Methods of the table `ablation`."""
 
 
+class PolicyKey(NamedTuple):
+    """Hand and method of a policy."""
+
+    hand: str
+    method: str
+
+
 class Entrant(NamedTuple):
     """A policy with its method; its task is that of the method."""
 
@@ -48,6 +55,11 @@ class Entrant(NamedTuple):
     def method(self) -> str:
         """Method of `common.task.methods`."""
         return self.policy.task.method
+
+    @property
+    def key(self) -> PolicyKey:
+        """Hand and method."""
+        return PolicyKey(self.hand, self.method)
 
 
 class Missing(NamedTuple):
@@ -69,24 +81,21 @@ class Lineup(NamedTuple):
         """Describes what is evaluated: a policy, a method without one, or several."""
         if len(self.entrants) > 1:
             return f"{len(self.entrants)} policies"
-        one = self.entrants[0][0]
-        what = f"{one.file.name}, version {one.policy.version}"
-        if one.method == "ours":
-            return what
-        return (
-            f"method {one.method}, {what}"
-            if get_method(one.method).learns
-            else f"method {one.method}"
-        )
+        entrant, _ = self.entrants[0]
+        version = f"{entrant.file.name}, version {entrant.policy.version}"
+        if entrant.method == "ours":
+            return version
+        if not get_method(entrant.method).learns:
+            return f"method {entrant.method}"
+        return f"method {entrant.method}, {version}"
 
     def objects(self, folder: pathlib.Path | None, exam: str) -> str:
         """Label of the objects, with their scale for the hand if there is one."""
-        labels = list(
-            dict.fromkeys(objects_label(one.policy, folder, exam) for one, _ in self.entrants)
-        )
-        return (
-            labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
-        )
+        labels = [objects_label(entrant.policy, folder, exam) for entrant, _ in self.entrants]
+        if len(set(labels)) == 1:
+            return labels[0]
+        source, _, _ = labels[0].partition(",")
+        return f"{source} in each hand's size"
 
     def require(self, hand: str) -> None:
         """Raises a CongraspError unless captured constraints of this hand belong to all
@@ -124,28 +133,46 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
       CongraspError: a policy cannot be read or has another method, a folder holds none, or two have
         the same hand and method.
     """
-    found: list[Entrant] = []
+    entrants: list[Entrant] = []
     for text in texts:
-        path, own = pathlib.Path(text), method
+        path = pathlib.Path(text)
+        method_of_file = method
         if not path.exists() and "=" in text:
-            own, _, rest = text.partition("=")
-            path = pathlib.Path(rest)
-        files = [policy_file(path)]
-        if path.is_dir():
-            files = sorted({*path.glob(POLICY_FILE), *path.glob(f"*/{POLICY_FILE}")})
-            if not files:
-                raise CongraspError(
-                    f"The folder {path} holds no {POLICY_FILE}.",
-                    "Pass a run's folder, or a policy file.",
-                )
-        found += [read_entrant(file, own) for file in files]
-    for i, one in enumerate(found):
-        if any((one.hand, one.method) == (other.hand, other.method) for other in found[:i]):
+            method_of_file, _, name = text.partition("=")
+            path = pathlib.Path(name)
+        for file in _policy_files(path):
+            entrants.append(read_entrant(file, method_of_file))
+    _check_different(entrants)
+    return entrants
+
+
+def _policy_files(path: pathlib.Path) -> list[pathlib.Path]:
+    """Returns the policy files of a path.
+
+    Raises:
+      CongraspError: a folder holds none, or a file does not exist.
+    """
+    if not path.is_dir():
+        return [policy_file(path)]
+    files = sorted({*path.glob(POLICY_FILE), *path.glob(f"*/{POLICY_FILE}")})
+    if not files:
+        raise CongraspError(
+            f"The folder {path} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file."
+        )
+    return files
+
+
+def _check_different(entrants: Sequence[Entrant]) -> None:
+    """Raises a CongraspError if two policies have the same hand and method."""
+    keys = set()
+    for entrant in entrants:
+        key = (entrant.hand, entrant.method)
+        if key in keys:
             raise CongraspError(
-                f"Two policies have the hand '{one.hand}' and the method '{one.method}'.",
+                f"Two policies have the hand '{entrant.hand}' and the method '{entrant.method}'.",
                 "Evaluate one at a time.",
             )
-    return found
+        keys.add(key)
 
 
 def line_up(
@@ -167,38 +194,60 @@ def line_up(
     Raises:
       CongraspError: there is no policy for the hand.
     """
-    first = list(given) or [read_entrant(policy_file(None, hand), method)]
-    own = first[0].hand
-    tables_of: dict[tuple[str, str], list[Table]] = {}
-    known = {(one.hand, one.method): one for one in first}
+    policies = list(given) or [read_entrant(policy_file(None, hand), method)]
+    known = {entrant.key: entrant for entrant in policies}
+    tables_of: dict[PolicyKey, list[Table]] = {}
     missing: list[Missing] = []
     for table in dict.fromkeys(tables):
-        if table == "hands" and not given:
-            for name in pretrained_hands():
-                known.setdefault((name, "ours"), read_entrant(policy_file(None, name)))
-        taught = table == "sensing" and any(one.method in STUDENTS for one in first)
-        if (
-            (taught or table == "ablation")
-            and (own, "ours") not in known
-            and own in pretrained_hands()
-        ):
-            known[own, "ours"] = read_entrant(policy_file(None, own))
-        chosen = {
-            "hands": [key for key in known if key[1] == "ours"],
-            "ablation": [(own, name) for name in ABLATION],
-        }.get(table, [(one.hand, one.method) for one in first])
-        if taught and (own, "ours") in known:
-            chosen = list(dict.fromkeys([(own, "ours"), *chosen]))
-        for key in chosen:
+        _add_pretrained(known, table, policies, pretrained_hands_requested=not given)
+        for key in _policies_of_table(table, policies, known):
             if key in known:
-                tables_of.setdefault(key, []).append(
-                    "single" if table in ("hands", "ablation") else table
-                )
+                same_rows = "single" if table in ("hands", "ablation") else table
+                tables_of.setdefault(key, []).append(same_rows)
             else:
                 missing.append(Missing(*key, "not trained"))
-    return Lineup(
-        [(known[key], tuple(dict.fromkeys(tables))) for key, tables in tables_of.items()], missing
-    )
+    entrants = []
+    for key, tables_of_policy in tables_of.items():
+        entrants.append((known[key], tuple(dict.fromkeys(tables_of_policy))))
+    return Lineup(entrants, missing)
+
+
+def _add_pretrained(
+    known: dict[PolicyKey, Entrant],
+    table: Table,
+    policies: Sequence[Entrant],
+    *,
+    pretrained_hands_requested: bool,
+) -> None:
+    """Adds the pretrained full systems with which a table compares, unless others are known."""
+    if table == "hands" and pretrained_hands_requested:
+        for name in pretrained_hands():
+            known.setdefault(PolicyKey(name, "ours"), read_entrant(policy_file(None, name)))
+    if table == "ablation" or _compares_student(table, policies):
+        full_system = PolicyKey(policies[0].hand, "ours")
+        if full_system not in known and full_system.hand in pretrained_hands():
+            known[full_system] = read_entrant(policy_file(None, full_system.hand))
+
+
+def _compares_student(table: Table, policies: Sequence[Entrant]) -> bool:
+    """True if a table compares a student with the full system."""
+    return table == "sensing" and any(entrant.method in STUDENTS for entrant in policies)
+
+
+def _policies_of_table(
+    table: Table, policies: Sequence[Entrant], known: Mapping[PolicyKey, Entrant]
+) -> list[PolicyKey]:
+    """Returns the policies that a table compares, some of them possibly unknown."""
+    hand = policies[0].hand
+    if table == "hands":
+        return [key for key in known if key.method == "ours"]
+    if table == "ablation":
+        return [PolicyKey(hand, method) for method in ABLATION]
+    keys = [entrant.key for entrant in policies]
+    full_system = PolicyKey(hand, "ours")
+    if _compares_student(table, policies) and full_system in known:
+        keys = list(dict.fromkeys([full_system, *keys]))
+    return keys
 
 
 def facts(one: Entrant) -> dict[str, Any]:

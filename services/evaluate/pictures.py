@@ -101,7 +101,7 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
     one, as PNG.
 
     Args:
-      results: rows of `services.evaluate.tables.NOISE`; the last one of each kind is the worst.
+      results: rows of `services.evaluate.variations.NOISE`; the last one of each kind is the worst.
       path: the file to write.
 
     Raises:

@@ -12,9 +12,10 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_json
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.evaluate.columns import RATE, paper_rate, row_title
 from congrasp.services.evaluate.scores import ERRORS, Row
-from congrasp.services.evaluate.table import RATE, Table, paper_rate, percent, row_title
-from congrasp.services.evaluate.tables import NOISE
+from congrasp.services.evaluate.text_table import Table, percent
+from congrasp.services.evaluate.variations import NOISE
 from congrasp.services.record.palette import INK
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, panel_grid, save, style
 
@@ -84,7 +85,7 @@ def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
     """Draws success and errors against the noise, a panel for each kind, as PNG.
 
     Args:
-      rows: rows of `services.evaluate.tables.NOISE`, in that order.
+      rows: rows of `services.evaluate.variations.NOISE`, in that order.
       path: the file to write.
       title: title of the figure.
 

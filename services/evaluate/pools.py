@@ -37,7 +37,8 @@ from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
 from congrasp.services.evaluate.experiment import MEASURED, STRESSED, Experiment, Variation, silent
-from congrasp.services.evaluate.scores import Row, object_groups, summarise
+from congrasp.services.evaluate.object_groups import object_groups
+from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
 Exam = Literal["figures", "development"]
 """Sets of procedural objects: one for published figures, one for development."""
@@ -334,20 +335,20 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
     names, sizes, masses, families = zip(
         *(facts for result in results for facts in result.objects), strict=True
     )
-    row = functools.partial(
-        summarise,
+    all_objects = RowDescription(
         Variation().constraint,
         experiment.hand.name,
+        [*names, *left_out],
         held_2s=True,
-        objects=[*names, *left_out],
         method=experiment.task.method,
         paper="objects",
     )
-    rows = [row(sample=whole)]
+    rows = [summarise(all_objects, whole)]
     for label, members in object_groups(np.array(sizes), np.array(masses), np.array(families)):
         chosen = members[index]
         if chosen.any():
-            rows.append(row(sample=whole.where(chosen), pool=int(members.sum()), group=label))
+            group = dataclasses.replace(all_objects, pool=int(members.sum()), group=label)
+            rows.append(summarise(group, whole.where(chosen)))
     return rows
 
 

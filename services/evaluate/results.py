@@ -22,18 +22,16 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.evaluate.scores import Row
-from congrasp.services.evaluate.table import (
+from congrasp.services.evaluate.columns import (
     PLAUSIBILITY,
     RATE,
-    Columns,
-    Table,
     paper_rate,
-    percent,
     posture_columns,
     row_title,
 )
-from congrasp.services.evaluate.tables import HeadingRules
+from congrasp.services.evaluate.heading_rules import HeadingRules
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.evaluate.text_table import Columns, Table, percent
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDER = pathlib.Path("docs", "results")

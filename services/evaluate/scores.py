@@ -4,7 +4,6 @@ comparison.
 
 import dataclasses
 import json
-import math
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -17,7 +16,13 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.episodes import Sample
-from congrasp.services.evaluate.paper import PaperRow, paper_row
+from congrasp.services.evaluate.intervals import (
+    NORMAL_95,
+    clustered,
+    independent_episodes,
+    standard_error,
+)
+from congrasp.services.evaluate.paper.figures import PaperRow, paper_row
 from congrasp.services.evaluate.plan import ALIGNED
 
 TABLES = {
@@ -32,12 +37,17 @@ UNITS = {
     spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors
 }
 """Units of the errors, by their names in rows."""
-NORMAL_95 = 1.959964
-"""Quantile of the normal distribution for two-sided 95 % intervals."""
-_FORCES = ("link_force", "force_sum", "torque_share")
-_PRESSED = ("force_peak_n", "force_mean_n")
+_FORCE_COLUMNS = (
+    "link_force_mean",
+    "link_force_p95",
+    "force_sum_mean",
+    "force_sum_p95",
+    "torque_share_mean",
+    "torque_share_p95",
+    "force_peak_n",
+    "force_mean_n",
+)
 _HUNDREDTHS = np.linspace(0, 1, 101)
-_SIZES = ("small", "medium", "large")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,8 +112,11 @@ class Row:
     def to_json(self) -> dict[str, Any]:
         """Returns the row as written to `--json`."""
         row = dataclasses.asdict(self)
-        errors, forces, total = row.pop("errors"), row.pop("forces"), row.pop("episode_return")
-        return {**row, **errors, **forces, **row.pop("plausibility"), "return": total}
+        errors = row.pop("errors")
+        forces = row.pop("forces")
+        plausibility = row.pop("plausibility")
+        total = row.pop("episode_return")
+        return {**row, **errors, **forces, **plausibility, "return": total}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> "Row":
@@ -112,76 +125,84 @@ class Row:
         Raises:
           LookupError, TypeError: `row` has another format.
         """
-        own = {
+        fields = {
             field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row
         }
         # Older files lack constraints that were added later.
-        errors = {name: row.get(name) for names in ERRORS.values() for name in names.values()}
-        forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
-        forces |= {name: row[name] for name in _PRESSED}
-        known = {*own, *errors, *forces, "return"}
-        measured = {name: value for name, value in row.items() if name not in known}
-        own |= {
-            "paper": PaperRow(**row["paper"]) if row["paper"] else None,
-            "plausibility": measured,
-        }
-        return cls(**own, errors=errors, forces=forces, episode_return=row["return"])
+        errors = {name: row.get(name) for name in UNITS}
+        forces = {name: row[name] for name in _FORCE_COLUMNS}
+        known = {*fields, *errors, *forces, "return"}
+        plausibility = {name: value for name, value in row.items() if name not in known}
+        paper = PaperRow(**row["paper"]) if row["paper"] else None
+        fields |= {"paper": paper, "plausibility": plausibility}
+        return cls(**fields, errors=errors, forces=forces, episode_return=row["return"])
 
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
     """Names of the rows of some of `TABLES` whose constraints the task's policy supports."""
-    rows = dict.fromkeys(row for table in tables for row in TABLES[table])
-    return [
-        row for row in rows if set(row.removesuffix(ALIGNED).split("+")) <= set(task.constraints)
-    ]
+    supported = []
+    for row in dict.fromkeys(row for table in tables for row in TABLES[table]):
+        constraints = row.removesuffix(ALIGNED).split("+")
+        if set(constraints) <= set(task.constraints):
+            supported.append(row)
+    return supported
 
 
-def summarise(  # noqa: PLR0913
-    name: str,
-    hand: str,
-    sample: Sample,
-    *,
-    held_2s: bool,
-    objects: Sequence[str],
-    pool: int | None = None,
-    by_reference: bool = False,
-    group: str = "",
-    method: str = "ours",
-    paper: str = "",
-) -> Row:
-    """Computes a row from its episodes.
+@dataclasses.dataclass(frozen=True)
+class RowDescription:
+    """Description of a row's episodes."""
 
-    Args:
-      name: name of the row, see `services.evaluate.plan.plan_row`.
-      hand: name of the hand.
-      sample: episodes of the row.
-      held_2s: True if the episodes lasted for two seconds without the table.
-      objects: names of the pool's objects, including those without an episode.
-      pool: number of requested objects, if the row covers only some of them; all by default.
-      by_reference: uses references, such as captured sequences, as clusters of the intervals
-        instead of objects.
-      group: group of objects, such as "small (below 8 cm)".
-      method: method of `common.task.methods`.
-      paper: table of the paper for comparison, see `services.evaluate.paper`.
+    name: str
+    """Name of the row, see `services.evaluate.plan.plan_row`."""
+    hand: str
+    """Name of the hand."""
+    objects: Sequence[str]
+    """Names of the pool's objects, including those without an episode."""
+    held_2s: bool
+    """True if the episodes lasted for two seconds without the table."""
+    pool: int | None = None
+    """Number of requested objects, if the row covers only some of them; all if None."""
+    by_reference: bool = False
+    """True if references, such as captured sequences, are the clusters of the intervals instead of
+    objects.
     """
-    constraint = name.removesuffix(ALIGNED)
-    group = group or ("aligned pairs" if name.endswith(ALIGNED) else "")
-    values, pool = sample.values, pool or len(objects)
-    success, index = values["success"] > 0, values["object_index"]
-    clusters = values["reference"] if by_reference else index
+    group: str = ""
+    """Group of objects, such as "small (below 8 cm)"."""
+    method: str = "ours"
+    """Method of `common.task.methods`."""
+    paper: str = ""
+    """Table of the paper for comparison, see `services.evaluate.paper.figures`."""
+
+    @property
+    def constraint(self) -> str:
+        """Constraints joined by `+`."""
+        return self.name.removesuffix(ALIGNED)
+
+    @property
+    def title(self) -> str:
+        """Group of objects or pairs."""
+        if not self.group and self.name.endswith(ALIGNED):
+            return "aligned pairs"
+        return self.group
+
+
+def summarise(description: RowDescription, sample: Sample) -> Row:
+    """Computes a row from its episodes."""
+    values = sample.values
+    success = values["success"] > 0
+    index = values["object_index"]
+    clusters = values["reference"] if description.by_reference else index
+    pool = description.pool or len(description.objects)
     held = _rates(("held_2s", "held_all"), values["held"] > 0, clusters, index, pool)
-    found = {
-        name: values[source][success]
-        for part in constraint.split("+")
-        for source, name in ERRORS[part].items()
-    }
-    reached = {name: error for name, error in found.items() if len(error)}
-    means = {name: float(error.mean()) for name, error in reached.items()}
+    if not description.held_2s:
+        held = dict.fromkeys(held)
+    errors = _errors_of_successes(description.constraint, values, success)
+    means = {name: float(error.mean()) for name, error in errors.items()}
     return Row(
-        constraint=constraint,
-        hand=hand,
-        method=method,
-        group=group,
+        constraint=description.constraint,
+        hand=description.hand,
+        method=description.method,
+        group=description.title,
         episodes=len(success),
         covered=len(np.unique(index)),
         pool=pool,
@@ -189,25 +210,44 @@ def summarise(  # noqa: PLR0913
         independent=independent_episodes(success, clusters),
         mass_kg=float(values["mass_kg"].mean()),
         **_rates(("success", "success_all"), success, clusters, index, pool),
-        **(held if held_2s else dict.fromkeys(held)),
-        errors={name: means.get(name) for names in ERRORS.values() for name in names.values()},
+        **held,
+        errors={name: means.get(name) for name in UNITS},
         forces=_forces(sample.where(success)),
         episode_return=float(values["return"].mean()),
         links_at_removal=float(values["links_at_removal"].mean()),
         diverged=float((values["diverged"] > 0).mean()),
-        paper=paper_row(paper, hand, method, constraint, group),
-        plausibility=_plausibility(values, held_2s),
+        paper=paper_row(
+            description.paper,
+            description.hand,
+            description.method,
+            description.constraint,
+            description.title,
+        ),
+        plausibility=_plausibility(values, description.held_2s),
         margins={
             name: NORMAL_95 * standard_error(error)
-            for name, error in reached.items()
+            for name, error in errors.items()
             if len(error) > 1
         },
         quantiles={
             name: np.quantile(error, _HUNDREDTHS).round(6).tolist()
-            for name, error in reached.items()
+            for name, error in errors.items()
         },
-        objects=_by_object(values, objects, held_2s),
+        objects=_by_object(values, description.objects, description.held_2s),
     )
+
+
+def _errors_of_successes(
+    constraint: str, values: Mapping[str, np.ndarray], success: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Errors of successful episodes by their names in rows; empty if no episode succeeded."""
+    if not success.any():
+        return {}
+    errors = {}
+    for part in constraint.split("+"):
+        for metric, name in ERRORS[part].items():
+            errors[name] = values[metric][success]
+    return errors
 
 
 def _rates(
@@ -227,11 +267,16 @@ def _rates(
       objects: (E,) index of each episode's object.
       pool: number of objects; those without episodes have a rate of 0.
     """
+    over_episodes, over_pool = names
     low, high = clustered(outcomes, clusters)
     _, members = np.unique(objects, return_inverse=True)
-    of_each = np.bincount(members, outcomes) / np.bincount(members)
-    found = {names[0]: float(outcomes.mean()), f"{names[0]}_low": low, f"{names[0]}_high": high}
-    return {**found, names[1]: float(of_each.sum() / pool)}
+    rate_of_object = np.bincount(members, outcomes) / np.bincount(members)
+    return {
+        over_episodes: float(outcomes.mean()),
+        f"{over_episodes}_low": low,
+        f"{over_episodes}_high": high,
+        over_pool: float(rate_of_object.sum() / pool),
+    }
 
 
 def _by_object(
@@ -245,12 +290,12 @@ def _by_object(
         columns["held_2s"] = values["held"] > 0
         if "clean" in values:
             columns["clean"] = values["clean"] > 0
-    of_each = {name: np.bincount(index, column, len(objects)) for name, column in columns.items()}
-    return [
-        {"name": objects[i], "episodes": int(counts[i])}
-        | {name: float(total[i] / counts[i]) for name, total in of_each.items()}
-        for i in np.flatnonzero(counts).tolist()
-    ]
+    totals = {name: np.bincount(index, column, len(objects)) for name, column in columns.items()}
+    rows = []
+    for i in np.flatnonzero(counts).tolist():
+        rates = {name: float(total[i] / counts[i]) for name, total in totals.items()}
+        rows.append({"name": objects[i], "episodes": int(counts[i]), **rates})
+    return rows
 
 
 def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
@@ -261,8 +306,10 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
     for name in ASSESSED:
         column = values.get(name, np.zeros(0))
         column = column[~np.isnan(column)]
-        rate = name == "clean" or name in SURVIVAL
-        row[name] = float(column.mean()) if len(column) and (held_2s or not rate) else None
+        needs_hold = name == "clean" or name in SURVIVAL
+        row[name] = None
+        if len(column) and (held_2s or not needs_hold):
+            row[name] = float(column.mean())
         if name in CLEAN_MM:
             row[f"{name}_p95"] = float(np.percentile(column, 95)) if len(column) else None
     return row
@@ -276,103 +323,19 @@ def _forces(sample: Sample) -> dict[str, float | None]:
     strongest link in a step. Both are means over the episodes.
     """
     links = np.asarray(sample.link_force, np.float32)
-    samples = links[links > 0], links.sum(-1).ravel(), np.asarray(sample.torque, np.float32).ravel()
+    samples = {
+        "link_force": links[links > 0],
+        "force_sum": links.sum(-1).ravel(),
+        "torque_share": np.asarray(sample.torque, np.float32).ravel(),
+    }
     row: dict[str, float | None] = {}
-    for name, found in zip(_FORCES, samples, strict=True):
-        row[f"{name}_mean"] = float(found.mean()) if found.size else None
-        row[f"{name}_p95"] = float(np.percentile(found, 95)) if found.size else None
+    for name, values in samples.items():
+        row[f"{name}_mean"] = float(values.mean()) if values.size else None
+        row[f"{name}_p95"] = float(np.percentile(values, 95)) if values.size else None
     strongest = links.max(-1) if links.size else np.zeros(0)
     row["force_peak_n"] = float(strongest.max(-1).mean()) if strongest.size else None
     row["force_mean_n"] = float(strongest.mean()) if strongest.size else None
     return row
-
-
-def wilson(rate: float, count: float) -> tuple[float, float]:
-    """95 % Wilson score interval of a rate.
-
-    Args:
-      rate: share of successes.
-      count: number of independent episodes, not necessarily an integer.
-    """
-    if count <= 0:
-        return 0.0, 1.0
-    z2 = NORMAL_95**2
-    center = (rate + z2 / (2 * count)) / (1 + z2 / count)
-    half = NORMAL_95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
-    return max(center - half, 0.0), min(center + half, 1.0)
-
-
-def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
-    """Number of independent episodes with the same variance of the rate as these clustered ones.
-
-    It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the
-    cluster-robust variance of the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p
-    (1 - p) / n. The design effect is at least 1. If all episodes have the same outcome it cannot be
-    estimated, and each cluster counts once. Episodes of a single cluster count as independent, and
-    the rate is that of the cluster.
-
-    Args:
-      outcomes: (E,) bool.
-      clusters: (E,) label of the cluster of each episode.
-    """
-    count, rate = len(outcomes), float(np.mean(outcomes)) if len(outcomes) else 0.0
-    _, members = np.unique(clusters, return_inverse=True)
-    number = int(members.max(initial=-1)) + 1
-    if number <= 1:
-        return float(count)
-    if rate in (0.0, 1.0):
-        return float(number)
-    off = np.bincount(members, np.asarray(outcomes, float) - rate)
-    robust = number / (number - 1) * float(off @ off) / count**2
-    return count / max(robust * count / (rate * (1 - rate)), 1.0)
-
-
-def clustered(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with
-    `independent_episodes`.
-    """
-    rate = float(np.mean(outcomes)) if len(outcomes) else 0.0
-    return wilson(rate, independent_episodes(outcomes, clusters))
-
-
-def standard_error(values: np.ndarray) -> float:
-    """Standard error of the mean of independent values (E,), at least two."""
-    return float(values.std(ddof=1) / np.sqrt(len(values)))
-
-
-def terciles(
-    values: np.ndarray, names: Sequence[str], unit: str, factor: float
-) -> tuple[np.ndarray, list[str]]:
-    """Divides objects into three groups of equal size by a property (N,).
-
-    Returns:
-      Groups (N,) of the objects, 0 to 2, and labels of the groups with their bounds.
-    """
-    low, high = (float(x) for x in np.quantile(values, [1 / 3, 2 / 3]))
-    labels = [
-        f"{names[0]} (up to {factor * low:.3g} {unit})",
-        f"{names[1]} ({factor * low:.3g} to {factor * high:.3g} {unit})",
-        f"{names[2]} (above {factor * high:.3g} {unit})",
-    ]
-    return (values > low).astype(int) + (values > high), labels
-
-
-def object_groups(
-    sizes: np.ndarray, masses: np.ndarray, families: np.ndarray
-) -> list[tuple[str, np.ndarray]]:
-    """Labels and members (N,) bool of the groups of objects in the test on unseen geometry.
-
-    The paper stratifies by size without giving bounds. The groups are terciles of the largest side
-    (m), terciles of the mass (kg), and families.
-    """
-    groups = []
-    for values, names, unit, factor in (
-        (sizes, _SIZES, "cm", 100.0),
-        (masses, ("light", "mid", "heavy"), "g", 1000.0),
-    ):
-        of_object, labels = terciles(values, names, unit, factor)
-        groups += [(label, of_object == i) for i, label in enumerate(labels)]
-    return groups + [(f"family {family}", families == family) for family in np.unique(families)]
 
 
 def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -> None:

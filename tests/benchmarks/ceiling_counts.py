@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
-from congrasp.services.evaluate.table import Table
+from congrasp.services.evaluate.text_table import Table
 
 Reached = Literal["noise", "search", ""]
 """Stage that held a condition; empty if none did."""

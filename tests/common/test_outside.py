@@ -185,7 +185,8 @@ def tables(task, values):
     """Its row of an evaluation, from those episodes that had it alone, as if they had all held the
     object.
     """
-    from congrasp.services.evaluate import episodes, scores, table
+    from congrasp.services.evaluate import columns, episodes, scores
+    from tests.rows import summarised
 
     assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {
         "level_m": "level_m"
@@ -197,7 +198,7 @@ def tables(task, values):
         for name, column in {**values, **plan, "success": np.ones(len(alone))}.items()
     }
     nothing = np.zeros((0, 1, 1))
-    row = scores.summarise(
+    row = summarised(
         "level",
         "human",
         episodes.Sample(some, nothing, nothing),
@@ -206,7 +207,7 @@ def tables(task, values):
     )
     np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
     assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
-    assert "level" in table.RATE["error"](row) or "level" in table.RATE["constraint"](row)
+    assert "level" in columns.RATE["error"](row) or "level" in columns.RATE["constraint"](row)
 
 
 def server(task):

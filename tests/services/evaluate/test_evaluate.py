@@ -19,9 +19,10 @@ from congrasp.services.cli.main import load
 from congrasp.services.evaluate import episodes as simulation
 from congrasp.services.evaluate import plan, references
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.paper import CENTER_GROUP
+from congrasp.services.evaluate.heading_rules import heading_rules
+from congrasp.services.evaluate.paper.figures import CENTER_GROUP
 from congrasp.services.evaluate.pictures import failure_sheets
-from congrasp.services.evaluate.tables import Center, Load, heading_rules
+from congrasp.services.evaluate.variations import Center, Load
 from congrasp.services.train.presets import TRACKERS
 from tests import task
 

@@ -11,6 +11,7 @@ from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.common.task.methods import with_method
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate import tables
+from congrasp.services.evaluate.captured import CapturedObjects
 from congrasp.services.evaluate.lineup import ABLATION, line_up, read_entrants
 from congrasp.services.train.command import untrained
 from tests.rows import row
@@ -112,7 +113,7 @@ def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
 def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monkeypatch):
     def evaluate_tables(own, names, pools, kept, *, keep):
         assert names == ("single",) and own.episodes == 7 and pools is None and not keep
-        return tables.Found(
+        return tables.Evaluation(
             own, [], [row("heading", 0.9, 0.8, 0.95, method=own.policy.task.method)], [], ""
         )
 
@@ -145,8 +146,10 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
 
 
 def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):
-    sets = tables.Captured([], None, "human", "captured")
-    monkeypatch.setattr(tables, "captured", lambda folder, split, objects: sets)
+    sets = CapturedObjects([], None, "human", "captured")
+    monkeypatch.setattr(
+        "congrasp.services.cli.evaluate.captured_objects", lambda folder, split, objects: sets
+    )
     monkeypatch.setattr(
         "congrasp.services.assets.objects.named.objects_of", lambda *arguments, **options: []
     )

@@ -20,17 +20,11 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.services.assets.hands.findings import Finding, write_findings
 from congrasp.services.cli import main
+from congrasp.services.evaluate.model_card import limits, model_card
+from congrasp.services.evaluate.pages import Picture, count_causes, curves_of
 from congrasp.services.evaluate.pictures import turntable
-from congrasp.services.evaluate.report import (
-    Commands,
-    Picture,
-    count_causes,
-    curves_of,
-    limits,
-    model_card,
-    write_report,
-)
-from congrasp.services.evaluate.tables import Found
+from congrasp.services.evaluate.report import Commands, ReportContent, write_report
+from congrasp.services.evaluate.tables import Evaluation
 from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.train.command import untrained
 from congrasp.services.viz.shapes import skin_shape
@@ -64,16 +58,16 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     out = tmp_path / "report.html"
     commands = Commands("congrasp evaluate --policy <mine>", "", "congrasp plot x")
     sheets = [Picture("heading", png, "2 held, 1 slipped <b>")]
-    write_report(
-        out,
+    content = ReportContent(
         policy,
         "p & q.safetensors",
         rows,
         "100 episodes",
+        commands,
         sheets,
         [Picture("Learning", png)],
-        commands,
     )
+    write_report(out, content)
     found = Reader(text := out.read_text())
     cells = {content: kind for kind, content in found.cells}
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
@@ -109,8 +103,10 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         assert (
             subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
         )
-        write_report(out, own.policy, name, rows, "8 episodes", [], [], Commands("c", ""), check)
-        return Found(None, [], rows, [CongraspError("Row x.", "Y.")], "")
+        commands = Commands("c", "")
+        content = ReportContent(own.policy, name, rows, "8 episodes", commands, check=check)
+        write_report(out, content)
+        return Evaluation(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
     monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
     monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
@@ -207,7 +203,7 @@ def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
 def test_few_episodes_are_a_warning(tmp_path, policy):
     few = dataclasses.replace(row("heading", 0.9, 0.6, 0.98), episodes=16)
     for rows, warned in (([few], True), ([row("heading", 0.99, 0.975, 0.995)], False)):
-        write_report(tmp_path / "r.html", policy, "p", rows, "", [], [], Commands("c", ""))
+        write_report(tmp_path / "r.html", ReportContent(policy, "p", rows, "", Commands("c", "")))
         text = (tmp_path / "r.html").read_text()
         assert ('class="warning"' in text) == warned and ("rows of 16 episodes" in text) == warned
         for section in ("Use", "Limits", "Data", "Licence", "Citation"):
@@ -247,15 +243,7 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
         array("faces", "<u4", 3).max() < len(points)
         and data["table"][1] == array("faces", "<u4").size
     )
-    write_report(
-        tmp_path / "r.html",
-        policy,
-        "p",
-        [],
-        "",
-        [],
-        [],
-        Commands("c", ""),
-        motion={**made, "constraint": "x"},
-    )
+    motion = {**made, "constraint": "x"}
+    content = ReportContent(policy, "p", [], "", Commands("c", ""), motion=motion)
+    write_report(tmp_path / "r.html", content)
     assert "A grasp to turn around" in (tmp_path / "r.html").read_text()

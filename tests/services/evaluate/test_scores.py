@@ -11,20 +11,15 @@ from rich.console import Console
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.columns import RATE, tables_of
 from congrasp.services.evaluate.episodes import PROBED_EPISODES, Sample, joined
-from congrasp.services.evaluate.paper import CENTER_GROUP, paper_row
+from congrasp.services.evaluate.intervals import clustered, independent_episodes, wilson
+from congrasp.services.evaluate.object_groups import object_groups
+from congrasp.services.evaluate.paper.figures import CENTER_GROUP, paper_row
 from congrasp.services.evaluate.pictures import cause
-from congrasp.services.evaluate.scores import (
-    TABLES,
-    clustered,
-    independent_episodes,
-    object_groups,
-    summarise,
-    wilson,
-    write_json,
-)
-from congrasp.services.evaluate.table import RATE, tables_of
+from congrasp.services.evaluate.scores import TABLES, write_json
 from tests.rows import row as made_row
+from tests.rows import summarised
 
 TASK = TaskConfig()
 BLOCKS = blocks(TASK)
@@ -96,7 +91,7 @@ def test_a_row_averages_over_successful_episodes():
     )
     sample.link_force[:, 0] = [[2, 0], [4, 6], [100, 100], [0, 0]]
     sample.torque[:, 0] = [[0.5, 0.5, 0.5], [0.0, 0.0, 1.0], [1, 1, 1], [0.0, 0.0, 0.5]]
-    row = summarise(
+    row = summarised(
         "pose+trajectory", "human", sample, held_2s=True, objects=list("abcdefg"), paper="captured"
     )
     assert (row.episodes, row.covered, row.pool, row.success, row.held_2s) == (4, 3, 7, 0.75, 0.5)
@@ -127,13 +122,13 @@ def test_uncovered_objects_count_as_failures():
     five.
     """
     sample = _sample([1, 1, 1, 0, 0, 0], [1, 0, 1, 0, 0, 0], object_index=[0, 0, 2, 2, 4, 4])
-    row = summarise("affordance", "human", sample, held_2s=True, objects=list("abcde"))
+    row = summarised("affordance", "human", sample, held_2s=True, objects=list("abcde"))
     assert (row.covered, row.pool, row.success, row.success_all) == (3, 5, 0.5, pytest.approx(0.3))
     assert row.held_2s == pytest.approx(1 / 3) and row.held_all == pytest.approx(0.2)
     assert RATE["of all objects"](row) == "30.0 %, 20.0 %"
     # Of a group of three of the five there is no uncovered object.
     assert (
-        summarise(
+        summarised(
             "heading", "human", sample, held_2s=True, objects=list("abcde"), pool=3
         ).success_all
         == 0.5
@@ -144,10 +139,10 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
     repeated = _sample(
         [1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8
     )
-    row = summarise("pose", "human", repeated, held_2s=True, objects=["a", "b"])
+    row = summarised("pose", "human", repeated, held_2s=True, objects=["a", "b"])
     assert (row.episodes, row.distinct, row.independent) == (16, 2, pytest.approx(1.0))
     assert RATE["episodes"](row) == "16 (2 different)"
-    spread = summarise(
+    spread = summarised(
         "pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"]
     )
     assert (
@@ -156,12 +151,12 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
     )
     # Sequences of one object are the clusters where references are.
     own = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
-    row = summarise("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
+    row = summarised("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
     assert row.independent == pytest.approx(1.0)
 
 
 def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
-    row = summarise("heading", "human", _sample([0, 0], [0, 0]), held_2s=False, objects=["a"])
+    row = summarised("heading", "human", _sample([0, 0], [0, 0]), held_2s=False, objects=["a"])
     assert row.success == 0 and row.held_2s is None and row.held_2s_low is None
     assert set(row.errors.values()) == {None} and set(row.forces.values()) == {None}
 
@@ -218,7 +213,7 @@ def test_peak_and_mean_of_the_strongest_links_force():
     """
     force = np.array([[[3, 1], [0, 4]], [[8, 2], [1, 0]]], np.float16)
     sample = dataclasses.replace(_sample([1, 1], [1, 1]), link_force=force)
-    row = summarise("heading", "human", sample, held_2s=True, objects=["a"]).to_json()
+    row = summarised("heading", "human", sample, held_2s=True, objects=["a"]).to_json()
     assert (row["force_peak_n"], row["force_mean_n"]) == (6.0, 4.0)
 
 
@@ -243,7 +238,7 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     names = dict.fromkeys(name for names in TABLES.values() for name in names)
     objects = list("abcdefgh")
     rows = [
-        summarise(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects)
+        summarised(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects)
         for name in names
     ]
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
@@ -293,10 +288,10 @@ def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
     sample = _sample(
         [1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0]
     )
-    found = summarise("heading", "human", sample, held_2s=True, objects=["box"])
+    found = summarised("heading", "human", sample, held_2s=True, objects=["box"])
     # Standard deviation 0.1 of three values: 1.96 x 0.1 / sqrt(3).
     assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
-    only = summarise("heading", "human", sample.first(1), held_2s=True, objects=["box"])
+    only = summarised("heading", "human", sample.first(1), held_2s=True, objects=["box"])
     assert only.margins == {} and only.errors["heading_rad"] == pytest.approx(0.1)
 
 

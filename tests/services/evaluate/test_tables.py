@@ -22,7 +22,15 @@ from congrasp.services.evaluate import experiment as experiments
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import protocol
 from congrasp.services.evaluate.plots import draw_noise
-from congrasp.services.evaluate.tables import MASSES, NOISE, PEERS, SENSING, Load, Noise, payload
+from congrasp.services.evaluate.variations import (
+    MASSES,
+    NOISE,
+    PEERS,
+    SENSING,
+    Load,
+    Noise,
+    payload,
+)
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.train.presets import TRACKERS

@@ -12,13 +12,13 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli import main
+from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
-from congrasp.services.reproduce.plan import RequiredPolicy
-from congrasp.services.reproduce.run import Request, train_all
 from congrasp.services.train import processes
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import MAX_RESTARTS, Child
+from congrasp.services.train.reproduction import PolicyRequest, train_all, training_options
 
 WAITS = "import time; time.sleep(60)"
 
@@ -213,7 +213,7 @@ def scripts(monkeypatch):
 
 def request(out, patience, *options):
     """A request whose trainings are in `out`."""
-    return Request(out, ("human",), (), {}, (), False, options, patience, "", 1, 1, 1, "native", 0)
+    return PolicyRequest(("human",), (), {}, False, out / "policies", options, patience)
 
 
 def silent(label, total):
@@ -264,7 +264,7 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
     "policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name
 )
 def test_its_command_lines_are_those_of_train(policy):
-    arguments = [*policy.training, "--environments", "4096"]
+    arguments = [*training_options(policy), "--environments", "4096"]
     train = main._parsed("train", main.load("train"), arguments)
     config = train.keywords["config"]
     assert (config.task.hand, config.environments) == (policy.hand, 4096)

@@ -17,9 +17,10 @@ from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli.plot import plot
 from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.plots import compared, plot_evaluation
-from congrasp.services.evaluate.scores import Row, summarise, write_json
+from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.record.writer import JsonChannels, LogWriter, nest
 from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth, titled
+from tests.rows import summarised
 
 METRICS = {
     "episode/return": 3.0,
@@ -175,7 +176,7 @@ def evaluation(path: pathlib.Path) -> list[dict]:
                 values[name] = np.concatenate([np.linspace(0.1, 0.4, 30), np.full(10, 9.0)])
         sample = Sample(values, np.zeros((0, 1, 1)), np.zeros((0, 1, 1)))
         rows.append(
-            summarise(constraint, "human", sample, held_2s=True, objects=["box"], paper="captured")
+            summarised(constraint, "human", sample, held_2s=True, objects=["box"], paper="captured")
         )
     write_json(rows, path, {})
     return json.loads(path.read_text())["rows"]

@@ -10,18 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from congrasp.services.evaluate.paper import TABLES, paper_lines, paper_row
-from congrasp.services.evaluate.scores import Row
-from congrasp.services.evaluate.table import escape
-from congrasp.services.reproduce.comparison import (
-    SUCCESS,
-    compare,
-    not_comparable,
-    summary,
-    tables,
-    unmatched,
+from congrasp.services.evaluate.paper.comparison import SUCCESS, compare, summary, unmatched
+from congrasp.services.evaluate.paper.evaluation import PartResult
+from congrasp.services.evaluate.paper.figures import TABLES, paper_lines, paper_row
+from congrasp.services.evaluate.paper.page import not_comparable, paper_tables
+from congrasp.services.evaluate.paper.parts import (
+    Part,
+    RequiredPolicy,
+    list_parts,
+    required_policies,
 )
-from congrasp.services.reproduce.plan import Part, RequiredPolicy, Result, parts, policies
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.evaluate.text_table import escape
 from tests.rows import row
 
 HANDS = ("human", "allegro", "sharpa")
@@ -29,7 +29,7 @@ HANDS = ("human", "allegro", "sharpa")
 
 def result(source, *rows, hand="human", method="ours", table="single", data=None):
     part = Part(RequiredPolicy(hand, method), table, data and pathlib.Path(data))
-    return Result(part, source, list(rows), {"pictures": [], "seconds": 1.0}, True)
+    return PartResult(part, source, list(rows), {"pictures": [], "seconds": 1.0}, True)
 
 
 def find(cells, table, constraint, quantity=SUCCESS, hand="human", method="ours", group=""):
@@ -139,14 +139,14 @@ def test_the_summary_counts_rates_and_intervals():
 
 
 def test_parts_are_the_papers_tables():
-    needed = policies(("human", "allegro"), ("pd", "no-dynamic-center"))
+    needed = required_policies(("human", "allegro"), ("pd", "no-dynamic-center"))
     assert [policy.name for policy in needed] == [
         "human-ours",
         "allegro-ours",
         "human-pd",
         "human-no-dynamic-center",
     ]
-    names = [part.name for part in parts(needed, [pathlib.Path("data/grab")], noise=True)]
+    names = [part.name for part in list_parts(needed, [pathlib.Path("data/grab")], noise=True)]
     assert names == [
         *(
             "human-ours-single",
@@ -178,7 +178,7 @@ def test_latex_is_balanced_and_holds_every_figure():
         row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01})
         for name in ("heading", "pose")
     ]
-    shown = tables(compare([result("hands", *rows)], {}, HANDS))
+    shown = paper_tables(compare([result("hands", *rows)], {}, HANDS))
     text = "\n".join(table.latex("50 % of 3_objects & more.") for table in shown)
     opened, closed = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
     assert sorted(opened) == sorted(closed) == ["table"] * 6 + ["tabular"] * 6

@@ -12,10 +12,14 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.cli.main import load
+from congrasp.services.evaluate.experiment import silent
 from congrasp.services.evaluate.lineup import read_entrant
-from congrasp.services.evaluate.tables import Found
-from congrasp.services.reproduce import run
-from congrasp.services.reproduce.plan import RequiredPolicy, Result
+from congrasp.services.evaluate.paper import evaluation as part_evaluation
+from congrasp.services.evaluate.paper import reproduction
+from congrasp.services.evaluate.paper.evaluation import PartResult, PartSettings
+from congrasp.services.evaluate.paper.parts import RequiredPolicy
+from congrasp.services.evaluate.tables import Evaluation
+from congrasp.services.train import reproduction as training
 from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
@@ -88,7 +92,7 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
     def never(*arguments, **options):
         raise CongraspError("This must not be evaluated.")
 
-    monkeypatch.setattr(run, "evaluate_tables", never)
+    monkeypatch.setattr(part_evaluation, "evaluate_tables", never)
     again, printed = reproduced(), capsys.readouterr().out
     assert printed.count("evaluated before") == 2 and again["cells"] == first["cells"]
     assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
@@ -109,32 +113,37 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
         asked.extend(wanted)
         return {one: "it failed" for one in wanted}
 
-    def evaluate_part(part, entrant, request, track):
+    def evaluate_part(part, entrant, settings, out, track):
         asked.append(part.name)
         constraint = "heading" if part.table == "single" else "pose+trajectory"
         made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
         about = {"pictures": [], "seconds": 1.0, "heading_rules": "Half of the headings are kept."}
-        return Result(part, "hands", [made], about, True)
+        return PartResult(part, "hands", [made], about, True)
 
-    monkeypatch.setattr(run, "train_all", train_all)
-    monkeypatch.setattr(run, "evaluate_part", evaluate_part)
-    request = run.Request(
-        out=tmp_path,
-        hands=("human", "allegro"),
-        methods=("pd", "graspxl"),
-        given={OURS: read_entrant(policy)},
-        captured=(),
-        quick=False,
-        options=(),
-        patience=1.0,
-        command="congrasp reproduce",
-        episodes=3,
-        pool=3,
-        many=6,
-        physics="native",
-        seed=0,
+    monkeypatch.setattr(training, "train_all", train_all)
+    monkeypatch.setattr(reproduction, "evaluate_part", evaluate_part)
+    hands = ("human", "allegro")
+    methods = ("pd", "graspxl")
+    policies = training.get_policies(
+        training.PolicyRequest(
+            hands=hands,
+            methods=methods,
+            given={OURS: read_entrant(policy)},
+            pretrained=False,
+            runs=tmp_path / "policies",
+        ),
+        silent,
     )
-    account = run.reproduce(request, lambda text, total: lambda done: None)
+    request = reproduction.Request(
+        out=tmp_path,
+        hands=hands,
+        methods=methods,
+        captured=(),
+        noise=True,
+        command="congrasp reproduce",
+        settings=PartSettings(episodes=3, pool=3, many=6, physics="native", seed=0),
+    )
+    account = reproduction.reproduce(request, policies, silent)
     what = {one.name: text for one, text in account.policies}
     assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
     assert asked[2:6] == [
@@ -184,9 +193,11 @@ def test_captured_sets_are_looked_for_where_the_import_puts_them(
 ):
     (tmp_path / "grab" / "objects").mkdir(parents=True)
     monkeypatch.setattr(
-        run, "evaluate_tables", lambda own, *arguments, **options: Found(own, [], [], [], "")
+        part_evaluation,
+        "evaluate_tables",
+        lambda own, *arguments, **options: Evaluation(own, [], [], [], ""),
     )
-    monkeypatch.setattr(run, "exam_pool", lambda exam, count: [])
+    monkeypatch.setattr(part_evaluation, "exam_pool", lambda exam, count: [])
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy)]
     assert (
         load("reproduce")(

@@ -1,4 +1,4 @@
-"""Tables of the paper, with figures to compare with rows of the same hand, method and source of
+"""The paper's tables: figures to compare with rows of the same hand, method and source of
 constraints.
 """
 
@@ -50,9 +50,12 @@ def paper_row(
     if source == "hands" and group == CENTER_GROUP:
         group = ""
     if source == "objects":
-        group = group.split(" ")[0]
-    wanted = (source, constraint, hand, method, group)
-    return next((line.figures for line in paper_lines() if line[1:6] == wanted), None)
+        group, _, _ = group.partition(" ")
+    key = (source, constraint, hand, method, group)
+    for line in paper_lines():
+        if (line.source, line.constraint, line.hand, line.method, line.group) == key:
+            return line.figures
+    return None
 
 
 class PaperLine(NamedTuple):
@@ -85,7 +88,8 @@ TABLES = {
 @functools.cache
 def paper_lines() -> tuple[PaperLine, ...]:
     """Returns every line of the paper's tables, in its order."""
-    rows = json.loads(pathlib.Path(__file__).with_suffix(".json").read_text())
-    return tuple(
-        PaperLine(figures=PaperRow(row.pop("success"), row.pop("errors")), **row) for row in rows
-    )
+    lines = []
+    for row in json.loads(pathlib.Path(__file__).with_suffix(".json").read_text()):
+        figures = PaperRow(row.pop("success"), row.pop("errors"))
+        lines.append(PaperLine(figures=figures, **row))
+    return tuple(lines)

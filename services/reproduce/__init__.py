@@ -1,3 +1,0 @@
-"""Reproduces the paper's tables: trains missing policies, evaluates, and writes a page, JSON and
-LaTeX.
-"""
