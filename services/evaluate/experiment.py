@@ -1,5 +1,6 @@
-"""Experiments: episodes of one policy on some objects by the paper's protocol. Each variation of
-one is a row.
+"""Experiments: episodes of one policy on some objects by the paper's protocol.
+
+A variation of an experiment is a row of a table.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io import files
+from congrasp.common.io import files as cached
 from congrasp.common.objects import store
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import scale_objects
@@ -51,7 +52,7 @@ STRESSED = 200
 """Episodes of a row that continue after the hold with lift and pushes."""
 MEASURED = 512
 """Number of objects above which distance fields, and thus plausibility, are skipped."""
-_KEPT = 8
+_MAX_KEPT = 8
 """Episodes of a row kept for inspection: at most this many that hold the object to the end, and as
 many others.
 """
@@ -62,6 +63,15 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 def silent(label: str, total: int | None) -> Callable[[int], None]:
     """A `Track` that shows nothing."""
     return lambda done: None
+
+
+def _ignore(batch: Batch, count: int) -> None:
+    """Does nothing with a batch."""
+
+
+def _advance_from(advance: Callable[[int], None], before: int, number: int) -> None:
+    """Shows that `number` episodes are done in addition to those `before`."""
+    advance(before + number)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,11 +193,10 @@ class Experiment:
         """References of the reference policy on these objects; None if the constraints are not
         sampled.
         """
-        return (
-            None
-            if self.constraints is not None
-            else self.references_of(references.reference_policy(self.policy)[0])
-        )
+        if self.constraints is not None:
+            return None
+        policy, _ = references.reference_policy(self.policy)
+        return self.references_of(policy)
 
     def references_of(self, policy: PolicyBundle) -> References:
         """Returns references of a policy on these objects; see
@@ -214,14 +223,15 @@ class Experiment:
     @functools.cached_property
     def field(self) -> DistanceField | None:
         """Grids of the objects' surfaces; None if plausibility is not measured."""
-        return (
-            distance_field(self.scaled) if self.measured and len(self.objects) <= MEASURED else None
-        )
+        if not self.measured or len(self.objects) > MEASURED:
+            return None
+        return distance_field(self.scaled)
 
     def bank_for(self, constraint: str) -> ConstraintBank:
         """Returns the bank of a row's episodes."""
-        made = self.references if from_references(constraint) else None
-        return made.bank if made else self.bank
+        if from_references(constraint) and self.references is not None:
+            return self.references.bank
+        return self.bank
 
     @compiling_entry
     def plan(self, variation: Variation) -> RowPlan:
@@ -245,7 +255,8 @@ class Experiment:
         Raises:
           CongraspError: no row is left.
         """
-        allowed, errors = [], []
+        allowed = []
+        errors = []
         for variation in variations:
             try:
                 self.plan(variation)
@@ -260,8 +271,10 @@ class Experiment:
     def _identity(self) -> tuple[object, ...]:
         """Code, policy and settings."""
         packages = (congrasp.common, congrasp.actors, congrasp.services.evaluate)
-        code = (files.source_digest(*packages), jax.__version__, mujoco.__version__)
-        settings = (
+        return (
+            cached.source_digest(*packages),
+            jax.__version__,
+            mujoco.__version__,
             self.task,
             self.steps,
             self.episodes,
@@ -269,14 +282,15 @@ class Experiment:
             self.physics,
             self.seed,
             self.pool,
+            self.measured,
+            content_hash(encode(self.policy.to_message())),
         )
-        return (*code, *settings, self.measured, content_hash(encode(self.policy.to_message())))
 
-    def digest(self, *about: object) -> str:
-        """Returns sixteen hex digits that identify the code, the policy, the settings, and what
-        else is given.
+    def digest(self, *others: object) -> str:
+        """Returns sixteen hex digits that identify the code, the policy, the settings and other
+        values.
         """
-        return content_hash(repr((*self._identity, *about)).encode())
+        return content_hash(repr((*self._identity, *others)).encode())
 
     @compiling_entry
     def run(
@@ -299,36 +313,38 @@ class Experiment:
         """
         plans = [self.plan(variation) for variation in variations]
         advance = self.track("Episodes", sum(plan.total for plan in plans))
-        paths = (
-            [stored / f"{self._name(variation)}.safetensors" for variation in variations]
-            if stored
-            else []
-        )
-        samples = {
-            n: Sample.of(message.arrays)
-            for n, path in enumerate(paths)
-            if (message := files.read_kept(path))
-        }
-        found = {
-            n: Result(variations[n], one, self.row(variations[n], one), [], [])
-            for n, one in samples.items()
-        }
-        todo = [n for n in range(len(plans)) if n not in found]
-        for task, group in itertools.groupby(todo, lambda n: variations[n].task(self.task)):
+        files: list[pathlib.Path | None] = [None] * len(variations)
+        if stored is not None:
+            files = [stored / f"{self._name(variation)}.safetensors" for variation in variations]
+        results: list[Result | None] = []
+        for variation, file in zip(variations, files, strict=True):
+            results.append(self._stored_result(variation, file))
+        missing = [n for n, result in enumerate(results) if result is None]
+        for task, group in itertools.groupby(missing, lambda n: variations[n].task(self.task)):
             with self.simulator(task, traced=keep) as running:
                 for n in group:
-                    done = sum(result.row.episodes for result in found.values())
-                    progress = functools.partial(lambda before, n: advance(before + n), done)
-                    found[n] = self._run(running, variations[n], plans[n], progress, keep)
-                    for path in paths[n:][:1]:
-                        files.keep(path, Message(found[n].sample.arrays()), len(paths))
-        return [found[n] for n in range(len(plans))]
+                    finished = sum(result.row.episodes for result in results if result)
+                    progress = functools.partial(_advance_from, advance, finished)
+                    result = self._run(running, variations[n], plans[n], progress, keep)
+                    results[n] = result
+                    file = files[n]
+                    if file is not None:
+                        cached.keep(file, Message(result.sample.arrays()), len(files))
+        return [result for result in results if result is not None]
+
+    def _stored_result(self, variation: Variation, file: pathlib.Path | None) -> Result | None:
+        """Returns the result of a row from its file, without kept episodes; None without one."""
+        message = None if file is None else cached.read_kept(file)
+        if message is None:
+            return None
+        sample = Sample.of(message.arrays)
+        return Result(variation, sample, self.row(variation, sample), [], [])
 
     def _name(self, variation: Variation) -> str:
         """File name of a row, from everything that it depends on."""
-        bank = hashlib.sha256(
-            b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(variation.bank(self)))
-        )
+        bank = hashlib.sha256()
+        for leaf in jax.tree.leaves(variation.bank(self)):
+            bank.update(np.asarray(leaf).tobytes())
         return self.digest(variation, bank.hexdigest(), self._contents)
 
     @functools.cached_property
@@ -360,16 +376,19 @@ class Experiment:
         keep: bool,
     ) -> Result:
         """Simulates a row, and keeps some episodes."""
-        kept: dict[bool, list[Message]] = {True: [], False: []}
+        held: list[Message] = []
+        lost: list[Message] = []
 
-        def visit(batch: Batch, count: int) -> None:
-            for i in range(count if keep else 0):
-                like = kept[bool(batch.sample.values["held"][i] > 0)]
-                if len(like) < _KEPT:
-                    like.append(batch.message(i))
+        def keep_some(batch: Batch, count: int) -> None:
+            """Keeps the first episodes of each outcome."""
+            for i in range(count):
+                episodes = held if batch.sample.values["held"][i] > 0 else lost
+                if len(episodes) < _MAX_KEPT:
+                    episodes.append(batch.message(i))
 
+        visit = keep_some if keep else _ignore
         sample = self.sample(running, variation, plan, progress, visit)
-        return Result(variation, sample, self.row(variation, sample), kept[True], kept[False])
+        return Result(variation, sample, self.row(variation, sample), held, lost)
 
     def sample(
         self,
@@ -377,7 +396,7 @@ class Experiment:
         variation: Variation,
         plan: RowPlan,
         progress: Callable[[int], None],
-        visit: Callable[[Batch, int], None] = lambda batch, count: None,
+        visit: Callable[[Batch, int], None] = _ignore,
         stressed: int = STRESSED,
     ) -> Sample:
         """Returns the episodes of a row; see `batches`.
@@ -390,13 +409,14 @@ class Experiment:
           visit: called with each batch, and the number of its episodes that count.
           stressed: least number of episodes that continue after the hold.
         """
-        found, done = list[Sample](), 0
+        samples: list[Sample] = []
+        finished = 0
         for batch, count in self.batches(running, variation, plan, stressed):
             visit(batch, count)
-            found.append(batch.sample.first(count))
-            done += count
-            progress(done)
-        return joined(found)
+            samples.append(batch.sample.first(count))
+            finished += count
+            progress(finished)
+        return joined(samples)
 
     def batches(
         self, running: Episodes, variation: Variation, plan: RowPlan, stressed: int
@@ -411,18 +431,17 @@ class Experiment:
           stressed: least number of episodes that continue after the hold with lift and pushes;
             batches continue as a whole.
         """
-        if (objects := variation.objects(self.scaled)) is not running.objects:
+        objects = variation.objects(self.scaled)
+        if objects is not running.objects:
             running.replace_objects(objects, self.field)
         task = variation.task(self.task)
-        done, most = 0, min(plan.total, stressed) if running.stressable else 0
-        for begun, count in batches(
-            self.hand, task, variation.bank(self), plan, self.seed, running.batch
-        ):
-            yield (
-                running.run(variation.episodes(begun, task.control_dt), stressed=done < most),
-                count,
-            )
-            done += count
+        bank = variation.bank(self)
+        to_stress = min(plan.total, stressed) if running.stressable else 0
+        finished = 0
+        for planned, count in batches(self.hand, task, bank, plan, self.seed, running.batch):
+            conditions = variation.episodes(planned, task.control_dt)
+            yield running.run(conditions, stressed=finished < to_stress), count
+            finished += count
 
     def row(self, variation: Variation, sample: Sample) -> Row:
         """Returns the row of a variation's episodes."""

@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import initial
+from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import PlannedEpisodes
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
@@ -41,13 +43,13 @@ HELD_OUT = POSES // 5
 """References of an object and region that its constraint set holds out (`sampling.sets`), the last
 ones.
 """
-_ATTEMPTS = 3 * POSES
+_MAX_ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
-_SPARE = 1.25
+_ATTEMPTS_PER_REFERENCE = 1.25
 """Episodes for each missing reference."""
 _SEED = 0
-_MOST_FILES = 256
-"""Most sets of references in the cache; that of 64 objects takes about 3 MB."""
+_MAX_FILES = 256
+"""Most sets of references in the cache; a set for 64 objects takes about 3 MB."""
 
 
 class References(NamedTuple):
@@ -66,9 +68,10 @@ def reference_policy(bundle: PolicyBundle) -> tuple[PolicyBundle, str]:
     policy itself, under headings and affordances only.
     """
     hand = get_hand(bundle.spec.hand)
-    if hand.reference == hand.name and (file := reference_file(hand.name)):
-        return bundles.load(file), f"the reference policy of the {hand.name} hand"
-    return bundle, "the policy itself, under headings and affordances"
+    file = reference_file(hand.name) if hand.reference == hand.name else None
+    if file is None:
+        return bundle, "the policy itself, under headings and affordances"
+    return bundles.load(file), f"the reference policy of the {hand.name} hand"
 
 
 def make(
@@ -90,14 +93,16 @@ def make(
       physics: engine, except `auto`.
       progress: called with the number of references found, and their greatest number.
     """
-    kept = cache_folder("references") / f"{_key(policy, task, objects, physics)}.safetensors"
-    if found := _read(kept, bank):
-        return found
-    grasps = _grasp(policy, task, objects, bank, physics, progress)
-    made = _filled(policy, task, bank, grasps)
-    arrays = {name: np.asarray(getattr(made.bank, name)) for name in _ARRAYS}
-    keep(kept, Message({**arrays, "grasps": made.grasps}, {"kind": "references"}), _MOST_FILES)
-    return made
+    file = cache_folder("references") / f"{_key(policy, task, objects, physics)}.safetensors"
+    cached = _read(file, bank)
+    if cached is not None:
+        return cached
+    grasps = _grasp_all(policy, objects, bank, physics, progress)
+    references = with_references(policy, task, bank, grasps)
+    arrays = {name: np.asarray(getattr(references.bank, name)) for name in _ARRAYS}
+    message = Message({**arrays, "grasps": references.grasps}, {"kind": "references"})
+    keep(file, message, _MAX_FILES)
+    return references
 
 
 _REGIONS = tuple(
@@ -111,60 +116,102 @@ _ARRAYS = tuple(
 """Columns of references: fields of `Poses`, then results of `make_references`."""
 
 
-def _grasp(
+class _GraspsOfRegion(NamedTuple):
+    """Grasps of one region (whole surface, or graspable region) of each object."""
+
+    constraint: str
+    """Constraint under which the policy grasps the region."""
+    rests: list[np.ndarray]
+    """Indices of the resting poses of each object in which the region can be grasped."""
+    attempts: np.ndarray
+    """(N,) int: episodes of each object so far."""
+    grasps: list[list[Poses]]
+    """At most `POSES` grasps of each object."""
+
+    def next_attempts(self) -> np.ndarray:
+        """Returns the number (N,) of further episodes of each object."""
+        missing = np.array([POSES - len(grasps) for grasps in self.grasps])
+        graspable = np.array([len(rests) > 0 for rests in self.rests])
+        episodes = np.ceil(_ATTEMPTS_PER_REFERENCE * missing * graspable).astype(int)
+        return np.minimum(episodes, _MAX_ATTEMPTS - self.attempts)
+
+    def plan(self, episodes: np.ndarray, names: np.ndarray) -> RowPlan:
+        """Plans episodes.
+
+        Args:
+          episodes: (N,) number of episodes of each object.
+          names: (N,) uint32, hashes of the objects.
+        """
+        objects = np.repeat(np.arange(len(episodes)), episodes)
+        number_in_object = np.concatenate([np.arange(count) for count in episodes])
+        numbers = self.attempts[objects] + number_in_object
+        rests = []
+        for obj, number in zip(objects, numbers, strict=True):
+            choices = self.rests[obj]
+            rests.append(choices[number % len(choices)])
+        planned = PlannedEpisodes(
+            objects.astype(np.int32),
+            np.array(rests, np.int32),
+            names[objects],
+            numbers.astype(np.int32),
+        )
+        return RowPlan(self.constraint, False, planned, episodes > 0)
+
+    def add(self, batch: Grasps, count: int) -> None:
+        """Adds the grasps of the first `count` episodes of a batch."""
+        for i in np.flatnonzero(batch.found[:count]):
+            grasps = self.grasps[batch.object_index[i]]
+            if len(grasps) < POSES:
+                grasps.append(Poses(batch.q[i], batch.position[i], batch.quaternion[i]))
+
+
+def _grasp_all(
     policy: PolicyBundle,
-    task: TaskConfig,
     objects: Sequence[GraspObject],
     bank: ConstraintBank,
     physics: PhysicsName,
     progress: Callable[[int, int], None],
 ) -> list[list[list[Poses]]]:
     """Returns at most `POSES` grasps of each object (N) and region (V)."""
-    own = protocol(policy.task, policy.task.hold_steps)
+    task = protocol(policy.task, policy.task.hold_steps)
     hand = get_hand(policy.spec.hand)
-    found: list[list[list[Poses]]] = [[[] for _ in range(2)] for _ in objects]
     names = np.array([int(store.digest(obj)[:8], 16) for obj in objects], np.uint32)
-    regions = [initial.allowing(own, bank, (asked,)) for asked in _REGIONS]
-    most = POSES * sum(int(allowed.any(1).sum()) for allowed in regions)
+    regions = []
+    for constraint in _REGIONS:
+        allowed = np.asarray(initial.allowing(task, bank, (constraint,)))
+        regions.append(
+            _GraspsOfRegion(
+                constraint,
+                [np.flatnonzero(row) for row in allowed],
+                np.zeros(len(objects), int),
+                [[] for _ in objects],
+            )
+        )
+    most = sum(POSES for region in regions for rests in region.rests if len(rests))
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
     with Episodes(
-        policy, own, objects, hold=own.hold_steps, batch=size, physics=physics
+        policy, task, objects, hold=task.hold_steps, batch=size, physics=physics
     ) as episodes:
-        for region, constraint in enumerate(_REGIONS):
-            rests = [np.flatnonzero(row) for row in regions[region]]
-            tried = np.zeros(len(objects), int)
+        for region in regions:
             while True:
-                missing = np.array([POSES - len(of[region]) for of in found]) * regions[region].any(
-                    1
-                )
-                wanted = np.minimum(np.ceil(_SPARE * missing).astype(int), _ATTEMPTS - tried)
-                if not wanted.any():
+                attempts = region.next_attempts()
+                if not attempts.any():
                     break
-                index = np.repeat(np.arange(len(objects)), wanted)
-                number = tried[index] + np.concatenate([np.arange(count) for count in wanted])
-                rest = np.array(
-                    [rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)],
-                    np.int32,
-                )
-                planned = PlannedEpisodes(
-                    index.astype(np.int32), rest, names[index], number.astype(np.int32)
-                )
-                plan = RowPlan(constraint, False, planned, wanted > 0)
-                for conditions, count in batches(hand, own, bank, plan, _SEED, size):
+                plan = region.plan(attempts, names)
+                for conditions, count in batches(hand, task, bank, plan, _SEED, size):
                     episodes.run(conditions)
-                    grasps = jax.tree.map(np.asarray, episodes.take_grasps())
-                    for i in np.flatnonzero(grasps.found[:count]):
-                        taken = found[grasps.object_index[i]][region]
-                        if len(taken) < POSES:
-                            taken.append(
-                                Poses(grasps.q[i], grasps.position[i], grasps.quaternion[i])
-                            )
-                    progress(sum(len(taken) for of in found for taken in of), most)
-                tried += wanted
-    return found
+                    region.add(jax.tree.map(np.asarray, episodes.take_grasps()), count)
+                    progress(_count_grasps(regions), most)
+                region.attempts[:] += attempts
+    return [[region.grasps[n] for region in regions] for n in range(len(objects))]
 
 
-def _filled(
+def _count_grasps(regions: Sequence[_GraspsOfRegion]) -> int:
+    """Number of grasps of all objects and regions."""
+    return sum(len(grasps) for region in regions for grasps in region.grasps)
+
+
+def with_references(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
     """Returns the bank with these grasps and trajectories to them, none of them both held out and
@@ -172,60 +219,64 @@ def _filled(
 
     A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of
     them (at least one) is repeated among those held out, and the others among those for training.
+    Where no grasp counts, the bank's poses that close the hand around the object are repeated
+    instead.
     """
-    hand = get_hand(policy.spec.hand)
     arrays = {name: np.array(getattr(bank, name)) for name in _ARRAYS}
-    counts = np.zeros((len(grasps), 2), int)
-    flat = [
-        (n, v, pose) for n, of in enumerate(grasps) for v, poses in enumerate(of) for pose in poses
-    ]
-    if flat:
-        poses = Poses(
-            *(
-                jnp.asarray(np.stack(field))
-                for field in zip(*(pose for *_, pose in flat), strict=True)
-            )
-        )
-        rest = jnp.asarray(bank.rest)[np.array([n for n, *_ in flat])]
-        path, turns, valid = make_references(
-            hand, poses, rest, jax.random.key(_SEED), task.trajectory_points
-        )
-        new = dict(zip(_ARRAYS, map(np.asarray, (*poses, path, turns, valid)), strict=True))
-        owners = np.array([(n, v) for n, v, _ in flat])
+    references = _reference_arrays(get_hand(policy.spec.hand), task, bank, grasps)
+    counts = np.zeros((len(grasps), len(_REGIONS)), int)
+    first = 0
     for n, v in np.ndindex(counts.shape):
-        usable = (
-            np.flatnonzero((owners == (n, v)).all(1) & new["pose_valid"].any(1))
-            if flat
-            else np.zeros(0, int)
-        )
+        end = first + len(grasps[n][v])
+        rows = {name: values[first:end] for name, values in references.items()}
+        first = end
+        usable = np.zeros(0, int)
+        if rows:
+            usable = np.flatnonzero(rows["pose_valid"].any(1))
         counts[n, v] = len(usable)
-        if len(usable):
-            order = usable[_arranged(len(usable))]
-            rows = {name: values[order] for name, values in new.items()}
-        else:
-            closed = np.flatnonzero(arrays["pose_valid"][n, v].any(0))
-            if not len(closed):
-                continue
-            order = closed[_arranged(len(closed))]
-            rows = {name: arrays[name][n, v][order] for name in _ARRAYS if name != "pose_valid"}
-            rows["pose_valid"] = arrays["pose_valid"][n, v].T[order]
+        if not len(usable):
+            rows = {name: values[n, v] for name, values in arrays.items()}
+            rows["pose_valid"] = arrays["pose_valid"][n, v].T
+            usable = np.flatnonzero(rows["pose_valid"].any(1))
+        if not len(usable):
+            continue
+        order = usable[arrange(len(usable))]
         for name, values in rows.items():
-            arrays[name][n, v] = values.T if name == "pose_valid" else values
-    return References(
-        bank._replace(**{name: jnp.asarray(values) for name, values in arrays.items()}), counts
+            ordered = values[order]
+            arrays[name][n, v] = ordered.T if name == "pose_valid" else ordered
+    columns = {name: jnp.asarray(values) for name, values in arrays.items()}
+    return References(bank._replace(**columns), counts)
+
+
+def _reference_arrays(
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
+) -> dict[str, np.ndarray]:
+    """Returns columns (G, ...) of G grasps, ordered by object and region, and of trajectories to
+    them; empty without a grasp. `pose_valid` is (G, R) for the object's R resting poses.
+    """
+    owners = []
+    poses = []
+    for n, of_object in enumerate(grasps):
+        for of_region in of_object:
+            owners += [n] * len(of_region)
+            poses += of_region
+    if not poses:
+        return {}
+    stacked = Poses(*(jnp.asarray(np.stack(field)) for field in zip(*poses, strict=True)))
+    rest = jnp.asarray(bank.rest)[np.array(owners)]
+    path, turns, valid = make_references(
+        hand, stacked, rest, jax.random.key(_SEED), task.trajectory_points
     )
+    columns = (*stacked, path, turns, valid)
+    return dict(zip(_ARRAYS, map(np.asarray, columns), strict=True))
 
 
-def _arranged(count: int) -> np.ndarray:
+def arrange(count: int) -> np.ndarray:
     """Indices (POSES,) into `count` references; those held out come last."""
     held_out = max(1, round(count * HELD_OUT / POSES))
-    training = np.arange(max(count - held_out, 1))
-    return np.concatenate(
-        [
-            np.resize(training, POSES - HELD_OUT),
-            np.resize(np.arange(count - held_out, count), HELD_OUT),
-        ]
-    )
+    for_training = np.arange(max(count - held_out, 1))
+    last = np.arange(count - held_out, count)
+    return np.concatenate([np.resize(for_training, POSES - HELD_OUT), np.resize(last, HELD_OUT)])
 
 
 def _key(
@@ -235,7 +286,7 @@ def _key(
     made_by = bundles.content_hash(encode(policy.to_message()))
     digests = [store.digest(obj) for obj in objects]
     geometry = [task.trajectory_points, task.surface_points, task.back_off, task.headings]
-    text = json.dumps([made_by, digests, geometry, physics, _SEED, POSES, _ATTEMPTS])
+    text = json.dumps([made_by, digests, geometry, physics, _SEED, POSES, _MAX_ATTEMPTS])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -243,13 +294,12 @@ def _read(path: pathlib.Path, bank: ConstraintBank) -> References | None:
     """Reads cached references of the bank's objects; returns None if they are missing or
     damaged.
     """
-    if not (message := read_kept(path)):
+    message = read_kept(path)
+    if message is None:
         return None
     arrays = message.arrays
-    if any(
-        name not in arrays or arrays[name].shape != getattr(bank, name).shape for name in _ARRAYS
-    ):
-        return None
-    return References(
-        bank._replace(**{name: jnp.asarray(arrays[name]) for name in _ARRAYS}), arrays["grasps"]
-    )
+    for name in _ARRAYS:
+        if name not in arrays or arrays[name].shape != getattr(bank, name).shape:
+            return None
+    columns = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+    return References(bank._replace(**columns), arrays["grasps"])

@@ -36,7 +36,7 @@ def test_reference_policies_never_had_poses_or_trajectories():
 
 @pytest.mark.parametrize("count", range(1, POSES + 1))
 def test_held_out_references_are_not_for_training(count):
-    order = references._arranged(count)
+    order = references.arrange(count)
     training, held_out = order[:-HELD_OUT], order[-HELD_OUT:]
     assert len(order) == POSES and set(order) <= set(range(count))
     if count > 1:
@@ -62,7 +62,7 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
     own, *below = (
         low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down)
     )
-    made = references._filled(
+    made = references.with_references(
         policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2]
     )
     np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
