@@ -69,7 +69,7 @@ def _ignore(batch: Batch, count: int) -> None:
     """Does nothing with a batch."""
 
 
-def _advance_from(advance: Callable[[int], None], before: int, number: int) -> None:
+def advance_from(advance: Callable[[int], None], before: int, number: int) -> None:
     """Shows that `number` episodes are done in addition to those `before`."""
     advance(before + number)
 
@@ -324,7 +324,7 @@ class Experiment:
             with self.simulator(task, traced=keep) as running:
                 for n in group:
                     finished = sum(result.row.episodes for result in results if result)
-                    progress = functools.partial(_advance_from, advance, finished)
+                    progress = functools.partial(advance_from, advance, finished)
                     result = self._run(running, variations[n], plans[n], progress, keep)
                     results[n] = result
                     file = files[n]

@@ -7,6 +7,7 @@ the evaluation.
 """
 
 import dataclasses
+import math
 import pathlib
 import zlib
 from collections.abc import Iterator, Sequence
@@ -64,11 +65,9 @@ def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None, exam: str =
     """Name of the objects' source, with the factor on their lengths for the policy's hand."""
     scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
     source = str(folder) if folder else f"procedural objects ({exam})"
-    return (
-        source
-        if scale == 1.0
-        else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
-    )
+    if scale == 1.0:
+        return source
+    return f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
 
 
 class RowPlan(NamedTuple):
@@ -104,45 +103,56 @@ def plan_row(
     Raises:
       CongraspError: no object allows them, or the policy does not support them.
     """
-    constraint, aligned = name.removesuffix(ALIGNED), name.endswith(ALIGNED)
-    require_known(constraint.split("+"), task)
-    allowed = initial.allowing(
-        dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+")
-    )
-    allowed = (
-        allowed & ~repeated_rests(np.asarray(bank.rest)) & (np.asarray(bank.weight) > 0)[:, None]
-    )
-    covered = np.asarray(allowed.any(1))
+    constraint = name.removesuffix(ALIGNED)
+    aligned = name.endswith(ALIGNED)
+    parts = constraint.split("+")
+    require_known(parts, task)
+    task = dataclasses.replace(task, aligned_references=aligned)
+    allowed = np.asarray(initial.allowing(task, bank, parts))
+    different = ~repeated_rests(np.asarray(bank.rest))
+    approachable = np.asarray(bank.weight) > 0
+    allowed = allowed & different & approachable[:, None]
+    covered = allowed.any(1)
     if not covered.any():
         raise CongraspError(
             f"None of the {len(objects)} objects allows the constraint '{constraint}'.",
             "An affordance needs labelled parts; poses and trajectories need room above the table.",
         )
-    which = np.flatnonzero(covered)
-    each = -(-episodes // len(which))
-    number = np.repeat(np.arange(each), len(which))
-    index = np.tile(which, each)
-    rests = [np.flatnonzero(row) for row in allowed]
-    return RowPlan(
-        constraint,
-        aligned,
-        PlannedEpisodes(
-            objects=index.astype(np.int32),
-            rests=np.array(
-                [rests[n][i % len(rests[n])] for n, i in zip(index, number, strict=True)], np.int32
-            ),
-            names=np.array([zlib.crc32(objects[n].name.encode()) for n in index], np.uint32),
-            numbers=number.astype(np.int32),
-        ),
-        covered,
+    return RowPlan(constraint, aligned, _plan_episodes(allowed, objects, episodes), covered)
+
+
+def _plan_episodes(
+    allowed: np.ndarray, objects: Sequence[GraspObject], episodes: int
+) -> PlannedEpisodes:
+    """Returns at least `episodes` episodes, as many for each object that has an allowed resting
+    pose.
+
+    Args:
+      allowed: (N, R) bool, allowed resting poses of each object.
+      objects: N objects.
+      episodes: least number of episodes.
+    """
+    covered = np.flatnonzero(allowed.any(1))
+    episodes_of_object = math.ceil(episodes / len(covered))
+    index = np.tile(covered, episodes_of_object)
+    number = np.repeat(np.arange(episodes_of_object), len(covered))
+    rests = []
+    for n, i in zip(index, number, strict=True):
+        choices = np.flatnonzero(allowed[n])
+        rests.append(choices[i % len(choices)])
+    names = [zlib.crc32(objects[n].name.encode()) for n in index]
+    return PlannedEpisodes(
+        objects=index.astype(np.int32),
+        rests=np.array(rests, np.int32),
+        names=np.array(names, np.uint32),
+        numbers=number.astype(np.int32),
     )
 
 
 def from_references(name: str) -> bool:
     """True if a row's constraints are drawn from references."""
-    return any(
-        get_constraint(part).from_reference for part in name.removesuffix(ALIGNED).split("+")
-    )
+    parts = name.removesuffix(ALIGNED).split("+")
+    return any(get_constraint(part).from_reference for part in parts)
 
 
 def batches(
@@ -159,14 +169,14 @@ def batches(
       seed: seed of the evaluation; draws also depend on the row's constraints.
       size: size of a batch.
     """
-    asked = {c.name: c.name in plan.constraint.split("+") for c in optional(task)}
+    parts = plan.constraint.split("+")
+    requested = {constraint.name: constraint.name in parts for constraint in optional(task)}
     task = dataclasses.replace(task, aligned_references=plan.aligned)
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(plan.constraint.encode()))
     for start in range(0, plan.total, size):
         chosen = np.minimum(np.arange(start, start + size), plan.total - 1)
-        conditions = _planned(
-            hand, task, bank, key, jax.tree.map(lambda x, c=chosen: x[c], plan.episodes), asked
-        )
+        episodes = PlannedEpisodes(*(column[chosen] for column in plan.episodes))
+        conditions = _planned(hand, task, bank, key, episodes, requested)
         yield conditions, min(size, plan.total - start)
 
 

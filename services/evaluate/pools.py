@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import itertools
 import logging
+import math
 import pathlib
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -36,7 +37,14 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
-from congrasp.services.evaluate.experiment import MEASURED, STRESSED, Experiment, Variation, silent
+from congrasp.services.evaluate.experiment import (
+    MEASURED,
+    STRESSED,
+    Experiment,
+    Variation,
+    advance_from,
+    silent,
+)
 from congrasp.services.evaluate.object_groups import object_groups
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
@@ -47,12 +55,12 @@ FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(famil
 MANY = 50_000
 """Most procedural objects of the table `objects` by default."""
 _SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}
-_MOST = {True: 4096, False: 128}
-"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the
-latter.
-"""
-_MESHES = 512
-"""Objects of a pool of a folder, whose surfaces may be large."""
+_MAX_OBJECTS_ON_DEVICE = 4096
+"""Most objects of a pool for engines on a device."""
+_MAX_OBJECTS_ELSEWHERE = 128
+"""Most objects of a pool for other engines, which compile a scene for each."""
+_MAX_OBJECTS_OF_FOLDER = 512
+"""Most objects of a pool of a folder, whose surfaces may be large."""
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
@@ -96,7 +104,7 @@ class Pools(NamedTuple):
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
     """Returns at least `count` procedural objects of an exam, in pools of one size."""
-    number, size = _divided(count, _MOST[ENGINES[physics].on_device])
+    number, size = _divided(count, _max_objects(physics))
     seed = first_seed(exam, number * size)
     families = procedural.family_turns(number * size, seed, FAMILIES)
 
@@ -110,45 +118,55 @@ def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
 
 def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
     """The objects of a path, in pools that an engine can take."""
-    found = objects_at(path)
-    identity = ",".join(f"{one.name} {one.digest()}" for one in found)
-    return listed_pools(found, most_objects(physics), source=identity)
+    objects = objects_at(path)
+    identity = ",".join(f"{obj.name} {obj.digest()}" for obj in objects)
+    return listed_pools(objects, most_objects(physics), source=identity)
 
 
 def most_objects(physics: PhysicsName) -> int:
     """Most objects of a pool whose surfaces may be large."""
-    return min(_MOST[ENGINES[physics].on_device], _MESHES)
+    return min(_max_objects(physics), _MAX_OBJECTS_OF_FOLDER)
+
+
+def _max_objects(physics: PhysicsName) -> int:
+    """Most objects of a pool of procedural objects."""
+    if ENGINES[physics].on_device:
+        return _MAX_OBJECTS_ON_DEVICE
+    return _MAX_OBJECTS_ELSEWHERE
 
 
 def listed_pools(
-    found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = ""
+    objects: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = ""
 ) -> Pools:
     """Objects of different names in pools of at most `most`; meshes are imported when their turn
     comes, and those that cannot be are left out."""
-    number, size = _divided(len(found), most)
+    number, size = _divided(len(objects), most)
 
     def make(part: list[ObjectAt]) -> Loaded:
         left_out: list[str] = []
 
-        def leave_out(one: ObjectAt, error: CongraspError) -> None:
-            _log.warning("%s is skipped: %s", one.name, error)
-            left_out.append(one.name)
+        def leave_out(obj: ObjectAt, error: CongraspError) -> None:
+            _log.warning("%s is skipped: %s", obj.name, error)
+            left_out.append(obj.name)
 
-        objects = load_each(part, options, on_error=leave_out)
-        names = [one.name for one in part if one.name not in left_out]
-        return Loaded(
-            [dataclasses.replace(obj, name=n) for obj, n in zip(objects, names, strict=True)],
-            left_out,
-        )
+        imported = load_each(part, options, on_error=leave_out)
+        names = [obj.name for obj in part if obj.name not in left_out]
+        renamed = [
+            dataclasses.replace(obj, name=name) for obj, name in zip(imported, names, strict=True)
+        ]
+        return Loaded(renamed, left_out)
 
-    parts = [[found[i] for i in part] for part in np.array_split(np.arange(len(found)), number)]
-    return Pools(source, size, [functools.partial(make, part) for part in parts])
+    makers = []
+    for indices in np.array_split(np.arange(len(objects)), number):
+        part = [objects[i] for i in indices]
+        makers.append(functools.partial(make, part))
+    return Pools(source, size, makers)
 
 
 def _divided(count: int, most: int) -> tuple[int, int]:
     """Number and size of pools for `count` objects, at most `most` in each."""
-    number = -(-count // most)
-    return number, -(-count // number)
+    number = math.ceil(count / most)
+    return number, math.ceil(count / number)
 
 
 class Pool(NamedTuple):
@@ -164,26 +182,26 @@ class Pool(NamedTuple):
 
 @contextlib.contextmanager
 def prepared(
-    experiment: Experiment, pools: Pools, wanted: Sequence[int]
+    experiment: Experiment, pools: Pools, numbers: Sequence[int]
 ) -> Iterator[Iterator[Pool]]:
     """Yields an experiment on each of some pools, made in a thread while the previous one is in
     use.
     """
-    with _one_ahead(_prepared(experiment, pools, wanted)) as found:
-        yield found
+    with _one_ahead(_prepared(experiment, pools, numbers)) as ready:
+        yield ready
 
 
-def _prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> Iterator[Pool]:
+def _prepared(experiment: Experiment, pools: Pools, numbers: Sequence[int]) -> Iterator[Pool]:
     """Yields experiments on pools, with their constraints."""
-    for number in wanted:
+    for number in numbers:
         loaded, left_out = pools.make[number]()
-        own, kept = _approachable(
+        of_pool, approachable = _approachable(
             dataclasses.replace(experiment, pool=number, track=silent), loaded, pools.size
         )
-        lost = [obj.name for obj in loaded if all(obj is not other for other in kept)]
-        if kept:
-            _ = own.field  # computed here
-        yield Pool(own, len(kept), [*left_out, *lost])
+        lost = [obj.name for obj in loaded if all(obj is not other for other in approachable)]
+        if approachable:
+            _ = of_pool.field  # computed in this thread
+        yield Pool(of_pool, len(approachable), [*left_out, *lost])
 
 
 @contextlib.contextmanager
@@ -208,34 +226,43 @@ def _approachable(
     pose, and all these.
     """
     while objects:
-        filled = list(itertools.islice(itertools.cycle(objects), size))
-        own = dataclasses.replace(experiment, objects=filled)
+        padded = list(itertools.islice(itertools.cycle(objects), size))
+        of_pool = dataclasses.replace(experiment, objects=padded)
         try:
-            _ = own.bank
-            return own, objects
+            _ = of_pool.bank
+            return of_pool, objects
         except CongraspError as error:
-            task, scale = own.task, object_scale(own.hand, own.task)
-            seeds = [(own.seed + own.pool, n) for n in range(size)]
-            hand = itertools.repeat(outline(own.hand), size)
-            fine = parallel_map(
-                _has_heading, [task] * size, own.scaled, seeds, [scale] * size, hand
-            )
-            if all(fine):
+            approachable = _have_headings(of_pool)
+            if all(approachable):
                 raise
             _log.warning("%s", error)
-            lost = {id(obj) for obj, good in zip(filled, fine, strict=True) if not good}
+            lost = {id(obj) for obj, kept in zip(padded, approachable, strict=True) if not kept}
             objects = [obj for obj in objects if id(obj) not in lost]
     return dataclasses.replace(experiment, objects=()), []
 
 
+def _have_headings(experiment: Experiment) -> list[bool]:
+    """Returns for each object whether the hand can approach it."""
+    task = experiment.task
+    size = len(experiment.objects)
+    return parallel_map(
+        _has_heading,
+        [task] * size,
+        experiment.scaled,
+        [(experiment.seed + experiment.pool, n) for n in range(size)],
+        [object_scale(experiment.hand, task)] * size,
+        itertools.repeat(outline(experiment.hand), size),
+    )
+
+
 def _has_heading(
-    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline
+    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, hand: Outline
 ) -> bool:
     """True if an object has a heading for the hand with this outline, and does not lie too flat for
     all of them.
     """
     try:
-        return bool(headings_of(task, obj, seed, None, scale, own)["weight"])
+        return bool(headings_of(task, obj, seed, None, scale, hand)["weight"])
     except CongraspError:
         return False
 
@@ -260,7 +287,7 @@ class _Result(NamedTuple):
 
 
 def evaluate_pools(
-    experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None
+    experiment: Experiment, pools: Pools, stored: pathlib.Path | None = None
 ) -> list[Row]:
     """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass
     and family.
@@ -269,39 +296,48 @@ def evaluate_pools(
       experiment: policy and settings; `episodes` is the least total number, and every object has
         the same number.
       pools: pools of objects.
-      kept: folder for results of pools, from which an evaluation with the same arguments resumes;
+      stored: folder for results of pools, from which an evaluation with the same arguments resumes;
         None stores none.
 
     Raises:
       CongraspError: the hand can approach none of the objects.
     """
     number = len(pools.make)
-    each = -(-experiment.episodes // (pools.size * number))
-    advance = experiment.track("Episodes on many objects", each * pools.size * number)
+    episodes_of_object = math.ceil(experiment.episodes / (pools.size * number))
+    total = episodes_of_object * pools.size * number
+    advance = experiment.track("Episodes on many objects", total)
     experiment = dataclasses.replace(
         experiment,
         constraints=None,
-        episodes=each * pools.size,
+        episodes=episodes_of_object * pools.size,
         measured=pools.size * number <= MEASURED,
     )
-    name = experiment.digest(pools.source, pools.size)
-    files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []
-    found = {n: _stored(message) for n, file in enumerate(files) if (message := read_kept(file))}
-    todo = sorted(set(range(number)) - set(found))
-    with contextlib.ExitStack() as stack, prepared(experiment, pools, todo) as ready:
+    files: list[pathlib.Path | None] = [None] * number
+    if stored is not None:
+        name = experiment.digest(pools.source, pools.size)
+        files = [stored / f"{name}-{n:05d}.safetensors" for n in range(number)]
+    results = {}
+    for n, file in enumerate(files):
+        message = None if file is None else read_kept(file)
+        if message is not None:
+            results[n] = _stored(message)
+    missing = [n for n in range(number) if n not in results]
+    with contextlib.ExitStack() as stack, prepared(experiment, pools, missing) as ready:
         running: Episodes | None = None
         for pool in ready:
             if pool.real and not running:
                 running = stack.enter_context(pool.experiment.simulator())
-            done = sum(result.episodes for result in found.values())
-            progress = functools.partial(lambda before, n: advance(before + n), done)
-            result = _simulated(running, pool, progress, max(0, STRESSED - done))
-            if done:  # forces are read from the first pool
+            finished = sum(result.episodes for result in results.values())
+            progress = functools.partial(advance_from, advance, finished)
+            result = _simulated(running, pool, progress, max(0, STRESSED - finished))
+            if finished:  # forces are read from the first pool
                 result = result._replace(sample=result.sample.without_forces())
-            for file in files[pool.experiment.pool :][:1]:
+            n = pool.experiment.pool
+            results[n] = result
+            file = files[n]
+            if file is not None:
                 keep(file, result.message(), number)
-            found[pool.experiment.pool] = result
-    return _rows([found[n] for n in sorted(found)], experiment)
+    return _rows([results[n] for n in sorted(results)], experiment)
 
 
 def _simulated(
@@ -310,13 +346,16 @@ def _simulated(
     """Simulates the episodes of a pool, if it has objects."""
     if not running or not pool.real:
         return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
-    own, row = pool.experiment, Variation()
-    sample = own.sample(running, row, own.plan(row), progress, stressed=stressed)
-    facts = [
-        (obj.name, float(np.ptp(obj.visual_vertices, axis=0).max()), float(obj.mass), obj.family)
-        for obj in own.scaled[: pool.real]
-    ]
-    return _Result(sample.where(sample.values["object_index"] < pool.real), facts, pool.left_out)
+    experiment = pool.experiment
+    row = Variation()
+    plan = experiment.plan(row)
+    sample = experiment.sample(running, row, plan, progress, stressed=stressed)
+    facts = []
+    for obj in experiment.scaled[: pool.real]:
+        largest_side = float(np.ptp(obj.visual_vertices, axis=0).max())
+        facts.append((obj.name, largest_side, float(obj.mass), obj.family))
+    not_padding = sample.values["object_index"] < pool.real
+    return _Result(sample.where(not_padding), facts, pool.left_out)
 
 
 def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
@@ -327,14 +366,15 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
         raise CongraspError(
             "None of the objects can be approached.", "Scale them for the hand, or pass others."
         )
-    firsts = np.cumsum([0, *(len(result.objects) for result in results)])
-    for result, first in zip(results, firsts, strict=False):
+    first = 0
+    facts = []
+    for result in results:
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
+        first += len(result.objects)
+        facts += result.objects
     whole = joined([result.sample for result in results])
     index = whole.values["object_index"].astype(int)
-    names, sizes, masses, families = zip(
-        *(facts for result in results for facts in result.objects), strict=True
-    )
+    names, sizes, masses, families = zip(*facts, strict=True)
     all_objects = RowDescription(
         Variation().constraint,
         experiment.hand.name,

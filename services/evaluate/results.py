@@ -36,7 +36,17 @@ from congrasp.services.evaluate.text_table import Columns, Table, percent
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDER = pathlib.Path("docs", "results")
 _BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
-_LARGEST = 1 << 26
+_MAX_FILE_BYTES = 1 << 26
+_REQUIRED = (
+    "command",
+    "heading_rules",
+    "machine",
+    "objects",
+    "physics",
+    "policies",
+    "version",
+)
+"""Required content of a file in addition to its rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +66,13 @@ class Results:
 def provenance() -> dict[str, Any]:
     """Version of the package, command line and machine of the current evaluation."""
     device = jax.local_devices()[0]
-    accelerator = [] if device.platform == "cpu" else [device.device_kind]
+    machine = f"{cores()} {platform.machine()} cores"
+    if device.platform != "cpu":
+        machine = f"{machine}, {device.device_kind}"
     return {
         "version": congrasp.__version__,
         "command": shlex.join(["congrasp", *sys.argv[1:]]),
-        "machine": ", ".join([f"{cores()} {platform.machine()} cores", *accelerator]),
+        "machine": machine,
     }
 
 
@@ -72,23 +84,13 @@ def read_results(file: pathlib.Path) -> Results:
     """
     remedy = "Run the command that wrote it again."
     try:
-        about = read_json(file, _LARGEST, remedy)
+        about = read_json(file, _MAX_FILE_BYTES, remedy)
         rows = [Row.from_json(row) for row in about.pop("rows")]
     except (LookupError, TypeError, AttributeError):
         raise CongraspError(f"{file} is not a file of results of this version.", remedy) from None
-    if (
-        missing := {
-            "policies",
-            "command",
-            "machine",
-            "version",
-            "objects",
-            "physics",
-            "heading_rules",
-        }
-        - about.keys()
-    ):
-        raise CongraspError(f"{file} lacks '{min(missing)}'.", remedy)
+    for name in _REQUIRED:
+        if name not in about:
+            raise CongraspError(f"{file} lacks '{name}'.", remedy)
     return Results(rows, about)
 
 
@@ -121,7 +123,9 @@ def rates(results: Results) -> list[str]:
         ("objects", RATE["objects"]),
         ("success (95 %)", RATE["success"]),
         ("held 2 s (95 %)", RATE["held 2 s"]),
-        *((name, RATE[name]) for name in ("of all objects", "error", "paper")),
+        ("of all objects", RATE["of all objects"]),
+        ("error", RATE["error"]),
+        ("paper", RATE["paper"]),
     )
     return Table.of("", results.rows, columns).markdown()
 
@@ -148,24 +152,23 @@ def conditions(results: Results) -> list[str]:
         f"`{policy['file']}` of version {policy['version']} (SHA-256 {policy['sha256'][:12]})"
         for policy in about["policies"]
     )
-    return [
-        f"{policies}, on {about['objects']}, {engine_title(about['physics'])}, {about['machine']}, "
-        f"congrasp "
-        f"{about['version']}:",
+    lines = [
+        f"{policies}, on {about['objects']}, {engine_title(about['physics'])}, "
+        f"{about['machine']}, congrasp {about['version']}:",
         "",
         "```text",
         about["command"],
         "```",
-        *(line for sentence in headings(results) for line in ("", sentence)),
     ]
+    for sentence in headings(results):
+        lines += ["", sentence]
+    return lines
 
 
 def headings(results: Results) -> list[str]:
     """Effect of the rules for headings."""
-    return [
-        HeadingRules(**found).sentence(hand)
-        for hand, found in results.about["heading_rules"].items()
-    ]
+    rules_by_hand = results.about["heading_rules"]
+    return [HeadingRules(**rules).sentence(hand) for hand, rules in rules_by_hand.items()]
 
 
 KINDS: dict[str, Callable[[Results], list[str]]] = {
@@ -181,15 +184,16 @@ def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str
       CongraspError: it names a file or a kind of table that does not exist.
     """
 
-    def block(found: re.Match[str]) -> str:
+    def block(match: re.Match[str]) -> str:
         """Returns one table between its markers."""
-        if found[2] not in results or found[3] not in KINDS:
+        opening, file, kind, closing = match.groups()
+        if file not in results or kind not in KINDS:
             raise CongraspError(
-                f"{name} names '{found[2]} {found[3]}', which does not exist.",
+                f"{name} names '{file} {kind}', which does not exist.",
                 f"Files: {', '.join(results)}; tables: {', '.join(KINDS)}.",
             )
-        lines = "\n".join(KINDS[found[3]](results[found[2]]))
-        return f"{found[1]}\n{lines}\n\n{found[4]}"
+        lines = "\n".join(KINDS[kind](results[file]))
+        return f"{opening}\n{lines}\n\n{closing}"
 
     return _BLOCK.sub(block, page)
 
@@ -199,8 +203,9 @@ def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
     results = recorded(root)
     for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
         text = path.read_text()
-        if (new := filled(text, results, path.name)) != text:
-            yield path, new
+        corrected = filled(text, results, path.name)
+        if corrected != text:
+            yield path, corrected
 
 
 if __name__ == "__main__":
