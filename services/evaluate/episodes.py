@@ -33,7 +33,10 @@ from congrasp.services.evaluate.plan import two_seconds
 
 PROBED_EPISODES = 2000
 """Most episodes of a row from which forces are read."""
-_FORCES = ("sample/link_force", "sample/torque")
+_LINK_FORCE = "sample/link_force"
+_TORQUE = "sample/torque"
+_SHORTEST_CHUNK = 10
+"""Control steps below which an episode is collected as a whole."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,12 +57,14 @@ class Sample:
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> "Sample":
         """Returns the sample of its `arrays`."""
-        values = {name: array for name, array in arrays.items() if name not in _FORCES}
-        return cls(values, *(arrays[name] for name in _FORCES))
+        values = dict(arrays)
+        link_force = values.pop(_LINK_FORCE)
+        torque = values.pop(_TORQUE)
+        return cls(values, link_force, torque)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns all arrays for a file."""
-        return {**self.values, **dict(zip(_FORCES, (self.link_force, self.torque), strict=True))}
+        return {**self.values, _LINK_FORCE: self.link_force, _TORQUE: self.torque}
 
     def where(self, chosen: np.ndarray) -> "Sample":
         """Selects episodes by `chosen` (E,)."""
@@ -78,19 +83,17 @@ class Sample:
 
 def joined(samples: Sequence[Sample]) -> Sample:
     """Joins the episodes of several samples, with forces of at most the first `PROBED_EPISODES`."""
+    values = {}
+    for name in samples[0].values:
+        values[name] = np.concatenate([sample.values[name] for sample in samples])
     probed: list[Sample] = []
     for sample in samples:
         probed.append(sample)
         if len(sample.link_force) < len(sample.values["success"]):
             break
-    return Sample(
-        {
-            name: np.concatenate([sample.values[name] for sample in samples])
-            for name in samples[0].values
-        },
-        np.concatenate([sample.link_force for sample in probed])[:PROBED_EPISODES],
-        np.concatenate([sample.torque for sample in probed])[:PROBED_EPISODES],
-    )
+    link_force = np.concatenate([sample.link_force for sample in probed])
+    torque = np.concatenate([sample.torque for sample in probed])
+    return Sample(values, link_force[:PROBED_EPISODES], torque[:PROBED_EPISODES])
 
 
 class Batch(NamedTuple):
@@ -134,8 +137,12 @@ class Episodes:
             (`common.task.plausibility`); None skips it.
           traced: records every step of every episode.
         """
-        self._bundle, self._task, self._hold, self._measured = bundle, task, hold, field is not None
-        self._hand, self.batch = get_hand(bundle.spec.hand), batch
+        self._bundle = bundle
+        self._task = task
+        self._hold = hold
+        self._measured = field is not None
+        self._hand = get_hand(bundle.spec.hand)
+        self.batch = batch
         self._worker = RolloutWorker(
             self._hand,
             task,
@@ -177,50 +184,52 @@ class Episodes:
           conditions: initial conditions, including the length of the hold.
           stressed: also simulates the stress test after the hold (`actors.stress`).
         """
-        task, worker = self._task, self._worker
-        start, window, length = (
-            task.approach_steps,
-            task.hold_steps,
-            task.approach_steps + self._hold,
-        )
-        piece = math.gcd(start, self._hold)
-        piece = piece if piece >= 10 else length
-        after = -(-protocols.stress_steps(task) // piece) * piece if stressed else 0
+        length = self._task.approach_steps + self._hold
+        chunk = self._chunk_steps()
+        after = 0
+        if stressed:
+            after = chunk * math.ceil(protocols.stress_steps(self._task) / chunk)
         begun = self._begin(conditions, after)
         traces: list[Trace] = []
         probed: list[Any] = []
-        for step in range(0, length + after, piece):
-            rollout = worker.collect(self._bundle.inference_parameters, piece)
+        for step in range(0, length + after, chunk):
+            rollout = self._worker.collect(self._bundle.inference_parameters, chunk)
             probed.append(jax.tree.map(np.asarray, rollout.probed))
             if step < length:
                 traces.append(rollout.trace)
-                finished = finished_episodes(rollout, task)
-                assert worker.state is not None and worker.state.views is not None
-                final = worker.state.views.true
-        samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
-        values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
+                finished = finished_episodes(rollout, self._task)
+                assert self._worker.state is not None and self._worker.state.views is not None
+                final = self._worker.state.views.true
+        samples = jax.tree.map(lambda *chunks: np.concatenate(chunks), *probed)
+        values = {name: finished[f"episode/{name}"] for name in metric_names(self._task)}
         if self._measured:
-            values |= protocols.assess(samples, values["held"] > 0, task, self._hold)
-        force, torque = (
-            x[start : start + window].swapaxes(0, 1)
-            for x in (samples.link_force, samples.torque_share)
+            values |= protocols.assess(samples, values["held"] > 0, self._task, self._hold)
+        sample = Sample(
+            {**values, **self._facts(conditions)},
+            self._in_window(samples.link_force),
+            self._in_window(samples.torque_share),
         )
 
         def message(episode: int) -> Message:
             """Returns the recording of one episode."""
-            trace = Trace(
-                *(
-                    np.concatenate([np.asarray(x[:, episode]) for x in field])
-                    for field in zip(*traces, strict=True)
-                )
-            )
-            return self._message(
-                begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode
-            )
+            metrics = {name: float(column[episode]) for name, column in values.items()}
+            return self._message(begun, _trace_of_episode(traces, episode), metrics, episode)
 
-        return Batch(
-            conditions, Sample({**values, **self._facts(conditions)}, force, torque), final, message
-        )
+        return Batch(conditions, sample, final, message)
+
+    def _chunk_steps(self) -> int:
+        """Control steps of a chunk, a divisor of the steps before and after the removal of the
+        table.
+        """
+        chunk = math.gcd(self._task.approach_steps, self._hold)
+        if chunk < _SHORTEST_CHUNK:
+            return self._task.approach_steps + self._hold
+        return chunk
+
+    def _in_window(self, steps: np.ndarray) -> np.ndarray:
+        """Returns the steps of the paper's window: (B, W, ...) of (T, B, ...)."""
+        start = self._task.approach_steps
+        return steps[start : start + self._task.hold_steps].swapaxes(0, 1)
 
     def take_grasps(self) -> Grasps:
         """Returns the grasps of the last batch that may become references."""
@@ -277,14 +286,25 @@ class Episodes:
         )
 
 
+def _trace_of_episode(traces: Sequence[Trace], episode: int) -> Trace:
+    """Returns the trace of one episode, joined from chunks of (T, B, ...)."""
+    fields = []
+    for chunks in zip(*traces, strict=True):
+        fields.append(np.concatenate([np.asarray(chunk[:, episode]) for chunk in chunks]))
+    return Trace(*fields)
+
+
 def identity(conditions: InitialConditions) -> np.ndarray:
     """(B,) uint32, equal for episodes with the same initial conditions and active constraints,
     ignoring sensors.
 
     Numbers are rounded to 1e-4.
     """
-    start, goal = conditions.reset_state, conditions.goal
-    return _hashes([*start, *(array for name in goal.values for array in _active(goal, name))])
+    goal = conditions.goal
+    arrays = list(conditions.reset_state)
+    for name in goal.values:
+        arrays += _active(goal, name)
+    return _hashes(arrays)
 
 
 def reference(conditions: InitialConditions) -> np.ndarray:
@@ -293,19 +313,25 @@ def reference(conditions: InitialConditions) -> np.ndarray:
     If poses and trajectories are drawn independently, the pose counts.
     """
     goal = conditions.goal
-    drawn = [_active(goal, name) for name in goal.values if get_constraint(name).from_reference]
-    return _hashes(
-        [conditions.reset_state.object_index, *(array for arrays in drawn for array in arrays)]
-    )
+    arrays = [conditions.reset_state.object_index]
+    for name in goal.values:
+        if get_constraint(name).from_reference:
+            arrays += _active(goal, name)
+    return _hashes(arrays)
 
 
 def _active(goal: Goal, name: str) -> list[np.ndarray]:
     """Goal arrays (B, ...) of a constraint, zero where it is inactive."""
-    constraint, arrays = get_constraint(name), [np.asarray(array) for array in goal[name]]
+    constraint = get_constraint(name)
+    arrays = [np.asarray(array) for array in goal[name]]
     if not constraint.blocks:
         return arrays
     active = np.any([goal.active[block] for block in constraint.blocks], 0)
-    return [np.where(active.reshape(-1, *[1] * (array.ndim - 1)), array, 0) for array in arrays]
+    masked = []
+    for array in arrays:
+        of_episodes = active.reshape(-1, *[1] * (array.ndim - 1))
+        masked.append(np.where(of_episodes, array, 0))
+    return masked
 
 
 def _hashes(arrays: Sequence[Array]) -> np.ndarray:
