@@ -6,7 +6,7 @@ import base64
 import json
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,7 +26,10 @@ FRAME_SECONDS = 0.04
 """Time between two frames of an interactive grasp."""
 _FRAMES = 5
 _SIZE = (300, 225)
-_PUSHED = 0.05  # tolerated displacement of an object before the table is removed, m
+_PUSHED = 0.05
+"""Tolerated displacement of an object before the table is removed, m."""
+_MARGIN = 0.05
+"""Margin around hand and object in the view of an interactive grasp, m."""
 
 
 def cause(episode: Message, drop_height: float) -> str:
@@ -43,10 +46,9 @@ def cause(episode: Message, drop_height: float) -> str:
         return f"pushed away before {moment}"
     if not metrics["links_at_removal"]:
         return f"not touched when {moment}"
-    seconds = (fall_step(episode, drop_height) - grasp_steps(episode)[1]) * episode.meta[
-        "control_dt"
-    ]
-    return f"slipped {seconds:.2f} s after {moment}"
+    _, removal = grasp_steps(episode)
+    steps = fall_step(episode, drop_height) - removal
+    return f"slipped {steps * episode.meta['control_dt']:.2f} s after {moment}"
 
 
 def fall_step(episode: Message, drop_height: float) -> int:
@@ -55,12 +57,14 @@ def fall_step(episode: Message, drop_height: float) -> int:
 
     In a lift the height is relative to the wrist.
     """
-    removal = grasp_steps(episode)[1]
+    _, removal = grasp_steps(episode)
     height = np.asarray(episode.arrays["object_position"])[:, 2]
     if "lift" in phases_of(episode.meta):
         height = height - episode.arrays["link_position"][:, 0, 2]
     below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
-    return removal + int(below[0]) if len(below) else len(height) - 1
+    if not len(below):
+        return len(height) - 1
+    return removal + int(below[0])
 
 
 def failure_sheets(
@@ -79,20 +83,30 @@ def failure_sheets(
       For each row with an episode: its name, the sheet (H, W, 3) uint8, and the outcome of each
       episode.
     """
-    policy, drop_height = experiment.policy, experiment.task.drop_height
+    policy = experiment.policy
+    drop_height = experiment.task.drop_height
     for result in results:
-        name, episodes = result.variation.constraint, result.examples(successes, failures)
+        name = result.variation.constraint
+        episodes = result.examples(successes, failures)
         if not episodes:
             continue
-        causes = [cause(episode, drop_height) for episode in episodes]
+        causes = []
+        strips = []
+        for episode in episodes:
+            outcome = cause(episode, drop_height)
+            causes.append(outcome)
+            strips.append(
+                _Strip(
+                    episode,
+                    first_caption=episode.meta["object"],
+                    last_caption=f": {outcome}",
+                    last_step=fall_step(episode, drop_height),
+                )
+            )
         title = (
             f"{policy.spec.hand_name} hand, version {policy.version}, {name}: {len(episodes)} "
             f"episodes, failures first"
         )
-        strips = [
-            (episode, episode.meta["object"], f": {outcome}", fall_step(episode, drop_height))
-            for episode, outcome in zip(episodes, causes, strict=True)
-        ]
         yield name, _sheet(strips, title), causes
 
 
@@ -107,37 +121,68 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    worst = {
-        result.variation.label.partition(" ")[0]: result
-        for result in results
-        if result.variation.label
-    }
-    strips = [
-        (
-            episode,
-            f"{variation.constraint}, {variation.label}: {episode.meta['object']}",
-            ", held",
-            None,
-        )
-        for variation, _, _, held, _ in worst.values()
-        for episode in held[:1]
-    ]
+    worst_of_kind = {}
+    for result in results:
+        kind, _, _ = result.variation.label.partition(" ")
+        if kind:
+            worst_of_kind[kind] = result
+    strips = []
+    for result in worst_of_kind.values():
+        if not result.held:
+            continue
+        episode = result.held[0]
+        variation = result.variation
+        caption = f"{variation.constraint}, {variation.label}: {episode.meta['object']}"
+        strips.append(_Strip(episode, first_caption=caption, last_caption=", held"))
     if strips:
         text = "Requested: the blue hand or the violet path, with noise. Executed: the grey hand"
         save_png(path, _sheet(strips, text))
 
 
-def _sheet(strips: Sequence[tuple[Message, str, str, int | None]], title: str) -> np.ndarray:
-    """Draws key frames of episodes: each with its first caption, the end of its last one, and its
-    last step.
-    """
+class _Strip(NamedTuple):
+    """Key frames of an episode in a sheet."""
+
+    episode: Message
+    first_caption: str
+    last_caption: str
+    """Added to the caption of the last frame."""
+    last_step: int | None = None
+    """Step of the last frame; None for the episode's last one."""
+
+
+def _sheet(strips: Sequence[_Strip], title: str) -> np.ndarray:
+    """Draws a sheet (H, W, 3) uint8 with a line of key frames for each episode."""
     images: list[np.ndarray] = []
-    labels: list[str] = []
-    for episode, first, last, until in strips:
-        frames, captions = episode_strip(episode, _FRAMES, _SIZE, first, last, until=until)
+    captions: list[str] = []
+    for strip in strips:
+        frames, frame_captions = episode_strip(
+            strip.episode,
+            _FRAMES,
+            _SIZE,
+            strip.first_caption,
+            strip.last_caption,
+            until=strip.last_step,
+        )
         images += frames
-        labels += captions
-    return contact_sheet(images, labels, columns=_FRAMES, title=title)
+        captions += frame_captions
+    return contact_sheet(images, captions, columns=_FRAMES, title=title)
+
+
+class _SkinnedMesh(NamedTuple):
+    """A mesh whose points move with up to four bones each."""
+
+    points: np.ndarray
+    """(V, 3) in the bones' resting frames, m."""
+    normals: np.ndarray
+    """(V, 3)."""
+    colours: np.ndarray
+    """(V, 3), 0 to 1."""
+    faces: np.ndarray
+    """(F, 3)."""
+    bones: np.ndarray
+    """(V, 4) indices of bones."""
+    weights: np.ndarray
+    """(V, 4), with the sum 1."""
 
 
 def turntable(episode: Message) -> Mapping[str, Any]:
@@ -154,74 +199,104 @@ def turntable(episode: Message) -> Mapping[str, Any]:
       `table`'s first and last corner in `faces`, and the `centre` (3,) and `radius`, m, of the
       grasp.
     """
-    arrays, hand = episode.arrays, known_hand(episode.meta["hand"])
-    every = max(1, round(FRAME_SECONDS / float(episode.meta["control_dt"])))
-    steps = np.arange(0, len(arrays["table"]), every)
-    frames, bones = _frames(episode, steps), len(hand.links)
-    skin, table = skin_of(hand), table_shape(arrays["object_position"][0])
+    arrays = episode.arrays
+    hand = known_hand(episode.meta["hand"])
+    control_dt = float(episode.meta["control_dt"])
+    steps_per_frame = max(1, round(FRAME_SECONDS / control_dt))
+    steps = np.arange(0, len(arrays["table"]), steps_per_frame)
+    frames = _frames(episode, steps)
+    object_bone = len(hand.links)
+    skin = skin_of(hand)
     links, weights = skin.influences()
-    body = Shape(
+    hand_mesh = _SkinnedMesh(
+        skin.points, skin.normals, skin_colours(skin), skin.faces, links, weights
+    )
+    obj = Shape(
         "mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"]
     )
-    parts = [(skin.points, skin.normals, skin_colours(skin), skin.faces, links, weights)]
-    for bone, shape in ((bones, body), (bones + 1, table)):
-        found = triangles_of([shape], fine=False)
-        count = len(found.points)
-        moved = np.tile([bone, 0, 0, 0], (count, 1)), np.tile([1.0, 0, 0, 0], (count, 1))
-        parts.append(
-            (found.points, found.normals, np.tile(shape.colour, (count, 1)), found.faces, *moved)
-        )
-    counts = np.cumsum([0, *(len(part[0]) for part in parts)])
-    points, normals, colours, _, bone_of, weight = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
-    faces = np.concatenate(
-        [part[3] + first for part, first in zip(parts, counts[:-1], strict=True)]
-    )
-    seen = np.concatenate(
-        [frames[:, :bones, :, 3] @ np.eye(3), arrays["object_position"][steps][:, None]], 1
-    )
+    table_mesh = _rigid_mesh(table_shape(arrays["object_position"][0]), object_bone + 1)
+    mesh = _join([hand_mesh, _rigid_mesh(obj, object_bone), table_mesh])
     removal = int(np.sum(arrays["table"][steps]))
-    held = seen[removal // 2 : removal + 1].reshape(-1, 3)
-    centre = (held.min(0) + held.max(0)) / 2
+    centre, radius = _bounds(episode, steps, frames, removal)
     data = {
-        "position": _encoded(points, "<f4"),
-        "normal": _encoded(normals, "<f4"),
-        "colour": _encoded(np.round(255 * colours), "u1"),
-        "bones": _encoded(bone_of, "u1"),
-        "weights": _encoded(np.round(255 * weight), "u1"),
-        "faces": _encoded(faces, "<u4"),
+        "position": _encoded(mesh.points, "<f4"),
+        "normal": _encoded(mesh.normals, "<f4"),
+        "colour": _encoded(np.round(255 * mesh.colours), "u1"),
+        "bones": _encoded(mesh.bones, "u1"),
+        "weights": _encoded(np.round(255 * mesh.weights), "u1"),
+        "faces": _encoded(mesh.faces, "<u4"),
         "frames": _encoded(frames, "<f4"),
-        "count": bones + 2,
-        "seconds": every * float(episode.meta["control_dt"]),
+        "count": object_bone + 2,
+        "seconds": steps_per_frame * control_dt,
         "removal": removal,
-        "table": [3 * (len(faces) - len(parts[-1][3])), 3 * len(faces)],
+        "table": [3 * (len(mesh.faces) - len(table_mesh.faces)), 3 * len(mesh.faces)],
         "centre": centre.round(4).tolist(),
-        "radius": round(float(np.linalg.norm(held - centre, axis=-1).max()) + 0.05, 4),
+        "radius": round(radius, 4),
     }
     return {"data": json.dumps(data), "object": episode.meta["object"]}
 
 
+def _rigid_mesh(shape: Shape, bone: int) -> _SkinnedMesh:
+    """Returns a shape's mesh, which moves with one bone."""
+    triangles = triangles_of([shape], fine=False)
+    count = len(triangles.points)
+    return _SkinnedMesh(
+        triangles.points,
+        triangles.normals,
+        np.tile(shape.colour, (count, 1)),
+        triangles.faces,
+        np.tile([bone, 0, 0, 0], (count, 1)),
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+    )
+
+
+def _join(meshes: Sequence[_SkinnedMesh]) -> _SkinnedMesh:
+    """Joins meshes into one."""
+    faces = []
+    first = 0
+    for mesh in meshes:
+        faces.append(mesh.faces + first)
+        first += len(mesh.points)
+    columns = [np.concatenate(column) for column in zip(*meshes, strict=True)]
+    return _SkinnedMesh(*columns)._replace(faces=np.concatenate(faces))
+
+
+def _bounds(
+    episode: Message, steps: np.ndarray, frames: np.ndarray, removal: int
+) -> tuple[np.ndarray, float]:
+    """Returns centre (3,) and radius, m, of hand and object in the second half of the approach.
+
+    Args:
+      episode: the episode.
+      steps: (T,) steps of the frames.
+      frames: (T, B, 3, 4) matrices of all bones.
+      removal: frame of the table's removal.
+    """
+    links = frames[:, :-2, :, 3]
+    obj = episode.arrays["object_position"][steps][:, None]
+    positions = np.concatenate([links, obj], 1)[removal // 2 : removal + 1].reshape(-1, 3)
+    centre = (positions.min(0) + positions.max(0)) / 2
+    radius = float(np.linalg.norm(positions - centre, axis=-1).max()) + _MARGIN
+    return centre, radius
+
+
 def _frames(episode: Message, steps: np.ndarray) -> np.ndarray:
     """Matrices (T, B, 3, 4) of all bones at some steps."""
-    arrays, skin = episode.arrays, skin_of(known_hand(episode.meta["hand"]))
-    places = np.concatenate(
+    arrays = episode.arrays
+    skin = skin_of(known_hand(episode.meta["hand"]))
+    positions = np.concatenate(
         [arrays["link_position"][steps], arrays["object_position"][steps][:, None]], 1
     )
-    turns = np.concatenate(
+    quaternions = np.concatenate(
         [arrays["link_quaternion"][steps], arrays["object_quaternion"][steps][:, None]], 1
     )
-    rotations = (
-        Rotation.from_quat(turns.reshape(-1, 4), scalar_first=True)
-        .as_matrix()
-        .reshape(*turns.shape[:2], 3, 3)
-    )
+    matrices = Rotation.from_quat(quaternions.reshape(-1, 4), scalar_first=True).as_matrix()
+    rotations = matrices.reshape(*quaternions.shape[:2], 3, 3)
     origins = np.concatenate([skin.origins, np.zeros((1, 3))])
-    moved = np.concatenate(
-        [rotations, (places - np.einsum("tbij,bj->tbi", rotations, origins))[..., None]], -1
-    )
+    translations = positions - np.einsum("tbij,bj->tbi", rotations, origins)
+    moving = np.concatenate([rotations, translations[..., None]], -1)
     world = np.broadcast_to(np.eye(3, 4), (len(steps), 1, 3, 4))
-    return np.concatenate([moved, world], 1)
+    return np.concatenate([moving, world], 1)
 
 
 def _encoded(array: np.ndarray, kind: str) -> str:

@@ -3,6 +3,7 @@ effect of noise.
 """
 
 import functools
+import math
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -30,7 +31,11 @@ _NOISES = {
     "depth": "Pose: depth that it sinks into the object",
     "jitter": "Trajectory: normal error of every waypoint",
 }
-_LARGEST = 64 << 20  # limit of a JSON file in bytes
+_RULE = "#e3e6ea"
+"""Colour of the lines between the rows of a table."""
+_PLOTTED_UNITS = {"rad": (1.0, "rad"), "m": (10.0, "dm")}
+"""Factors and units with which angles and lengths fit one axis, by the units of errors."""
+_MAX_FILE_BYTES = 64 << 20
 
 
 def plot_evaluation(
@@ -50,16 +55,19 @@ def plot_evaluation(
       CongraspError: it is not such a file.
     """
     try:
-        rows = [Row.from_json(row) for row in read_json(path, _LARGEST)["rows"]]
-        figures = {"table": _table(compared(rows)), "success": _success(rows)}
+        rows = [Row.from_json(row) for row in read_json(path, _MAX_FILE_BYTES)["rows"]]
+        figures = {"table": _draw_table(compared(rows)), "success": _draw_success(rows)}
         if any(row.quantiles for row in rows):
-            figures["errors"] = _errors(rows)
+            figures["errors"] = _draw_errors(rows)
     except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CongraspError(
             f"{path} is not the result of an evaluation ({type(error).__name__}: {error}).",
             "Pass a file that 'congrasp evaluate --json FILE' wrote, or a run's folder.",
         ) from None
-    return [file for name, figure in figures.items() for file in save(figure, out / name, formats)]
+    files = []
+    for name, figure in figures.items():
+        files += save(figure, out / name, formats)
+    return files
 
 
 def compared(rows: Sequence[Row]) -> Table:
@@ -94,90 +102,104 @@ def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
     """
     figure = new_figure(4.0 * len(_NOISES), 5.6, title)
     grid = figure.subplots(2, len(_NOISES), sharex="col")
-    pairs = list(zip(NOISE, rows, strict=True))
     for (above, below), (kind, heading) in zip(grid.T, _NOISES.items(), strict=True):
         constraint = next(noise.constraint for noise in NOISE if noise.kind == kind)
-        shown = [
-            (n, row) for n, row in pairs if n.constraint == constraint and n.kind in ("", kind)
-        ]
         unit, factor = ("rad", 1.0) if kind == "joints" else ("cm", 100.0)
-        x = [factor * noise.level for noise, _ in shown]
+        levels = []
+        rows_of_kind = []
+        for noise, row in zip(NOISE, rows, strict=True):
+            if noise.constraint == constraint and noise.kind in ("", kind):
+                levels.append(factor * noise.level)
+                rows_of_kind.append(row)
         style(above, heading, "", "%")
         style(below, "", f"{kind}, {unit}", "mean error")
-        for name, label, colour in (
-            ("success", "success", COLOURS[0]),
-            ("held_2s", "held for 2 s", COLOURS[2]),
-        ):
-            ends = ("_low", "", "_high")
-            low, middle, high = (
-                [100 * (getattr(row, f"{name}{end}") or 0.0) for _, row in shown] for end in ends
+        _draw_rate(above, levels, rows_of_kind, "success", "success", COLOURS[0])
+        _draw_rate(above, levels, rows_of_kind, "held_2s", "held for 2 s", COLOURS[2])
+        for name, colour in zip(ERRORS[constraint].values(), (COLOURS[3], COLOURS[1]), strict=True):
+            _, error_unit = _TITLES[name]
+            scale, label = _PLOTTED_UNITS[error_unit]
+            below.plot(
+                levels,
+                [scale * _or_nan(row.errors[name]) for row in rows_of_kind],
+                "s-",
+                color=colour,
+                label=f"error, {label}",
             )
-            above.plot(x, middle, "o-", color=colour, label=label)
-            above.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-        for (name, scale, unit), colour in zip(
-            _scaled(constraint), (COLOURS[3], COLOURS[1]), strict=True
-        ):
-            found = [
-                np.nan if (value := row.errors[name]) is None else scale * value for _, row in shown
-            ]
-            below.plot(x, found, "s-", color=colour, label=f"error, {unit}")
         above.set_ylim(0, 102)
         below.set_ylim(0, 1.1 * below.get_ylim()[1])
-        for axes in (above, below):
-            axes.legend(frameon=False, fontsize=8)
+        above.legend(frameon=False, fontsize=8)
+        below.legend(frameon=False, fontsize=8)
     save(figure, path.with_suffix(""), ["png"])
 
 
-def _scaled(constraint: str) -> list[tuple[str, float, str]]:
-    """Errors of a constraint, with a factor and a unit: angles in rad, lengths in dm."""
-    shown = {"rad": (1.0, "rad"), "m": (10.0, "dm")}
-    return [(name, *shown[_TITLES[name][1]]) for name in ERRORS[constraint].values()]
+def _draw_rate(
+    axes: Any, levels: Sequence[float], rows: Sequence[Row], name: str, label: str, colour: str
+) -> None:
+    """Draws a rate of rows against the noise, in per cent, with its interval."""
+    rate = [100 * (getattr(row, name) or 0.0) for row in rows]
+    low = [100 * (getattr(row, f"{name}_low") or 0.0) for row in rows]
+    high = [100 * (getattr(row, f"{name}_high") or 0.0) for row in rows]
+    axes.plot(levels, rate, "o-", color=colour, label=label)
+    axes.fill_between(levels, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _or_nan(error: float | None) -> float:
+    """The error; NaN, which leaves a gap in a curve, if there is none."""
+    return math.nan if error is None else error
 
 
 def _labels(rows: Sequence[Row]) -> list[str]:
     """Labels of the rows: constraint and group, with hand and method if there are several."""
-    several = len({(row.hand, row.method) for row in rows}) > 1
-    return [row_title(row) + (f", {row.hand}, {row.method}" if several else "") for row in rows]
+    if len({(row.hand, row.method) for row in rows}) == 1:
+        return [row_title(row) for row in rows]
+    return [f"{row_title(row)}, {row.hand}, {row.method}" for row in rows]
 
 
 def _error(name: str, row: Row) -> str:
     """An error of a row with three digits; empty if there is none."""
-    return "" if (error := row.errors.get(name)) is None else f"{error:.3f}"
+    error = row.errors.get(name)
+    return "" if error is None else f"{error:.3f}"
 
 
 def _paper_error(name: str, row: Row) -> str:
-    """The paper's; empty if there is none."""
-    return f"{row.paper.errors[name]:.3f}" if row.paper and name in row.paper.errors else ""
+    """The paper's error with three digits; empty if there is none."""
+    if not row.paper or name not in row.paper.errors:
+        return ""
+    return f"{row.paper.errors[name]:.3f}"
 
 
-def _table(table: Table) -> Any:
+def _draw_table(table: Table) -> Any:
     """Draws a table."""
     heads = [name.replace(", ", ",\n", 1) for name in table.columns]
-    cells = zip(heads, *table.rows, strict=True)
-    widths = [
-        2 + max(len(word) for cell in column for word in cell.split("\n")) for column in cells
-    ]
+    widths = []
+    for column in zip(heads, *table.rows, strict=True):
+        lines = "\n".join(column).split("\n")
+        widths.append(2 + max(map(len, lines)))
     figure = new_figure(0.085 * sum(widths) + 0.3, 0.32 * (1 + len(table.rows)) + 1.0, table.title)
     axes = figure.subplots()
     axes.set_axis_off()
-    shown = axes.table(
+    drawn = axes.table(
         table.rows,
         colLabels=heads,
         colWidths=np.divide(widths, sum(widths)),
         bbox=(0, 0, 1, 1),
         edges="horizontal",
     )
-    shown.auto_set_font_size(False)
-    shown.set_fontsize(8.5)
-    for (line, column), cell in shown.get_celld().items():
-        cell.set_edgecolor(INK if line == 0 else "#e3e6ea")
-        weight = "bold" if line == 0 or column == 0 else "normal"
-        cell.set_text_props(color=QUIET if table.columns[column] == "paper" else INK, weight=weight)
-        cell.set_text_props(ha="left" if column == 0 else "right")
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(8.5)
+    for (line, column), cell in drawn.get_celld().items():
+        heading = line == 0
+        first_column = column == 0
+        cell.set_edgecolor(INK if heading else _RULE)
+        cell.set_text_props(
+            color=QUIET if table.columns[column] == "paper" else INK,
+            weight="bold" if heading or first_column else "normal",
+            ha="left" if first_column else "right",
+        )
     return figure
 
 
-def _success(rows: Sequence[Row]) -> Any:
+def _draw_success(rows: Sequence[Row]) -> Any:
     """Draws the success of each row with its interval, and that of the paper."""
     figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
     axes = figure.subplots()
@@ -199,22 +221,22 @@ def _success(rows: Sequence[Row]) -> Any:
     return figure
 
 
-def _errors(rows: Sequence[Row]) -> Any:
+def _draw_errors(rows: Sequence[Row]) -> Any:
     """Draws cumulative distributions of the errors, one panel each."""
-    shown = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
+    names = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
     figure, grid = panel_grid(
-        len(shown), 2.8, "Errors of successful episodes: share of episodes below"
+        len(names), 2.8, "Errors of successful episodes: share of episodes below"
     )
     labels = _labels(rows)
-    for axes, name in zip(grid, shown, strict=True):
+    for axes, name in zip(grid, names, strict=True):
         title, unit = _TITLES[name]
         for i, row in enumerate(rows):
-            if not (found := row.quantiles.get(name)):
+            quantiles = row.quantiles.get(name)
+            if not quantiles:
                 continue
+            shares = np.linspace(0, 1, len(quantiles))
             colour = COLOURS[i % len(COLOURS)]
-            axes.plot(
-                found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=labels[i]
-            )
+            axes.plot(quantiles, shares, color=colour, linewidth=1.6, label=labels[i])
             if row.paper and name in row.paper.errors:
                 axes.axvline(row.paper.errors[name], color=colour, linewidth=1.0, linestyle=":")
         style(axes, title, f"{unit}   (dotted: mean of the paper)", "share")
