@@ -31,8 +31,8 @@ from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.objects.object_checks import LARGEST
 from congrasp.common.objects.spec import Colours
-from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
