@@ -99,7 +99,7 @@ class Pools(NamedTuple):
     """Identity of the objects, for that of results."""
     size: int
     """Objects of a pool; the last pools may have one less."""
-    make: list[Callable[[], Loaded]]
+    make: Sequence[Callable[[], Loaded]]
 
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
