@@ -12,7 +12,6 @@ import numpy as np
 
 from congrasp.actors import initial
 from congrasp.actors import stress as protocols
-from congrasp.actors.env import metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.native import NativePhysics
@@ -25,6 +24,7 @@ from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import Resolution
+from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 
@@ -56,7 +56,7 @@ class Outcome(NamedTuple):
     aligned: np.ndarray
     """(B,) bool."""
     metrics: dict[str, np.ndarray]
-    """(B,) each, by the names in `actors.env.metric_names` and `actors.stress.assess`."""
+    """(B,) each, by the names in `common.task.metrics.metric_names` and `actors.stress.assess`."""
     trace: Trace
     """(T, B, ...)."""
 
@@ -88,7 +88,9 @@ class Attempts:
           phases: durations and heights.
         """
         self.phases = phases
-        self._hand, self._task, self._bundle = hand, task, bundle
+        self._hand = hand
+        self._task = task
+        self._bundle = bundle
         self._threads = threads
         self._worker: RolloutWorker | None = None
 
@@ -100,7 +102,9 @@ class Attempts:
     @property
     def speed(self) -> float:
         """Initial speed of the wrist along the heading, m/s."""
-        return initial.handover_speed(self._hand, self._task) if self.phases.approach else 0.0
+        if not self.phases.approach:
+            return 0.0
+        return initial.handover_speed(self._hand, self._task)
 
     @property
     def _after(self) -> int:
@@ -112,13 +116,11 @@ class Attempts:
     def begins(self) -> dict[str, float]:
         """Start times of the grasp, a lift and the hold, in seconds from the first step."""
         removal = self._task.approach_steps
-        begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self.phases.lift)}
+        begins = {"grasp": 0}
         if self.phases.lift:
             begins["lift"] = removal
-        return {
-            name: step * self._task.control_dt
-            for name, step in sorted(begins.items(), key=lambda item: item[1])
-        }
+        begins["hold"] = removal + protocols.lift_steps(self._task, self.phases.lift)
+        return {name: step * self._task.control_dt for name, step in begins.items()}
 
     def run(
         self,
@@ -133,32 +135,54 @@ class Attempts:
           request: the episodes.
           progress: called with the number of completed control steps.
         """
-        task, hold, lift = self._task, self._after, self.phases.lift
-        conditions, resolution = _given(self._hand, task, request, hold, self.speed)
-        batch = len(request.rest)
+        task = self._task
+        hold = self._after
+        conditions, resolution = _requested(self._hand, task, request, hold, self.speed)
+        worker = self._worker_of(obj, len(request.rest))
+        worker.replace_objects([obj], None)
+        worker.adjust(protocol=self._protocol(obj), probe_data=distance_field([obj]))
+        worker.begin(conditions)
+        parameters = self._bundle.inference_parameters
+        rollout = worker.collect(parameters, task.approach_steps + hold, progress)
+        stressed = worker.collect(parameters, protocols.stress_steps(task, self._stress_height))
+        trace, samples = jax.tree.map(
+            lambda *parts: np.concatenate(parts),
+            (rollout.trace, rollout.probed),
+            (stressed.trace, stressed.probed),
+        )
+        names = metric_names(task)
+        columns = np.asarray(rollout.episodes)[:, : len(names)].T
+        metrics = dict(zip(names, columns, strict=True))
+        is_held = metrics["held"] > 0
+        metrics |= protocols.assess(samples, is_held, task, hold, self._stress_height)
+        trace = Trace(*(field[: self.steps] for field in trace))
+        if self.phases.lift:
+            trace = trace._replace(table=np.ones_like(trace.table))
+        return Outcome(
+            goal=resolution.goal,
+            redirected=np.asarray(resolution.redirected),
+            aligned=np.asarray(resolution.aligned),
+            metrics=metrics,
+            trace=trace,
+        )
+
+    @property
+    def _stress_height(self) -> float:
+        """Height of the lift after the hold, m: none if the hand has already lifted the object."""
+        return 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+
+    def _protocol(self, obj: GraspObject) -> protocols.Protocol:
+        """Returns the lift and the pushes of a run."""
+        if self.phases.lift:
+            return protocols.lift_first(self._task, [obj], self._after, self.phases.lift)
+        return protocols.stress(self._task, [obj], self._after, self._stress_height)
+
+    def _worker_of(self, obj: GraspObject, batch: int) -> RolloutWorker:
+        """Returns the worker, a new one if it has another number of environments."""
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
-        height = 0.0 if lift else protocols.LIFT_HEIGHT  # height of the lift after the hold, m
-        protocol = protocols.stress(task, [obj], hold, height)
-        if lift:
-            protocol = protocols.lift_first(task, [obj], hold, lift)
-        self._worker.replace_objects([obj], None)
-        self._worker.adjust(protocol=protocol, probe_data=distance_field([obj]))
-        self._worker.begin(conditions)
-        parameters = self._bundle.inference_parameters
-        rollout = self._worker.collect(parameters, task.approach_steps + hold, progress)
-        after = self._worker.collect(parameters, protocols.stress_steps(task, height))
-        parts = ((part.trace, part.probed) for part in (rollout, after))
-        trace, samples = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-        names = metric_names(task)
-        metrics = dict(zip(names, np.asarray(rollout.episodes)[:, : len(names)].T, strict=True))
-        metrics |= protocols.assess(samples, metrics["held"] > 0, task, hold, height)
-        flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
-        trace = Trace(*(field[: self.steps] for field in trace))
-        if lift:
-            trace = trace._replace(table=np.ones_like(trace.table))
-        return Outcome(resolution.goal, *flags, metrics, trace)
+        return self._worker
 
     def episode(
         self,
@@ -210,15 +234,15 @@ class Attempts:
         )
 
 
-def _given(*request: Any) -> tuple[initial.InitialConditions, Resolution]:
-    """See `initial.given`: one program for all attempts at a task."""
-    conditions: tuple[initial.InitialConditions, Resolution] = _given_program()(*request)
+def _requested(*request: Any) -> tuple[initial.InitialConditions, Resolution]:
+    """See `initial.requested_conditions`: one program for all attempts at a task."""
+    conditions: tuple[initial.InitialConditions, Resolution] = _requested_program()(*request)
     return conditions
 
 
 @functools.cache
-def _given_program() -> Any:
+def _requested_program() -> Any:
     """Compiles in a quarter of the time on a CPU, where it runs once for thousands of steps."""
     quick = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     options = quick if jax.default_backend() == "cpu" else None
-    return jax.jit(initial.given, static_argnums=(0, 1), compiler_options=options)
+    return jax.jit(initial.requested_conditions, static_argnums=(0, 1), compiler_options=options)

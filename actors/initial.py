@@ -19,7 +19,8 @@ from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
 from congrasp.common.task.sampling.bank import ConstraintBank, Draw, surface_of
 from congrasp.common.task.sampling.headings import Headings, local_width
-from congrasp.common.task.sensing import Sensors, draw_sensors
+from congrasp.common.task.sensors import get_sensor
+from congrasp.common.task.sensors.parameters import SensorParameters
 from congrasp.common.task.types import Array, Goal, Surface
 
 _CLEARANCE = 0.005
@@ -39,8 +40,8 @@ class InitialConditions(NamedTuple):
     """(B,) int: region of the constraint bank from which they were drawn."""
     hold: Array
     """(B,) int: control steps without the table before the end of the episode."""
-    sensors: Sensors
-    """Trackers of the objects' poses, for policies that do not observe the true ones."""
+    sensors: SensorParameters
+    """Parameters of the sensors, for policies that do not observe the true state."""
 
 
 class Approach(NamedTuple):
@@ -52,6 +53,27 @@ class Approach(NamedTuple):
     """(B,) distance by which the fingers are opened wider than the object, m."""
     speed: Array
     """(B,) speed of the wrist along the heading, m/s."""
+
+
+class PlacedHand(NamedTuple):
+    """Initial hands of B episodes."""
+
+    q: Array
+    """(B, F) finger angles."""
+    position: Array
+    """(B, 3) wrist, world frame."""
+    quaternion: Array
+    """(B, 4)."""
+
+
+class Dynamics(NamedTuple):
+    """Objects and dynamics of B episodes; fields as in `ResetState`."""
+
+    object_index: Array
+    mass_scale: Array
+    friction: Array
+    gain_scale: Array
+    stationary: Array
 
 
 class RequestedEpisodes(NamedTuple):
@@ -91,41 +113,93 @@ def sample(
       stationary: () bool, fixes the objects (the paper's first phase).
       rows: (K,) int, draws only these of the B episodes; all by default.
     """
-    uniform, sensors = (
-        _uniforms(hand, task, key, batch),
-        draw_sensors(task.sensing, task.control_dt, key, batch),
-    )
+    uniform = _uniforms(hand, task, key, batch)
+    sensors = get_sensor(task).draw(task.sensing, task.control_dt, key, batch)
     if rows is not None:
         uniform, sensors = jax.tree.map(lambda numbers: numbers[rows], (uniform, sensors))
-    episode = uniform[_TRAINING].T
-    count = len(episode[0])
-    objects, rests = (
-        chance.weighted(episode[0], bank.weight),
-        chance.index(episode[1], bank.rest.shape[1]),
-    )
-    # A constraint that is never requested is a constant, so that its share of the program is not
-    # even compiled.
-    wanted = {
-        c.name: uniform[c.name][:, 0] < share
-        if (share := getattr(task, f"p_{c.name}"))
-        else jnp.zeros(count, bool)
-        for c in optional(task)
-    }
-    active = active_blocks(wanted)
-    for constraint in optional(task):
-        if (joined := constraint.joined(task, active, episode[2])) is not None:
-            wanted[constraint.name] |= joined
+    episode = _TrainingNumbers(*uniform[_TRAINING].T)
     disturbance = None
     if task.disturbed_references:
-        disturbance = jnp.where(episode[3] < task.disturbed_references, episode[4], 0.0)
-    draw = Draw(bank, objects, rests, disturbance=disturbance)
-    return _drawn(
-        hand, task, draw, uniform, sensors, wanted, stationary, _varied(task, *episode[5:])
+        is_disturbed = episode.is_disturbed < task.disturbed_references
+        disturbance = jnp.where(is_disturbed, episode.disturbance, 0.0)
+    draw = Draw(
+        bank,
+        objects=chance.weighted(episode.object, bank.weight),
+        rests=chance.index(episode.rest, bank.rest.shape[1]),
+        disturbance=disturbance,
     )
+    plan = _Plan(
+        uniform=uniform,
+        sensors=sensors,
+        requested=_requested(task, uniform, episode.joined),
+        stationary=stationary,
+        approach=_varied(task, episode.distance, episode.margin, episode.speed),
+    )
+    return _drawn(hand, task, draw, plan)
 
 
-_TRAINING, _EPISODE = "training", "episode"
-"""Random numbers of an episode apart from those of its constraints, which have their names."""
+_TRAINING = "training"
+"""Name of the random numbers of `_TrainingNumbers`."""
+_EPISODE = "episode"
+"""Name of the random numbers of `_EpisodeNumbers`; those of constraints have their names."""
+
+
+class _TrainingNumbers(NamedTuple):
+    """Random numbers (B,) in [0, 1) of episodes in training only."""
+
+    object: Array
+    rest: Array
+    joined: Array
+    is_disturbed: Array
+    disturbance: Array
+    distance: Array
+    margin: Array
+    speed: Array
+
+
+class _EpisodeNumbers(NamedTuple):
+    """Random numbers (B,) in [0, 1) of all drawn episodes."""
+
+    mass: Array
+    friction: Array
+    hold: Array
+    gain: Array
+    reference: Array
+
+
+class _Plan(NamedTuple):
+    """Properties of B episodes before their constraints are sampled, apart from those of `Draw`."""
+
+    uniform: Mapping[str, Array]
+    """Random numbers of `_uniforms`."""
+    sensors: SensorParameters
+    requested: Mapping[str, Array]
+    """(B,) bool for each optional constraint by name: True if requested."""
+    stationary: Array | bool
+    approach: Approach
+
+
+def _requested(
+    task: TaskConfig, uniform: Mapping[str, Array], joined_number: Array
+) -> dict[str, Array]:
+    """Draws the requested constraints (B,) of episodes in training, by name.
+
+    A constraint that is never requested is a constant, so that its share of the program is not even
+    compiled.
+    """
+    requested = {}
+    for constraint in optional(task):
+        share = getattr(task, f"p_{constraint.name}")
+        if share:
+            requested[constraint.name] = uniform[constraint.name][:, 0] < share
+        else:
+            requested[constraint.name] = jnp.zeros(len(joined_number), bool)
+    active = active_blocks(requested)
+    for constraint in optional(task):
+        joined = constraint.joined(task, active, joined_number)
+        if joined is not None:
+            requested[constraint.name] |= joined
+    return requested
 
 
 def _uniforms(hand: Hand, task: TaskConfig, key: Array, batch: int) -> dict[str, Array]:
@@ -134,8 +208,13 @@ def _uniforms(hand: Hand, task: TaskConfig, key: Array, batch: int) -> dict[str,
     A constraint has two before those of `Constraint.sample`: whether it is requested, and its
     reference.
     """
-    numbers = {c.name: 2 + c.numbers(hand, task) for c in known(task)}
-    return chance.uniforms(key, {_TRAINING: 8, _EPISODE: 5, **numbers}, batch)
+    counts = {
+        _TRAINING: len(_TrainingNumbers._fields),
+        _EPISODE: len(_EpisodeNumbers._fields),
+    }
+    for constraint in known(task):
+        counts[constraint.name] = 2 + constraint.numbers(hand, task)
+    return chance.uniforms(key, counts, batch)
 
 
 def _varied(task: TaskConfig, distance: Array, margin: Array, speed: Array) -> Approach:
@@ -146,7 +225,9 @@ def _varied(task: TaskConfig, distance: Array, margin: Array, speed: Array) -> A
     narrow, wide = task.preshape_margin
     back_off = near + (far - near) * distance
     return Approach(
-        back_off, narrow + (wide - narrow) * margin, speed * task.initial_speed * back_off / far
+        back_off=back_off,
+        margin=narrow + (wide - narrow) * margin,
+        speed=speed * task.initial_speed * back_off / far,
     )
 
 
@@ -190,20 +271,17 @@ def planned(
     """
 
     def one(episode: PlannedEpisodes) -> InitialConditions:
-        own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
+        episode_key = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
-        wanted = {name: jnp.reshape(flag, 1) for name, flag in asked.items()}
-        sensors = draw_sensors(task.sensing, task.control_dt, own, 1)
-        return _drawn(
-            hand,
-            task,
-            draw,
-            _uniforms(hand, task, own, 1),
-            sensors,
-            wanted,
-            False,
-            _nominal(task, 1),
+        sensors = get_sensor(task).draw(task.sensing, task.control_dt, episode_key, 1)
+        plan = _Plan(
+            uniform=_uniforms(hand, task, episode_key, 1),
+            sensors=sensors,
+            requested={name: jnp.reshape(flag, 1) for name, flag in asked.items()},
+            stationary=False,
+            approach=_nominal(task, 1),
         )
+        return _drawn(hand, task, draw, plan)
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
 
@@ -213,82 +291,86 @@ def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> 
     together.
     """
     objects, rests = (jnp.asarray(axis.ravel()) for axis in np.indices(bank.has_affordance.shape))
-    wanted = {c.name: jnp.full(objects.shape, c.name in asked) for c in optional(task)}
-    draw, found = _available(task, Draw(bank, objects, rests), wanted)
-    fine = jnp.ones(objects.shape, bool)
-    for name, wish in wanted.items():
-        fine &= found[name] == wish
+    requested = {c.name: jnp.full(objects.shape, c.name in asked) for c in optional(task)}
+    draw, available = _available(task, Draw(bank, objects, rests), requested)
+    is_possible = jnp.ones(objects.shape, bool)
+    for name, is_requested in requested.items():
+        is_possible &= available[name] == is_requested
     if task.aligned_references:
-        fine &= jnp.any(_allowed_together(task, draw, wanted), -1)
-    return np.asarray(fine).reshape(bank.has_affordance.shape)
+        is_possible &= jnp.any(_allowed_together(task, draw, requested), -1)
+    return np.asarray(is_possible).reshape(bank.has_affordance.shape)
 
 
 def _available(
-    task: TaskConfig, draw: Draw, wanted: Mapping[str, Array]
+    task: TaskConfig, draw: Draw, requested: Mapping[str, Array]
 ) -> tuple[Draw, dict[str, Array]]:
-    """Returns the draw with its region, and the available ones of the wanted constraints (B,), in
-    order.
+    """Returns the draw with its region, and the available ones of the requested constraints (B,),
+    in order.
     """
-    asked, draw = {}, draw._replace(region=jnp.zeros_like(draw.objects))
+    available = {}
+    draw = draw._replace(region=jnp.zeros_like(draw.objects))
     for constraint in optional(task):
-        asked[constraint.name] = wanted[constraint.name] & constraint.available(draw)
-        draw = draw._replace(
-            region=jnp.maximum(draw.region, constraint.region * asked[constraint.name])
-        )
-    return draw, asked
+        flags = requested[constraint.name] & constraint.available(draw)
+        available[constraint.name] = flags
+        draw = draw._replace(region=jnp.maximum(draw.region, constraint.region * flags))
+    return draw, available
 
 
-def _drawn(  # noqa: PLR0913
-    hand: Hand,
-    task: TaskConfig,
-    draw: Draw,
-    uniform: Mapping[str, Array],
-    sensors: Sensors,
-    wanted: Mapping[str, Array],
-    stationary: Array | bool,
-    approach: Approach,
-) -> InitialConditions:
-    """Draws the rest of B episodes with given objects, resting poses, sensors and (where available)
-    constraints.
-
-    `uniform` are numbers of `_uniforms`.
+def _drawn(hand: Hand, task: TaskConfig, draw: Draw, plan: _Plan) -> InitialConditions:
+    """Draws the rest of B episodes with the objects and resting poses of a draw, and the available
+    ones of the requested constraints.
     """
-    bank, batch = draw.bank, draw.objects.shape
-    mass, friction, length, gain, common = uniform[_EPISODE].T
-    low, high = task.mass_range
-    friction_low, friction_high = task.friction_range
-    mass = low + (high - low) * mass
-    friction = friction_low + (friction_high - friction_low) * friction
-    draw, asked = _available(task, draw, wanted)
-    draw = draw._replace(mass=bank.mass[draw.objects] * mass, friction=friction)
-    draw = draw._replace(reference=_references(task, draw, asked, uniform, common))
-    values = {c.name: c.sample(hand, draw, uniform[c.name][:, 2:]) for c in known(task)}
-    surface = surface_of(task, bank, draw.objects)
-    goal = resolve(hand, surface, Goal(values, {}), asked).goal
-    gain_low, gain_high = task.gain_range
-    reset_state = start(
-        hand,
-        task,
-        goal,
-        surface,
-        bank.rest[draw.objects, draw.rests],
-        approach,
-        objects=draw.objects,
-        mass_scale=mass,
-        friction=friction,
-        gain_scale=gain_low + (gain_high - gain_low) * gain,
-        stationary=jnp.broadcast_to(stationary, batch),
+    bank = draw.bank
+    uniform = plan.uniform
+    numbers = _EpisodeNumbers(*uniform[_EPISODE].T)
+    dynamics = Dynamics(
+        object_index=draw.objects,
+        mass_scale=_within(task.mass_range, numbers.mass),
+        friction=_within(task.friction_range, numbers.friction),
+        gain_scale=_within(task.gain_range, numbers.gain),
+        stationary=jnp.broadcast_to(plan.stationary, draw.objects.shape),
     )
+    draw, available = _available(task, draw, plan.requested)
+    mass = bank.mass[draw.objects] * dynamics.mass_scale
+    draw = draw._replace(mass=mass, friction=dynamics.friction)
+    references = _references(task, draw, available, uniform, numbers.reference)
+    draw = draw._replace(reference=references)
+    values = {}
+    for constraint in known(task):
+        own_numbers = uniform[constraint.name][:, 2:]
+        values[constraint.name] = constraint.sample(hand, draw, own_numbers)
+    surface = surface_of(task, bank, draw.objects)
+    goal = resolve(hand, surface, Goal(values, {}), available).goal
+    rest = bank.rest[draw.objects, draw.rests]
+    placed = initial_hand(hand, task, goal, surface, rest, plan.approach)
+    return InitialConditions(
+        reset_state=_reset_state(goal, rest, placed, plan.approach, dynamics),
+        goal=goal,
+        surface=surface,
+        region=draw.region,
+        hold=_hold(task, numbers.hold),
+        sensors=plan.sensors,
+    )
+
+
+def _within(limits: tuple[float, float], number: Array) -> Array:
+    """Numbers (B,) in [0, 1) scaled to a range."""
+    low, high = limits
+    return low + (high - low) * number
+
+
+def _hold(task: TaskConfig, number: Array) -> Array:
+    """Control steps (B,) without the table, by random numbers (B,) in [0, 1)."""
+    choices = task.hold_steps_max - task.hold_steps + 1
     # Squared, so that short holds, whose beginning every episode shares, remain the most common.
-    longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
-    hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
-    return InitialConditions(reset_state, goal, surface, draw.region, hold, sensors)
+    longer = jnp.floor(number**2 * choices).astype(jnp.int32)
+    return jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
 
 
 def _references(
     task: TaskConfig,
     draw: Draw,
-    asked: Mapping[str, Array],
+    available: Mapping[str, Array],
     uniform: Mapping[str, Array],
     common: Array,
 ) -> dict[str, Array]:
@@ -298,13 +380,16 @@ def _references(
     `aligned_references`, all use one that every requested constraint allows, by the random numbers
     `common` (B,); where there is none, each draws independently.
     """
-    together = _allowed_together(task, draw, asked)
-    found = {}
-    for name, own in _allowed(task, draw).items():
+    together = _allowed_together(task, draw, available)
+    is_any_together = jnp.any(together, -1, keepdims=True)
+    references = {}
+    for name, allowed in _allowed(task, draw).items():
         if task.aligned_references:
-            own = jnp.where(jnp.any(together, -1, keepdims=True), together, own)
-        found[name] = chance.among(common if task.aligned_references else uniform[name][:, 1], own)
-    return found
+            allowed = jnp.where(is_any_together, together, allowed)
+            references[name] = chance.among(common, allowed)
+        else:
+            references[name] = chance.among(uniform[name][:, 1], allowed)
+    return references
 
 
 def _allowed(task: TaskConfig, draw: Draw) -> dict[str, Array]:
@@ -312,11 +397,11 @@ def _allowed(task: TaskConfig, draw: Draw) -> dict[str, Array]:
     return {c.name: c.allowed(draw) for c in optional(task) if c.from_reference}
 
 
-def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) -> Array:
+def _allowed_together(task: TaskConfig, draw: Draw, requested: Mapping[str, Array]) -> Array:
     """(B, M) bool: references allowed by every requested constraint."""
     together = jnp.ones_like(draw.allowed)
-    for name, own in _allowed(task, draw).items():
-        together &= own | ~asked[name][:, None]
+    for name, allowed in _allowed(task, draw).items():
+        together &= allowed | ~requested[name][:, None]
     return together
 
 
@@ -331,7 +416,7 @@ def handover_speed(hand: Hand, task: TaskConfig) -> float:
     return float(0.9 * task.control.approach_position_limit * stiffness / damping)
 
 
-def given(
+def requested_conditions(
     hand: Hand,
     task: TaskConfig,
     request: RequestedEpisodes,
@@ -351,62 +436,53 @@ def given(
       speed: initial speed of the wrist along the heading, m/s.
     """
     resolution = resolve(hand, request.surface, request.goal, request.asked)
+    goal = resolution.goal
     batch = request.rest.shape[0]
-    nominal, index = jnp.ones(batch), jnp.zeros(batch, jnp.int32)
-    reset_state = start(
-        hand,
-        task,
-        resolution.goal,
-        request.surface,
-        request.rest,
-        _nominal(task, batch)._replace(speed=jnp.full(batch, speed)),
-        objects=index,
+    nominal = jnp.ones(batch)
+    index = jnp.zeros(batch, jnp.int32)
+    dynamics = Dynamics(
+        object_index=index,
         mass_scale=nominal,
         friction=nominal,
         gain_scale=nominal,
         stationary=jnp.zeros(batch, bool),
     )
-    holds = jnp.full(batch, hold, jnp.int32)
-    sensors = draw_sensors(SensingConfig(), task.control_dt, jax.random.key(0), batch)
-    return InitialConditions(
-        reset_state, resolution.goal, request.surface, index, holds, sensors
-    ), resolution
+    approach = _nominal(task, batch)._replace(speed=jnp.full(batch, speed))
+    placed = initial_hand(hand, task, goal, request.surface, request.rest, approach)
+    sensors = get_sensor(task).draw(SensingConfig(), task.control_dt, jax.random.key(0), batch)
+    conditions = InitialConditions(
+        reset_state=_reset_state(goal, request.rest, placed, approach, dynamics),
+        goal=goal,
+        surface=request.surface,
+        region=index,
+        hold=jnp.full(batch, hold, jnp.int32),
+        sensors=sensors,
+    )
+    return conditions, resolution
 
 
-def start(  # noqa: PLR0913
-    hand: Hand,
-    task: TaskConfig,
-    goal: Goal,
-    surface: Surface,
-    rest: Array,
-    approach: Approach,
-    *,
-    objects: Array,
-    mass_scale: Array,
-    friction: Array,
-    gain_scale: Array,
-    stationary: Array,
+def _reset_state(
+    goal: Goal, rest: Array, placed: PlacedHand, approach: Approach, dynamics: Dynamics
 ) -> ResetState:
-    """Returns initial conditions with the hand where its constraints place it, for objects in
+    """Returns the initial states of placed hands that approach along the heading, for objects in
     resting poses (B, 7).
     """
-    q, base_position, base_quaternion = initial_hand(hand, task, goal, surface, rest, approach)
     along = rotations.rotate(rest[:, 3:], goal["heading"].direction)
     velocity = rotations.rotate(
-        rotations.conjugate(base_quaternion), approach.speed[:, None] * along
+        rotations.conjugate(placed.quaternion), approach.speed[:, None] * along
     )
     return ResetState(
-        object_index=objects,
-        mass_scale=mass_scale,
-        friction=friction,
-        gain_scale=gain_scale,
-        base_position=base_position,
-        base_quaternion=base_quaternion,
+        object_index=dynamics.object_index,
+        mass_scale=dynamics.mass_scale,
+        friction=dynamics.friction,
+        gain_scale=dynamics.gain_scale,
+        base_position=placed.position,
+        base_quaternion=placed.quaternion,
         u_velocity=jnp.pad(velocity, ((0, 0), (0, 3))),
-        q=q,
+        q=placed.q,
         object_position=rest[:, :3],
         object_quaternion=rest[:, 3:],
-        stationary=stationary,
+        stationary=dynamics.stationary,
     )
 
 
@@ -417,9 +493,8 @@ def initial_hand(
     surface: Surface,
     rest: Array,
     approach: Approach | None = None,
-) -> tuple[Array, Array, Array]:
-    """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the
-    constraints.
+) -> PlacedHand:
+    """Initial hands, determined by the constraints.
 
     With `TaskConfig.preshape` the fingers are opened to the object's width at the heading, unless a
     constraint sets them. A hand that would be in the table is raised.
@@ -436,26 +511,25 @@ def initial_hand(
     q = jnp.broadcast_to(jnp.array(hand.q_open), (rest.shape[0], len(hand.joints)))
     if task.preshape:
         heading = Headings(*(axis[:, None] for axis in goal["heading"]))
-        q = preshape(hand, local_width(heading, surface.points)[:, 0], approach.margin)
+        width = local_width(heading, surface.points)[:, 0]
+        q = preshape(hand, width, approach.margin)
     for constraint in known(task):
-        if (fingers := constraint.initial_fingers(goal)) is not None:
-            q = jnp.where(fingers[0][:, None], fingers[1], q)
-    position, quaternion = jnp.zeros_like(rest[:, :3]), jnp.zeros_like(rest[:, 3:])
+        fingers = constraint.initial_fingers(goal)
+        if fingers is not None:
+            is_set, angles = fingers
+            q = jnp.where(is_set[:, None], angles, q)
+    position = jnp.zeros_like(rest[:, :3])
+    quaternion = jnp.zeros_like(rest[:, 3:])
     for constraint in known(task):
-        if (wrist := constraint.initial_wrist(hand, approach.back_off, goal, q)) is not None:
-            where = wrist[0][:, None]
-            position, quaternion = (
-                jnp.where(where, wrist[1], position),
-                jnp.where(where, wrist[2], quaternion),
-            )
+        wrist = constraint.initial_wrist(hand, approach.back_off, goal, q)
+        if wrist is not None:
+            is_set, wrist_position, wrist_quaternion = wrist
+            position = jnp.where(is_set[:, None], wrist_position, position)
+            quaternion = jnp.where(is_set[:, None], wrist_quaternion, quaternion)
     position, quaternion = rotations.compose_pose(rest[:, :3], rest[:, 3:], position, quaternion)
-    return (
-        q,
-        position.at[:, 2].add(
-            jnp.maximum(_CLEARANCE - _lowest(hand, q, position, quaternion), 0.0)
-        ),
-        quaternion,
-    )
+    missing = _CLEARANCE - _lowest(hand, q, position, quaternion)
+    position = position.at[:, 2].add(jnp.maximum(missing, 0.0))
+    return PlacedHand(q, position, quaternion)
 
 
 def _lowest(hand: Hand, q: Array, position: Array, quaternion: Array) -> Array:

@@ -14,13 +14,15 @@ import numpy as np
 
 from congrasp.actors import initial
 from congrasp.actors import stress as protocols
-from congrasp.actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
+from congrasp.actors.env import GraspEnv
+from congrasp.actors.env_state import EnvState, Settings, Transition
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.stress import Frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import metrics
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.observation import observe
 from congrasp.common.task.privileged import observe_for_teacher
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -34,10 +36,13 @@ Probe = Callable[[Scene, Array, Any], Any]
 arrays to record for every environment and step."""
 Traced = Literal["first", "all", "none"]
 """Environments whose steps are recorded (`Trace`)."""
-_RENEWALS, _LEAST_TOGETHER = 64, 8
-"""A batch of new episodes is this fraction of the environments, and at least so many: about three
-times as many as end in a control step."""
-_WHICH: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
+_RENEWED_FRACTION = 64
+"""A batch of new episodes is the environments over this number: about three times as many as end in
+a control step.
+"""
+_LEAST_RENEWED = 8
+"""Least number of episodes in a batch of new ones."""
+_TRACED_ROWS: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
 
 
 def no_probe(scene: Scene, index: Array, data: Any) -> None:
@@ -84,7 +89,9 @@ class Rollout(NamedTuple):
     terminal: Array
     """(T, B) bool: the episode ended with this step."""
     truncated: Array
-    """(T, B) bool: it ended by its time limit with the object held (`actors.env.Transition`)."""
+    """(T, B) bool: it ended by its time limit with the object held
+    (`actors.env_state.Transition`).
+    """
     occupancy: Array
     """(T, 3), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
@@ -154,9 +161,13 @@ class Programs:
           engine: an engine that JAX can trace; None for one that is stepped between the functions.
         """
         self.env = GraspEnv(hand, task, engine)
-        self._engine, self._policy, self._probe = engine, policy, probe
-        self._batch, self._traced, self._taught = batch, _WHICH[traced], taught
-        self._together = min(batch, max(_LEAST_TOGETHER, batch // _RENEWALS))
+        self._engine = engine
+        self._policy = policy
+        self._probe = probe
+        self._batch = batch
+        self._traced = _TRACED_ROWS[traced]
+        self._taught = taught
+        self._together = min(batch, max(_LEAST_RENEWED, batch // _RENEWED_FRACTION))
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self.sample = jax.jit(self._sample)
         self.begin = jax.jit(self._begin)
@@ -172,24 +183,22 @@ class Programs:
         """Draws initial conditions for all environments from the bank."""
         return initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
 
-    def _begin(self, conditions: InitialConditions, kept: EnvState | None) -> EnvState:
+    def _begin(self, conditions: InitialConditions, running: EnvState | None) -> EnvState:
         """Starts episodes in every environment; a compiled engine is started or, if it runs
         already, reset.
         """
         if self._engine is None:
             return self.env.state_of(conditions, None)
-        if kept is None:
+        if running is None:
             return self.env.reset(conditions)
-        physics = self._engine.reset(
-            kept.physics, jnp.ones(self._batch, bool), conditions.reset_state
-        )
-        return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
+        every = jnp.ones(self._batch, bool)
+        physics = self._engine.reset(running.physics, every, conditions.reset_state)
+        return self.env.state_of(conditions, physics)._replace(grasps=running.grasps)
 
     def _restart(self, state: EnvState, mask: Array, conditions: InitialConditions) -> EnvState:
         """Starts these episodes in the masked environments (B,); see `GraspEnv.restart`."""
-        return self.env.restart(
-            state, jnp.where(mask, jnp.arange(self._batch), self._batch), conditions
-        )
+        rows = jnp.where(mask, jnp.arange(self._batch), self._batch)
+        return self.env.restart(state, rows, conditions)
 
     def _renew(
         self, bank: ConstraintBank, state: EnvState, key: Array, stationary: Array, ended: Array
@@ -198,7 +207,8 @@ class Programs:
         time.
         """
 
-        def some(carry: tuple[EnvState, Array]) -> tuple[EnvState, Array]:
+        def renew_some(carry: tuple[EnvState, Array]) -> tuple[EnvState, Array]:
+            """Draws a batch of the episodes that are left; returns which are left then."""
             state, left = carry
             rows = jnp.nonzero(left, size=self._together, fill_value=self._batch)[0]
             fresh = initial.sample(
@@ -206,20 +216,26 @@ class Programs:
             )
             return self.env.restart(state, rows, fresh), left.at[rows].set(False, mode="drop")
 
-        return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (state, ended))[0]
+        def is_any_left(carry: tuple[EnvState, Array]) -> Array:
+            _, left = carry
+            return jnp.any(left)
+
+        state, _ = jax.lax.while_loop(is_any_left, renew_some, (state, ended))
+        return state
 
     def _look(self, state: EnvState, settings: Settings) -> _Seen:
         """Returns the observations of the current control step."""
-        observation = observe(self.env.seen(state)).astype(self._dtype)
-        everything = None
+        env = self.env
+        observation = observe(env.seen(state)).astype(self._dtype)
+        for_teacher = None
         if self._taught:
-            given = self.env.privileged(state), self.env.seen(state), settings.control
-            everything = observe_for_teacher(*given).astype(self._dtype)
-        masses = settings.masses
-        inputs = (
-            None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
-        )
-        return _Seen(observation, everything, inputs)
+            true = env.privileged(state)
+            for_teacher = observe_for_teacher(true, env.seen(state), settings.control)
+            for_teacher = for_teacher.astype(self._dtype)
+        for_critic = None
+        if settings.masses is not None:
+            for_critic = env.critic_inputs(state, settings.masses).astype(self._dtype)
+        return _Seen(observation, for_teacher, for_critic)
 
     def _decide(
         self, parameters: Any, settings: Settings, state: EnvState, key: Array
@@ -232,7 +248,7 @@ class Programs:
         target, command = self.env.targets(state, action, settings)
         return _Decision(seen, action, log_probability, target, command)
 
-    def _kept(
+    def _recorded(
         self, state: EnvState, action: Array, transition: Transition, settings: Settings
     ) -> tuple[Trace, Any]:
         """Returns the recorded values of trace and probe of a step."""
@@ -256,13 +272,13 @@ class Programs:
         call has a cost.
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
-        kept = self._kept(after, decision.action, transition, settings)
+        recorded = self._recorded(after, decision.action, transition, settings)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(key_data))
-        changed = {
-            name: new for name, new in after._asdict().items() if new is not getattr(state, name)
-        }
-        changed.pop("views")
-        return changed, transition, kept, following
+        changed = {}
+        for name, value in after._asdict().items():
+            if name != "views" and value is not getattr(state, name):
+                changed[name] = value
+        return changed, transition, recorded, following
 
     def _scan(
         self,
@@ -278,9 +294,9 @@ class Programs:
 
         def renew(operand: Any) -> Any:
             state, episode_key, terminal = operand
-            episode_key, own = jax.random.split(episode_key)
+            episode_key, drawn_key = jax.random.split(episode_key)
             assert bank is not None
-            return self._renew(bank, state, own, stationary, terminal), episode_key
+            return self._renew(bank, state, drawn_key, stationary, terminal), episode_key
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry
@@ -289,12 +305,12 @@ class Programs:
                 parameters, seen.observation.astype(jnp.float32), step_key
             )
             state, transition = self.env.step(state, action, settings)
-            kept = self._kept(state, action, transition, settings)
+            recorded = self._recorded(state, action, transition, settings)
             carry = state, episode_key
             if bank is not None:
                 ended = jnp.any(transition.terminal)
                 carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
-            return carry, (row_of(seen, action, log_probability, transition), kept)
+            return carry, (row_of(seen, action, log_probability, transition), recorded)
 
         carry, (columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         state, _ = carry
@@ -358,15 +374,16 @@ def _traced(
     scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice
 ) -> Trace:
     """Recorded values of a step for one environment, or for several."""
-    state, features = scene.state, scene.features
-    force = jnp.sum(
-        jnp.where(state.contact_found[where][..., None], state.contact_force[where], 0.0), -2
-    )
-    errors = [
-        a[where] / jnp.maximum(b[where], 1.0)
-        for a, b in (transition.errors[s.name] for s in metrics.specs(scene.task))
-    ]
-    way, slid = protocols.up(frame.height), protocols.slides(state.base_quaternion, frame.height)
+    state = scene.state
+    features = scene.features
+    found = state.contact_found[where][..., None]
+    force = jnp.sum(jnp.where(found, state.contact_force[where], 0.0), -2)
+    errors = []
+    for spec in metrics.specs(scene.task):
+        numerator, denominator = transition.errors[spec.name]
+        errors.append(numerator[where] / jnp.maximum(denominator[where], 1.0))
+    way = protocols.up(frame.height)
+    slid = protocols.slides(state.base_quaternion, frame.height)
     return Trace(
         q=state.q[where],
         u=(state.u + slid)[where],
@@ -386,6 +403,6 @@ def _traced(
 
 
 def finished_episodes(rollout: Rollout, task: TaskConfig) -> dict[str, np.ndarray]:
-    """Metrics (E,) of the E finished episodes, by the names in `actors.env.episode_fields`."""
+    """Metrics (E,) of the E finished episodes, by name (`common.task.metrics.episode_fields`)."""
     rows = np.asarray(rollout.episodes)[np.asarray(rollout.has_episode)]
     return dict(zip(episode_fields(task), rows.T, strict=True))

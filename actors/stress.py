@@ -8,7 +8,6 @@ episode is otherwise unchanged.
 
 import itertools
 import math
-import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,16 +25,20 @@ from congrasp.common.task.plausibility import Sample
 from congrasp.common.task.settings import GRAVITY
 from congrasp.common.task.types import Array
 
-LIFT_HEIGHT, LIFT_SPEED, LIFT_ACCELERATION = 0.15, 0.3, 3.0
-"""Height (m), speed (m/s) and acceleration (m/s^2) of the lift."""
+LIFT_HEIGHT = 0.15
+"""Height of the lift, m."""
+LIFT_SPEED = 0.3
+"""Largest speed of the lift, m/s."""
+LIFT_ACCELERATION = 3.0
+"""Acceleration of the lift, m/s^2."""
 PUSH_SECONDS = 0.25
 """Duration of each push, s."""
 PUSH_FORCE = 1.0
 """Force of the second six pushes, N; that of the first six is half of the object's weight."""
-FARTHEST, MOST_TURNED = 0.05, float(np.radians(15.0))
-"""Greatest change of the object's pose in the wrist frame for survival, m and rad (as in
-DexGraspBench).
-"""
+FARTHEST = 0.05
+"""Largest displacement of the object in the wrist frame for survival, m (as in DexGraspBench)."""
+MOST_TURNED = float(np.radians(15.0))
+"""Largest rotation of the object in the wrist frame for survival, rad (likewise)."""
 SURVIVAL = ("lift_survival", "push_survival_weight", "push_survival")
 """Names of the survived parts."""
 ASSESSED = (*plausibility.MEASURES, "clean", *SURVIVAL)
@@ -134,8 +137,13 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
         pull = jnp.where(speeds_up, LIFT_ACCELERATION, jnp.zeros_like(seconds))
         return Frame(way, LIFT_ACCELERATION * speeding, pull)
 
-    begun, ended = ramp(since), ramp(since - protocol.lift_height / LIFT_SPEED)
-    return Frame(*(first - second for first, second in zip(begun, ended, strict=True)))
+    ramped = ramp(since)
+    delayed = ramp(since - protocol.lift_height / LIFT_SPEED)
+    return Frame(
+        height=ramped.height - delayed.height,
+        speed=ramped.speed - delayed.speed,
+        acceleration=ramped.acceleration - delayed.acceleration,
+    )
 
 
 def push(
@@ -151,9 +159,8 @@ def push(
       index: (B,) int, indices of the objects.
       mass_scale: (B,) factors on their masses.
     """
-    number = jnp.floor(
-        (time - task.approach_steps - protocol.push_start) / push_steps(task)
-    ).astype(jnp.int32)
+    since = time - task.approach_steps - protocol.push_start
+    number = jnp.floor(since / push_steps(task)).astype(jnp.int32)
     weight = GRAVITY * jnp.asarray(protocol.masses)[index] * mass_scale
     newtons = jnp.where(number < len(_DIRECTIONS), 0.5 * weight, PUSH_FORCE)
     newtons = jnp.where((number >= 0) & (number < 2 * len(_DIRECTIONS)), newtons, 0.0)
@@ -168,7 +175,8 @@ def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> Physic
       base_quaternion: (B, 4) orientation of the wrist's base, along whose axes the slides move.
       frame: the carried frame.
     """
-    way, speed = up(frame.height), up(frame.speed)
+    way = up(frame.height)
+    speed = up(frame.speed)
     return state._replace(
         u=state.u - slides(base_quaternion, frame.height),
         u_velocity=state.u_velocity - slides(base_quaternion, frame.speed),
@@ -222,14 +230,12 @@ def assess(
       is defined for a hold of two seconds; and those of `survival`, NaN without `stress`.
     """
     end = task.approach_steps + hold
-    until, after = (
-        jax.tree.map(operator.itemgetter(part), samples)
-        for part in (slice(end), slice(end - 1, None))
-    )
-    found = plausibility.measures(until, task.control_dt)
+    until_end = jax.tree.map(lambda array: array[:end], samples)
+    after = jax.tree.map(lambda array: array[end - 1 :], samples)
+    measures = plausibility.measures(until_end, task.control_dt)
     survived = survival(after.object_position, after.object_quaternion, held, task, height)
-    found |= {"clean": plausibility.is_clean(held, found), **survived}
-    return {name: np.asarray(value, np.float32) for name, value in found.items()}
+    results = {**measures, "clean": plausibility.is_clean(held, measures), **survived}
+    return {name: np.asarray(value, np.float32) for name, value in results.items()}
 
 
 def survival(
@@ -258,14 +264,15 @@ def survival(
     """
     six = len(_DIRECTIONS) * push_steps(task)
     ends = np.cumsum([0, lift_steps(task, height), six, six])
-    kept = [np.asarray(held, bool)]
-    for first, last in itertools.pairwise(ends):
-        position, quaternion = (
-            object_position[first : last + 1],
-            object_quaternion[first : last + 1],
-        )
+    is_simulated = len(object_position) > ends[-1]
+    survived = np.asarray(held, bool)
+    results = {}
+    for name, (first, last) in zip(SURVIVAL, itertools.pairwise(ends), strict=True):
+        position = object_position[first : last + 1]
+        quaternion = object_quaternion[first : last + 1]
         way = np.linalg.norm(position - position[:1], axis=-1)
-        turn = 2 * np.arccos(np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0))
-        kept.append(kept[-1] & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0))
-    simulated = 1.0 if len(object_position) > ends[-1] else np.nan
-    return {name: simulated * survived for name, survived in zip(SURVIVAL, kept[1:], strict=True)}
+        cosine = np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0)
+        turn = 2 * np.arccos(cosine)
+        survived = survived & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0)
+        results[name] = (1.0 if is_simulated else np.nan) * survived
+    return results

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from congrasp.actors import harvest
-from congrasp.actors.env import EnvState
+from congrasp.actors.env_state import EnvState
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics
@@ -79,10 +79,15 @@ class RolloutWorker:
             traced=traced,
             taught=taught,
         )
-        self.physics, self.env, self.batch = physics, self.programs.env, batch
-        self._hand, self._task, self._staggered = hand, task, staggered
+        self.physics = physics
+        self.env = self.programs.env
+        self.batch = batch
+        self._hand = hand
+        self._task = task
+        self._staggered = staggered
         self._bank: ConstraintBank | None = None
-        self._settings, self._stationary = self.env.settings, np.array(False)
+        self._settings = self.env.settings
+        self._stationary = np.array(False)
         if privileged:
             self.adjust(masses=_masses(privileged))
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
@@ -105,16 +110,15 @@ class RolloutWorker:
         """Sets the reward weights, and whether the objects of episodes that start from now on are
         fixed.
         """
-        self._settings, self._stationary = (
-            self._settings._replace(weights=weights),
-            np.array(stationary),
-        )
+        self._settings = self._settings._replace(weights=weights)
+        self._stationary = np.array(stationary)
 
     def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
         """Replaces the objects by as many others, with their bank, for episodes that start from now
         on.
         """
-        physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
+        running = self.state.physics if self.state else None
+        physics = self.physics.replace_objects(running, objects)
         self._bank = _on_device(bank)
         if self._settings.masses is not None:
             self.adjust(masses=_masses(objects))
@@ -127,12 +131,12 @@ class RolloutWorker:
         self._episode_key, key = _split(self._episode_key)
         if self.physics.compiled:
             conditions = self.programs.sample(self._bank, key, self._stationary)
-            return self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
+            self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
+            return
         # By the program that replaces finished episodes: another one would take as long to compile.
         state = (self.state or self._blank(key))._replace(views=None)
-        state = self.programs.renew(
-            self._bank, state, key, self._stationary, _on_device(np.ones(self.batch, bool))
-        )
+        every = _on_device(np.ones(self.batch, bool))
+        state = self.programs.renew(self._bank, state, key, self._stationary, every)
         self._place(state._replace(hold=self._staggered_hold(state.hold, key)))
 
     def _blank(self, key: Array) -> EnvState:
@@ -142,16 +146,15 @@ class RolloutWorker:
         return jax.tree.map(lambda array: _on_device(np.zeros(array.shape, array.dtype)), form)
 
     def _staggered_hold(self, hold: Array, key: Array) -> Array:
-        """Control steps (B,) without the table of first episodes, which end early at different
-        times if they shall.
+        """Control steps (B,) without the table of first episodes; of a staggered worker they end
+        early at different times.
         """
         if not self._staggered:
             return hold
-        whole = self._task.approach_steps + np.asarray(hold)
-        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(
-            size=whole.shape
-        )
-        return _on_device(np.int32(hold - np.floor(share * whole)))
+        steps = self._task.approach_steps + np.asarray(hold)
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        missing = np.floor(rng.uniform(size=steps.shape) * steps)
+        return _on_device(np.int32(hold - missing))
 
     def begin(self, conditions: InitialConditions) -> None:
         """Starts these episodes, one in each environment."""
@@ -165,14 +168,14 @@ class RolloutWorker:
         """Starts the engine's environments, of an engine that is not compiled, at the beginning of
         these episodes.
         """
-        kept = self.state
-        if kept is None:
+        earlier = self.state
+        if earlier is None:
             self.physics.start(state.reset_state)
         else:
             self.physics.reset(None, np.ones(self.batch, bool), state.reset_state)
         self.state = self.programs.with_scene(state._replace(views=None), self.physics.read(None))
-        if kept is not None:
-            self.state = self.state._replace(grasps=kept.grasps)
+        if earlier is not None:
+            self.state = self.state._replace(grasps=earlier.grasps)
 
     def renew(self, mask: np.ndarray, conditions: InitialConditions) -> None:
         """Starts these episodes in the masked environments (B,)."""
@@ -197,21 +200,24 @@ class RolloutWorker:
           parameters: parameters of the policy, or their shapes.
           steps: number T of steps.
         """
-        key, programs, stationary = self._key, self.programs, self._stationary
+        key = self._key
+        programs = self.programs
+        stationary = self._stationary
         form, parameters = _shapes((form, parameters))
         conditions = _shapes(jax.eval_shape(programs.sample, form, key, stationary))
         state = _shapes(jax.eval_shape(programs.begin, conditions, None))
-        given = parameters, self._settings, stationary, form, (state, key), key
+        scanned = (parameters, self._settings, stationary, form, (state, key), key)
         lowerings: list[Callable[[], jax.stages.Lowered]] = [
-            lambda: programs.scan.lower(*given, steps=steps),
+            lambda: programs.scan.lower(*scanned, steps=steps),
             lambda: programs.sample.lower(form, key, stationary),
             lambda: programs.begin.lower(conditions, None),
             lambda: harvest.renew.lower(self._hand, self._task, form, state.grasps, key),
         ]
         with concurrent.futures.ThreadPoolExecutor(len(lowerings)) as threads:
             # Each is compiled while the next one is lowered, which takes Python's lock.
-            for compiled in [threads.submit(lower().compile) for lower in lowerings]:
-                compiled.result()
+            compilations = [threads.submit(lower().compile) for lower in lowerings]
+            for compilation in compilations:
+                compilation.result()
 
     @property
     def bank(self) -> ConstraintBank:
@@ -260,7 +266,8 @@ class RolloutWorker:
         """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
         # One more key than steps: the decision after the last step only yields `last_observation`.
         # A split does not depend on how many follow it, so that one program serves many lengths.
-        key_data = np.asarray(jax.random.key_data(jax.random.split(key, 1 << steps.bit_length())))
+        count = 1 << steps.bit_length()
+        key_data = np.asarray(jax.random.key_data(jax.random.split(key, count)))
         parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
         decision = self.programs.decide(
@@ -271,13 +278,15 @@ class RolloutWorker:
         extras = []
         for step in range(1, steps + 1):
             _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
-            decided = decision
-            changed, transition, kept, decision = self.programs.advance(
+            changed, transition, recorded, following = self.programs.advance(
                 parameters, settings, state, physics_state, decision, key_data[step]
             )
             state = state._replace(**changed)
-            rows.append(row_of(decided.seen, decided.action, decided.log_probability, transition))
-            extras.append(kept)
+            rows.append(
+                row_of(decision.seen, decision.action, decision.log_probability, transition)
+            )
+            extras.append(recorded)
+            decision = following
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = _split(self._episode_key)
                 state = self.programs.renew(

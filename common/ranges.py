@@ -8,6 +8,7 @@ from typing import Any
 from congrasp.common.config import NetworkConfig
 from congrasp.common.objects.spec import SURFACE_POINTS
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sensors import SENSORS
 
 MAX_SPEED = 400.0
 """A joint speed above this (m/s or rad/s) marks a diverged environment."""
@@ -47,6 +48,8 @@ _LAYERS, _UNITS = 16, 8192
 def task_faults(task: TaskConfig) -> Iterator[str]:
     """Yields the fields of a task that are out of range, one phrase each."""
     yield from _numbers(task)
+    if task.observation not in SENSORS:
+        yield f"observation is '{task.observation[:60]}', not one of {', '.join(SENSORS)}"
     for name, (low, high) in _TASK.items():
         value = getattr(task, name)
         if not low <= value <= high:

@@ -187,7 +187,7 @@ def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState
 
 def scene_of(task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> Scene:
     """A scene with its features, which one program computes."""
-    return Scene(HAND, task, state, _features(task)(state, surface, goal), goal)
+    return Scene(HAND, task, state, _features(task)(state, surface, goal), goal, surface)
 
 
 @functools.cache

@@ -15,9 +15,10 @@ from typing_extensions import Doc
 
 from congrasp.common.task.constraints import CONSTRAINTS, OURS
 from congrasp.common.task.reward import GRASP
+from congrasp.common.task.sensors import SENSORS
 from congrasp.common.task.settings import ControlConfig, SensingConfig, TaskSettings
 
-__all__ = ["ControlConfig", "RewardWeights", "SensingConfig", "TaskConfig"]
+__all__ = ["SENSORS", "ControlConfig", "RewardWeights", "SensingConfig", "TaskConfig"]
 
 _Class = TypeVar("_Class")
 

@@ -13,8 +13,8 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
+from congrasp.common.task.readings import Readings
 from congrasp.common.task.scene import Scene
-from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Contacts, Features, Goal, SceneState, Surface
 
@@ -127,4 +127,4 @@ def scene_of(
 ) -> Scene:
     """Returns one control step as input of the constraints."""
     geometry = features(hand, task, state, surface, goal)
-    return Scene(hand, task, state, geometry, goal, readings)
+    return Scene(hand, task, state, geometry, goal, surface, readings)

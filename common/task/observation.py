@@ -11,8 +11,9 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import Constraint, blocks, known
 from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.geometry import flat, squash
+from congrasp.common.task.readings import Readings
 from congrasp.common.task.scene import Scene
-from congrasp.common.task.sensing import Readings
+from congrasp.common.task.sensors import get_sensor
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
@@ -22,7 +23,7 @@ _POSE_FIELDS = (
     "past object_position",
     "past object_rotation",
 )
-"""Fields that a camera does not provide, because they need the object's pose."""
+"""Fields that need the object's pose, which some sensors do not show (`Sensor.shows_pose`)."""
 
 
 def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:
@@ -37,12 +38,13 @@ def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:
 
 def fields(hand: Hand, task: TaskSettings) -> dict[str, tuple[ObservationField, ...]]:
     """Fields of every block, in order, restricted to those that the task's policy observes."""
+    sensor = get_sensor(task)
     state = _state_fields(hand, task)
-    if task.observation != "full":
+    if not sensor.privileged:
         state += _past_fields(hand, task)
     described = {"state": _observed_fields(task, state)}
-    if task.observation == "camera":
-        described["cloud"] = (_cloud_field(task),)
+    for block, block_fields in sensor.fields(hand, task).items():
+        described[block] = described.get(block, ()) + block_fields
     for constraint in known(task):
         names = constraint.blocks or (constraint.name,)
         for block, block_fields in zip(names, constraint.fields(hand, task), strict=True):
@@ -55,11 +57,12 @@ def observe(scene: Scene) -> Array:
     """Observation (B, D), laid out like `fields`; blocks of inactive constraints are zero."""
     hand = scene.hand
     task = scene.task
+    sensor = get_sensor(task)
     parts = _observed_values(task, _state_values(scene), _state_fields(hand, task))
-    if task.observation != "full":
+    if not sensor.privileged:
         parts += _observed_values(task, _past_values(scene), _past_fields(hand, task))
-    if task.observation == "camera":
-        parts.append(_cloud_values(scene))
+    for values in sensor.observe(scene).values():
+        parts += values
     for constraint in known(task):
         parts += _constraint_values(scene, constraint)
     mask = [scene.gate(block) for block in blocks(task)]
@@ -70,9 +73,10 @@ def observe(scene: Scene) -> Array:
 
 def _is_observed(task: TaskSettings, field: ObservationField) -> bool:
     """True if a field is part of the task's observation."""
-    if task.observation == "camera" and field.name in _POSE_FIELDS:
+    sensor = get_sensor(task)
+    if field.name in _POSE_FIELDS and not sensor.shows_pose:
         return False
-    return task.observation == "full" or not field.privileged
+    return sensor.privileged or not field.privileged
 
 
 def _observed_fields(
@@ -249,31 +253,6 @@ def _past_values(scene: Scene) -> list[Array]:
         flat(rotations.rotate(to_wrist, past.object_position - now.object_position)),
         flat(rotations.rotate(to_wrist, rotation)),
     ]
-
-
-def _cloud_field(task: TaskSettings) -> ObservationField:
-    """Field of the camera's cloud."""
-    return ObservationField(
-        "cloud",
-        4 * task.surface_points,
-        "m, points of the camera's cloud, wrist frame, each with 1 if an active affordance avoids "
-        "it, else 0",
-    )
-
-
-def _cloud_values(scene: Scene) -> Array:
-    """Points of the cloud in the wrist frame, each followed by its label: (B, 4 N)."""
-    assert scene.cloud is not None, "a camera observation needs a cloud"
-    features = scene.features
-    points = rotations.inverse_transform(
-        features.wrist_position, features.wrist_quaternion, scene.cloud.points
-    )
-    labels = jnp.zeros(scene.cloud.avoid.shape)
-    for constraint in known(scene.task):
-        constraint_labels = constraint.cloud_labels(scene)
-        if constraint_labels is not None:
-            labels = jnp.maximum(labels, constraint_labels)
-    return flat(jnp.concatenate([points, labels[..., None]], -1))
 
 
 def _constraint_values(scene: Scene, constraint: Constraint) -> list[Array]:

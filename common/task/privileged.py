@@ -27,7 +27,7 @@ from congrasp.common.task import observation
 from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.control import Guided, guided, wrist_lead
 from congrasp.common.task.scene import Scene
-from congrasp.common.task.sensing import Sensors
+from congrasp.common.task.sensors.parameters import SensorParameters
 from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array
 
@@ -52,8 +52,8 @@ class Parameters(NamedTuple):
     """(B,) bool: the object is fixed."""
     hold: Array
     """(B,) control steps of the hold, without the table."""
-    sensors: Sensors | None
-    """The trackers; None if the policy observes the true poses."""
+    sensors: SensorParameters | None
+    """Parameters of the sensors; None if the policy observes the true state."""
 
 
 def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:

@@ -1,12 +1,14 @@
 """One control step of B environments, as input of observation, reward and errors."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.grip import ObjectLoad
-from congrasp.common.task.sensing import Readings
+from congrasp.common.task.readings import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Features, Goal, SceneState, Surface
 
@@ -19,10 +21,13 @@ class Scene(NamedTuple):
     state: SceneState
     features: Features
     goal: Goal
+    surface: Surface
+    """Points of the object that the features are of: those of its surface, object frame, or of a
+    camera's cloud, world frame."""
     readings: Readings | None = None
     """Last control steps, if the policy observes them."""
-    cloud: Surface | None = None
-    """Cloud of the camera, world frame, if the policy has one."""
+    measured: Mapping[str, Array] = MappingProxyType({})
+    """Further measurements (B, ...) of the policy's sensor (`common.task.sensors.base`)."""
     load: ObjectLoad | None = None
     """Weight and friction of the objects, for the reward; None where they are not recorded."""
 

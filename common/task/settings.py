@@ -7,6 +7,7 @@ import dataclasses
 from typing import Literal, Self
 
 from congrasp.common.hands.spec import CONTACT_TIME
+from congrasp.common.task.sensor_registry import SensorName
 
 GRAVITY = 9.81
 """m/s^2."""
@@ -64,8 +65,8 @@ class ControlConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SensingConfig:
-    """Tracker that measures the object's pose (`common.task.sensing`), or camera that shows its
-    surface (`common.task.camera`): ranges, drawn uniformly at every reset.
+    """Tracker that measures the object's pose (`common.task.sensors.tracker`), or camera that shows
+    its surface (`common.task.sensors.camera`): ranges, drawn uniformly at every reset.
 
     With zeros, the default, either is perfect and measures at every control step.
     """
@@ -212,11 +213,11 @@ class TaskSettings:
     """Sliding friction between hand and object, drawn uniformly at every reset."""
     gain_range: tuple[float, float] = (1.0, 1.0)
     """Factors on the finger servos' gains, drawn uniformly at every reset."""
-    observation: Literal["full", "tracked", "camera"] = "full"
+    observation: SensorName = "full"
     """Observation of the policy: the full state of the simulator, or the sensors of a robot: joint
-    angles and targets, the wrist, and the object's pose from a tracker (`common.task.sensing`) or a
-    partial cloud of its surface from a depth camera (`common.task.camera`); no forces and no
-    velocities, but the last `history` steps."""
+    angles and targets, the wrist, and the object's pose from a tracker
+    (`common.task.sensors.tracker`) or a partial cloud of its surface from a depth camera
+    (`common.task.sensors.camera`); no forces and no velocities, but the last `history` steps."""
     history: int = 8
     """Control steps in a tracked or camera observation, including the current one: 2 to 64."""
     sensing: SensingConfig = SensingConfig()

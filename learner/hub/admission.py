@@ -35,8 +35,9 @@ from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields
 from congrasp.common.task.observation import observe
 from congrasp.common.task.privileged import Parameters, observe_for_teacher
+from congrasp.common.task.readings import Readings
 from congrasp.common.task.reward import reward_terms
-from congrasp.common.task.sensing import Readings, draw_sensors
+from congrasp.common.task.sensors import get_sensor
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.limits import PutOff
@@ -199,7 +200,7 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     hand = get_hand(task.hand)
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         evaluate = jax.jit(functools.partial(_evaluate, hand, task))
-        *observed, terms = jax.device_get(evaluate(*_extremes(hand, task)))
+        *observed, terms = jax.device_get(evaluate(_extremes(hand, task)))
     weights = (
         [task.reward, curriculum.reward]
         if curriculum.ramp[1] > curriculum.ramp[0]
@@ -230,20 +231,25 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     return Ranges(own, reward, _ACTION, episodes, teacher, critic)
 
 
-def _evaluate(
-    hand: Hand,
-    task: TaskConfig,
-    state: SceneState,
-    surface: Surface,
-    goal: Goal,
-    readings: Readings,
-    parameters: Parameters,
-) -> tuple[Any, Any, Any, Any]:
+class _Extremes(NamedTuple):
+    """Random control steps up to the engines' limits."""
+
+    state: SceneState
+    surface: Surface
+    goal: Goal
+    readings: Readings
+    measured: dict[str, Any]
+    """Further measurements of the sensor."""
+    parameters: Parameters
+
+
+def _evaluate(hand: Hand, task: TaskConfig, extremes: _Extremes) -> tuple[Any, Any, Any, Any]:
     """Evaluates observations (B, D), (B, S) of a teacher and (B, P) of the critic, and unweighted
     reward terms.
     """
     full = dataclasses.replace(task, observation="full")
-    scene = scene_of(hand, full, state, surface, goal)
+    scene = scene_of(hand, full, extremes.state, extremes.surface, extremes.goal)
+    parameters = extremes.parameters
     # An object that every contact carries, for the terms that depend on its weight.
     load = ObjectLoad(
         weight=jnp.full(scene.state.time.shape, _FEATHER), friction=parameters.friction
@@ -251,7 +257,7 @@ def _evaluate(
     scene = scene._replace(load=load)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
-    own = scene._replace(task=task, readings=readings, cloud=surface)
+    own = scene._replace(task=task, readings=extremes.readings, measured=extremes.measured)
     return (
         observe(own),
         observe_for_teacher(scene, own, task.control),
@@ -260,9 +266,7 @@ def _evaluate(
     )
 
 
-def _extremes(
-    hand: Hand, task: TaskConfig
-) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:
+def _extremes(hand: Hand, task: TaskConfig) -> _Extremes:
     """Random states up to the engines' limits, with random surfaces and goals in which everything
     is active.
 
@@ -314,17 +318,22 @@ def _extremes(
     others = rng.integers(0, _STATES, (_STATES, task.history))
     others[:, 0] = np.arange(_STATES)
     readings = Readings(*(getattr(state, name)[others] for name in Readings._fields))
+    sensors = None
+    if task.sensed:
+        sensors = get_sensor(task).draw(task.sensing, task.control_dt, jax.random.key(0), _STATES)
     parameters = Parameters(
         mass=rng.uniform(0.0, _MASS, _STATES),
         friction=rng.uniform(*task.friction_range, _STATES),
         gain_scale=rng.uniform(*task.gain_range, _STATES),
         stationary=rng.random(_STATES) < 0.5,
         hold=rng.integers(0, max(task.hold_steps, task.hold_steps_max) + 1, _STATES),
-        sensors=draw_sensors(task.sensing, task.control_dt, jax.random.key(0), _STATES)
-        if task.sensed
-        else None,
+        sensors=sensors,
     )
-    return jax.tree.map(jnp.asarray, (state, surface, goal, readings, parameters))
+    measured = {}
+    for name, shape in get_sensor(task).query(hand, task).items():
+        measured[name] = within(*shape, most=MAX_DISTANCE)
+    extremes = _Extremes(state, surface, goal, readings, measured, parameters)
+    return jax.tree.map(jnp.asarray, extremes)
 
 
 def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:

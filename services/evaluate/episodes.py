@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import stress as protocols
-from congrasp.actors.env import EnvState, View, metric_names
+from congrasp.actors.env_state import EnvState, View
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
@@ -27,6 +27,7 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
+from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Array, Goal
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.plan import two_seconds
@@ -44,8 +45,8 @@ class Sample:
     """Episodes of one row."""
 
     values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for
-    equal episodes; and `reference`, equal for the same object and reference (`identity`,
+    """Metrics (E,), by the names in `common.task.metrics.metric_names`; `mass_kg`; `identity`,
+    equal for equal episodes; and `reference`, equal for the same object and reference (`identity`,
     `reference`)."""
     link_force: np.ndarray
     """(E', W, L) net contact force of each link in the paper's window, N, for the first E'

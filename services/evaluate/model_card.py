@@ -7,6 +7,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.plausibility import CLEAN_MM
+from congrasp.common.task.sensors import get_sensor
 from congrasp.services.evaluate.scores import Row
 
 _LOW_RATE = 0.8
@@ -62,7 +63,7 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
         "hand": policy.spec.hand_name,
         "constraints": task.constraints,
         "data": (_TRAINED_ON, _episodes_in_training(task)),
-        "limits": (*limits(rows), _SIMULATED, _observation(task), _OBJECTS),
+        "limits": (*limits(rows), _SIMULATED, get_sensor(task).describe(task), _OBJECTS),
     }
 
 
@@ -163,20 +164,3 @@ def _range(bounds: tuple[float, float]) -> str:
     """Formats a range such as "0.8 to 1.2"; one number if both are equal."""
     low, high = bounds
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def _observation(task: TaskConfig) -> str:
-    """Describes the observation of the policy."""
-    robot = (
-        f"It observes the last {task.history} control steps of joint angles, the wrist, their "
-        f"targets"
-    )
-    if task.observation == "camera":
-        return (
-            f"{robot}, and a partial cloud of the object from a depth camera; no pose, velocities "
-            f"or contact forces."
-        )
-    if task.observation == "tracked":
-        return f"{robot} and the object's pose from a tracker; no velocities and no contact forces."
-    pose = "exact poses" if task.sensing == SensingConfig() else "the object's pose from a tracker"
-    return f"It observes {pose}, velocities and contact forces."

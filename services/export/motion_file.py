@@ -95,7 +95,7 @@ class GraspMotion:
     constraints: tuple[str, ...]
     """Names of the active constraints, weakest first."""
     metrics: dict[str, float]
-    """Errors, forces and reward of the episode, by the names in `actors.env.metric_names`."""
+    """Errors, forces and reward of the episode, by the names in `common.task.metrics`."""
     about: dict[str, Any]
     """Origin: version of the policy, file of the object, command."""
     time: Annotated[np.ndarray, "(T,) s"]

@@ -24,7 +24,7 @@ from congrasp.common.task import control, observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
 from congrasp.common.task.features import scene_of
-from congrasp.common.task.sensing import seen_by
+from congrasp.common.task.sensors import get_sensor
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.limits import JointLimits
@@ -158,8 +158,9 @@ def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> 
     resolution = resolve(hand, surface, layout.goal(fields), asked)
     state = SceneState(**{name: fields[name] for name in SceneState._fields})
     if (readings := layout.readings(fields)) is not None:
-        state = seen_by(task, state, readings)
-    scene = scene_of(hand, task, state, surface, resolution.goal, readings)._replace(cloud=surface)
+        state = get_sensor(task).seen(task, state, readings)
+    scene = scene_of(hand, task, state, surface, resolution.goal, readings)
+    scene = scene._replace(measured=layout.measured(fields))
     mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
     action = control.decode(scene, task.control, mean)
     notes = jnp.stack([resolution.redirected, resolution.aligned], -1)

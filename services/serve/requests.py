@@ -39,19 +39,18 @@ from congrasp.common.errors import CongraspError, LayoutError
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
-from congrasp.common.task.camera import world
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known, require_known
 from congrasp.common.task.normals import estimated_normals
-from congrasp.common.task.sensing import Readings
+from congrasp.common.task.readings import Readings
+from congrasp.common.task.sensors import get_sensor
+from congrasp.common.task.sensors.base import world_pose
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy import CAMERA, NORMALS, PACKED
 
 STATES_LIMIT = 64
 """Most states in one query."""
-CLOUD = "cloud"
-"""Name of the points of a query to a policy with a camera."""
 _UNIT_TOLERANCE = 0.02
 
 
@@ -97,16 +96,17 @@ class Layout:
             for c in self.known
             for name, value in c.neutral(hand, task)._asdict().items()
         }
-        self.points = CLOUD if task.observation == "camera" else "surface_points"
+        self._sensor = get_sensor(task)
+        self.points = self._sensor.points
         self._state = [
-            n for n in SceneState._fields if not (self.points == CLOUD and n.startswith("object_"))
+            n for n in SceneState._fields if self._sensor.shows_pose or not n.startswith("object_")
         ]
         self.shapes = {
             name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in self._state
         }
         self._past = (
             [f"past_{n}" for n in Readings._fields if n in self._state]
-            if task.observation != "full"
+            if not self._sensor.privileged
             else []
         )
         steps = (task.history - 1,)
@@ -117,7 +117,8 @@ class Layout:
         self.shapes |= {self.points: (points, 3), "surface_avoid": (points,)}
         if task.surface_normals:
             self.shapes[NORMALS] = (points, 3)
-            self.shapes |= {CAMERA: (3,)} if self.points == CLOUD else {}
+        self._measured = self._sensor.query(hand, task)
+        self.shapes |= self._measured
         self.shapes["asked"] = (len(self.known),)
         self.offsets = {}
         self.size = 0
@@ -232,7 +233,7 @@ class Layout:
             default = self._neutral.get(name, np.array((1, 0, 0, 0), np.float32))
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
-        frame, still = world(len(vectors)), jnp.zeros((len(vectors), 3))
+        frame, still = world_pose(len(vectors)), jnp.zeros((len(vectors), 3))
         for name in (
             name for name in SceneState._fields if name not in self._state
         ):  # the object frame is the world's
@@ -282,6 +283,10 @@ class Layout:
             },
             {},
         )
+
+    def measured(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the further measurements (B, ...) of the policy's sensor (`Sensor.query`)."""
+        return {name: fields[name] for name in self._measured}
 
     def readings(self, fields: Mapping[str, Any]) -> Readings | None:
         """Returns the earlier control steps of completed fields, if the policy observes them."""

@@ -68,12 +68,9 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
     )
     away = state.reset_state._replace(object_position=state.reset_state.object_position + 0.2)
     away = state._replace(reset_state=away)
-    elsewhere = state.camera._replace(
-        cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01)
-    )
-    tilted = state.camera._replace(
-        cloud=state.camera.cloud._replace(normals=-state.camera.cloud.normals)
-    )
+    camera = state.sensing.sensor
+    elsewhere = camera._replace(cloud=camera.cloud._replace(points=camera.cloud.points + 0.01))
+    tilted = camera._replace(cloud=camera.cloud._replace(normals=-camera.cloud.normals))
 
     @jax.jit
     def shown(state, physics_state):
@@ -86,15 +83,19 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
     np.testing.assert_array_equal(before, after)
     for one, other in zip(targets, others, strict=True):
         np.testing.assert_array_equal(one, other)
-    for camera, least in ((tilted, 0.1), (elsewhere, 0.009)):
-        changed, _ = shown(state._replace(camera=camera), physics_state)
+    for other, least in ((tilted, 0.1), (elsewhere, 0.009)):
+        sensing = state.sensing._replace(sensor=other)
+        changed, _ = shown(state._replace(sensing=sensing), physics_state)
         assert np.abs(changed - before).max() > least
 
 
 def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     worker, rollout = running
     state, trace = worker.state, rollout.trace
-    points, turn = np.asarray(state.camera.cloud.points), np.asarray(trace.object_quaternion)
+    points, turn = (
+        np.asarray(state.sensing.sensor.cloud.points),
+        np.asarray(trace.object_quaternion),
+    )
     surface = np.asarray(state.surface.points)
     ages = []
     for age in range(5):  # an image is at most 5 control steps old

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.env import GraspEnv, episode_fields, metric_names
+from congrasp.actors.env import GraspEnv
 from congrasp.actors.episode import _geometry
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
@@ -20,6 +20,7 @@ from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, l
 from congrasp.common.objects import procedural
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.geometry import hand_center
+from congrasp.common.task.metrics import episode_fields, metric_names
 from congrasp.common.task.observation import layout
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import task as suite

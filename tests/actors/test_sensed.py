@@ -63,7 +63,7 @@ def late():
 
 def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
     running, rollout = late
-    readings, trace = running.state.readings, rollout.trace
+    readings, trace = running.state.sensing.readings, rollout.trace
     for age in range(TASK.history):
         now = 17 - age
         np.testing.assert_allclose(readings.q[:, age], trace.q[now], atol=1e-6)
@@ -89,7 +89,7 @@ def test_servos_follow_the_target_of_so_many_steps_ago(late):
     """The teacher sees the targets that they follow, the student its newest ones."""
     running, rollout = late
     env, state = running.env, running.state
-    readings, action = state.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
+    readings, action = state.sensing.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
     _, (command, _) = jax.jit(env.targets)(state, action, env.settings)
     np.testing.assert_allclose(command[:, :6], readings.u_target[:, LATENCY - 1], atol=1e-6)
     np.testing.assert_allclose(
@@ -154,7 +154,7 @@ def test_a_fresh_episode_begins_with_fresh_readings(late):
     running, _ = late
     rollout = running.collect(suite.command(fingers=0.8), 2)
     assert rollout.terminal[-1].all()
-    readings, start = running.state.readings, running.state.reset_state
+    readings, start = running.state.sensing.readings, running.state.reset_state
     for age in range(TASK.history):
         np.testing.assert_array_equal(readings.object_position[:, age], start.object_position)
         np.testing.assert_array_equal(readings.q[:, age], start.q)

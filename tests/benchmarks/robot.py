@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -27,10 +26,12 @@ from congrasp.common.objects import procedural, store
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import named_policy
-from congrasp.common.task import camera, sensing
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
-from congrasp.common.task.types import Surface
+from congrasp.common.task.sensors import get_sensor
+from congrasp.common.task.sensors.base import EpisodeStart, Moment
+from congrasp.common.task.sensors.parameters import SensorParameters
+from congrasp.common.task.types import SceneState, Surface
 from congrasp.common.transport.ports import free_port
 from tests.bare_zenoh import bare_session
 from tests.examples import EXAMPLES, example
@@ -45,8 +46,8 @@ _DROP = 0.03
 
 
 class DepthCamera:
-    """The camera of an episode as drawn in training (`common.task.camera`), which takes images
-    throughout.
+    """The camera of an episode as drawn in training (`common.task.sensors.camera`), which takes
+    images throughout.
 
     Attributes:
       delay: seconds from an image to its arrival.
@@ -57,34 +58,54 @@ class DepthCamera:
         its frame, m.
         """
         config = dataclasses.replace(task.sensing, single_image=0.0)
-        sensors = sensing.draw_sensors(config, task.control_dt, jax.random.key(episode), 1)
+        self._task = dataclasses.replace(task, sensing=config)
+        self._sensor = get_sensor(task)
+        self._parameters = self._sensor.draw(config, task.control_dt, jax.random.key(episode), 1)
         self._surface = Surface(surface[None].astype(np.float32), np.zeros((1, len(surface)), bool))
-        start, steps = robot.request, sensing.longest(config, task.control_dt)
+        start = robot.request
         goal, pose = goal_of(get_hand(task.hand), task, start), np.concatenate(start.object_pose)
         goal, pose = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], (goal, pose))
-        self._camera = camera.begin(task, sensors, steps, pose, self._surface, goal)
+        begin = EpisodeStart(
+            hand=get_hand(task.hand), task=self._task, pose=pose, surface=self._surface, goal=goal
+        )
+        self._camera = self._sensor.begin(self._parameters, begin)
         self._base = dict(zip(("base_position", "base_quaternion"), start.wrist, strict=True))
-        self._hand, self._steps, self._shown = get_hand(task.hand), 0, np.zeros(0)
-        self.delay = task.control_dt * int(sensors.delay[0])
+        self._steps = 0
+        self._shown = np.zeros(0)
+        self.delay = task.control_dt * int(self._parameters.delay[0])
 
     def look(self, state: dict[str, np.ndarray]) -> np.ndarray | None:
         """Advances by a control step to the robot's state; returns the points (N, 3) of an image
         that arrives, m.
         """
         self._steps += 1
-        one = jax.tree.map(
-            lambda x: np.asarray(x)[None], (np.int32(self._steps), state, self._base)
-        )
-        self._camera = _look(self._hand, self._camera, *one, self._surface)
+        known = {name: state[name] for name in SceneState._fields if name in state} | self._base
+        time, known = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), known))
+        self._camera = _look(self._task, self._parameters, self._camera, time, known, self._surface)
         before, self._shown = self._shown, np.asarray(self._camera.cloud.points[0])
         return None if np.array_equal(before, self._shown) else self._shown
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _look(
-    hand: Any, seen: Any, time: Any, state: dict[str, Any], base: dict[str, Any], surface: Surface
+    task: TaskConfig,
+    parameters: SensorParameters,
+    camera: Any,
+    time: Any,
+    known: dict[str, Any],
+    surface: Surface,
 ) -> Any:
-    return camera.look(hand, seen, time, SimpleNamespace(**state), SimpleNamespace(**base), surface)
+    unknown: dict[str, Any] = dict.fromkeys(SceneState._fields)
+    moment = Moment(
+        hand=get_hand(task.hand),
+        task=task,
+        time=time,
+        state=SceneState(**{**unknown, **known}),
+        object_position=known["object_position"],
+        lift=None,
+        surface=surface,
+    )
+    return get_sensor(task).step(parameters, camera, moment)
 
 
 class Rig:

@@ -4,7 +4,6 @@ the object's pose.
 
 import dataclasses
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +18,13 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network
 from congrasp.common.policy.bundle import full_layout, mean_action, policy_spec
-from congrasp.common.task import camera
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.privileged import extra
-from congrasp.common.task.sensing import draw_sensors
-from congrasp.common.task.types import Goal, Surface
+from congrasp.common.task.sensors import get_sensor, images
+from congrasp.common.task.sensors.base import EpisodeStart, Moment
+from congrasp.common.task.sensors.parameters import draw_parameters
+from congrasp.common.task.types import Goal, SceneState, Surface
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.services.export.policy import export_policy
 from tests.compiled import Compiled
@@ -48,7 +48,7 @@ def cube():
     return jnp.asarray(np.concatenate(faces)[None], jnp.float32)
 
 
-_facing = jax.jit(camera.facing)
+_facing = jax.jit(images.facing)
 FRONTS = [((0.5, 0.0, 0.0), [1]), ((0.0, -0.5, 0.0), [2]), ((0.3, 0.3, 0.3), [1, 3, 5])]
 
 
@@ -72,16 +72,20 @@ def test_a_capsule_hides_what_is_behind_it():
         [[[0.0, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, 0.05, 0.0], [0.7, 0.0, 0.0], [0.0, 0.0, 0.05]]]
     )
     ends = jnp.array([[[[0.5, 0.0, -0.1], [0.5, 0.0, 0.1]]]])
-    hidden = camera.behind(
-        jnp.array([[1.0, 0.0, 0.0]]), points, camera.Capsules(ends, jnp.array([0.02]))
+    hidden = images.behind(
+        jnp.array([[1.0, 0.0, 0.0]]), points, images.Capsules(ends, jnp.array([0.02]))
     )
     assert hidden.tolist() == [[True, True, False, False, True]]
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def cameras(sensing, pose, points, goal):
-    sensors = draw_sensors(sensing, 0.01, jax.random.key(0), len(pose))
-    return camera.begin(TASK, sensors, 3, pose, Surface(points, points[..., 2] > 0.02), goal)
+    """Parameters and first state of cameras."""
+    task = dataclasses.replace(TASK, sensing=sensing)
+    parameters = draw_parameters(sensing, 0.01, jax.random.key(0), len(pose))
+    surface = Surface(points, points[..., 2] > 0.02)
+    start = EpisodeStart(hand=HAND, task=task, pose=pose, surface=surface, goal=goal)
+    return parameters, get_sensor(task).begin(parameters, start)
 
 
 def heading_goal(batch):
@@ -94,7 +98,7 @@ def heading_goal(batch):
 def test_a_calibration_error_is_one_rigid_motion_of_cloud_and_goal():
     """The error of each image of an episode is the same, and that of the stated goal too."""
     pose = jnp.array([[0.1, 0.2, 0.05, 1.0, 0.0, 0.0, 0.0]])
-    exact, off = (
+    (_, exact), (parameters, off) = (
         cameras(
             SensingConfig(position_bias=(x, x), rotation_bias=(7 * x, 7 * x)),
             pose,
@@ -103,16 +107,15 @@ def test_a_calibration_error_is_one_rigid_motion_of_cloud_and_goal():
         )
         for x in (0.0, 0.005)
     )
-    sensors = off.sensors
-    turn = rotations.from_rotation_vector(sensors.rotation_bias)
+    turn = rotations.from_rotation_vector(parameters.rotation_bias)
     moved = rotations.transform(
-        pose[:, :3] + sensors.position_bias, turn, exact.cloud.points - pose[:, None, :3]
+        pose[:, :3] + parameters.position_bias, turn, exact.cloud.points - pose[:, None, :3]
     )
     np.testing.assert_allclose(off.cloud.points, moved, atol=1e-6)
     np.testing.assert_array_equal(off.cloud.avoid, exact.cloud.points[..., 2] - 0.05 > 0.02)
     np.testing.assert_allclose(exact.goal["heading"].position, pose[:, :3], atol=1e-7)
     np.testing.assert_allclose(
-        off.goal["heading"].position, pose[:, :3] + sensors.position_bias, atol=1e-6
+        off.goal["heading"].position, pose[:, :3] + parameters.position_bias, atol=1e-6
     )
     down = rotations.rotate(turn, exact.goal["heading"].direction)
     np.testing.assert_allclose(off.goal["heading"].direction, down, atol=1e-6)
@@ -124,38 +127,47 @@ def test_a_calibration_error_is_one_rigid_motion_of_cloud_and_goal():
     np.testing.assert_array_equal(off.goal["force"].limit, exact.goal["force"].limit)
 
 
-class Shown(NamedTuple):
-    """Hands far from their objects."""
-
-    object_position: jax.Array
-    object_quaternion: jax.Array
-    q: jax.Array
-    u: jax.Array
-    base_position: jax.Array
-    base_quaternion: jax.Array
-
-
 def test_images_follow_their_period(monkeypatch):
     """At 10 Hz in steps of 10 ms: two or three in 25 steps. Half of the points are dropped. Three
     at most together.
     """
-    monkeypatch.setattr(camera, "IMAGES_TOGETHER", 3)
+    monkeypatch.setattr(images, "IMAGES_TOGETHER", 3)
     pose = jnp.tile(jnp.array([[0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]]), (4, 1))
     points = jnp.repeat(cube(), 4, 0)
-    still = jnp.zeros((4, 6)), jnp.full((4, 3), 3.0), pose[:, 3:]
-    look = jax.jit(lambda *given: camera.look(HAND, *given))
+    unknown = dict.fromkeys(SceneState._fields)
+    far = {  # hands far from their objects
+        "object_position": pose[:, :3],
+        "object_quaternion": pose[:, 3:],
+        "q": jnp.zeros((4, len(HAND.joints))),
+        "u": jnp.zeros((4, 6)),
+        "base_position": jnp.full((4, 3), 3.0),
+        "base_quaternion": pose[:, 3:],
+    }
+    true = SceneState(**{**unknown, **far})
+    surface = Surface(points, points[..., 2] > 0.02)
+
+    @jax.jit
+    def look(parameters, state, time):
+        moment = Moment(
+            hand=HAND,
+            task=TASK,
+            time=time,
+            state=true,
+            object_position=pose[:, :3],
+            lift=None,
+            surface=surface,
+        )
+        return get_sensor(TASK).step(parameters, state, moment)
+
     for single, expected in ((0.0, {2, 3}), (1.0, {0})):
         sensing = SensingConfig(period=(0.1, 0.1), dropout=(0.5, 0.5), single_image=single)
-        state = cameras(sensing, pose, points, heading_goal(4))
-        images = np.zeros(4, int)
+        parameters, state = cameras(sensing, pose, points, heading_goal(4))
+        count = np.zeros(4, int)
         for step in range(1, 26):
-            shown = Shown(pose[:, :3], pose[:, 3:], jnp.zeros((4, len(HAND.joints))), *still)
-            after = look(
-                state, jnp.full(4, step), shown, shown, Surface(points, points[..., 2] > 0.02)
-            )
-            images += np.any(after.cloud.points != state.cloud.points, (1, 2))
+            after = look(parameters, state, jnp.full(4, step))
+            count += np.any(after.cloud.points != state.cloud.points, (1, 2))
             state = after
-        assert set(images.tolist()) <= expected
+        assert set(count.tolist()) <= expected
         local = state.cloud.points - pose[:, None, :3]
         nearest = jnp.linalg.norm(local[:, :, None] - points[:, None], axis=-1).min(-1)
         np.testing.assert_allclose(nearest, 0.0, atol=1e-5)
@@ -171,33 +183,40 @@ def test_images_in_parts_equal_single_images(monkeypatch):
     points = rng.uniform(-0.04, 0.04, (7, POINTS, 3)).astype(np.float32)
     surface = Surface(points, points[..., 2] > 0.02, points / 0.07)
     task = dataclasses.replace(TASK, surface_normals=True)
-    sensors = jax.tree.map(
-        np.asarray, draw_sensors(SensingConfig(dropout=(0.2, 0.5)), 0.01, jax.random.key(0), 7)
-    )
-    state = camera.begin(task, sensors, 3, pose, surface, heading_goal(7))
+    drawn = draw_parameters(SensingConfig(dropout=(0.2, 0.5)), 0.01, jax.random.key(0), 7)
+    parameters = jax.tree.map(np.asarray, drawn)
+    start = EpisodeStart(hand=HAND, task=task, pose=pose, surface=surface, goal=heading_goal(7))
+    first = get_sensor(task).begin(parameters, start).cloud
     ends = (
         pose[:, None, None, :3]
-        + 0.5 * sensors.eye[:, None, None]
+        + 0.5 * parameters.eye[:, None, None]
         + rng.normal(size=(7, 1, 2, 3)) * (0, 0, 0.03)
     )
     ends = ends.astype(np.float32)
     due = np.arange(7) % 2 == 0
-    inputs = state, camera.Images(np.arange(7), pose, surface), due
+    taken = images.Images(
+        parameters=parameters,
+        origin=pose[:, :3],
+        time=np.arange(7),
+        pose=pose,
+        surface=surface,
+    )
+    inputs = first, taken, due
 
     @jax.jit
     def image(inputs, ends):
-        return camera.with_images(
-            *inputs, lambda rows: camera.Capsules(ends[rows], jnp.array([0.02]))
-        ).cloud
+        return images.with_images(
+            *inputs, lambda rows: images.Capsules(ends[rows], jnp.array([0.02]))
+        )
 
     def alone(i):
         return image(*jax.tree.map(lambda x: x[i : i + 1], (inputs, ends)))
 
     expected = jax.tree.map(lambda *clouds: jnp.concatenate(clouds), *map(alone, range(7)))
-    monkeypatch.setattr(camera, "IMAGES_TOGETHER", 3)
+    monkeypatch.setattr(images, "IMAGES_TOGETHER", 3)
     cloud = image(inputs, ends)
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-3), cloud, expected)
-    np.testing.assert_array_equal(np.any(cloud.points != state.cloud.points, (1, 2)), due)
+    np.testing.assert_array_equal(np.any(cloud.points != first.points, (1, 2)), due)
     assert np.any(cloud.points != image(inputs, ends + 9.0).points, (1, 2)).any()
 
 

@@ -26,7 +26,7 @@ def observed(time, hold, mass=0.5, friction=0.8):
     nothing = dict.fromkeys(SceneState._fields)
     state = SceneState(**{**nothing, "time": jnp.array([float(time)])})
     row = [jnp.array([x]) for x in (mass, friction, 1.1, False, hold)]
-    scene = Scene(HAND, TASK, state, features=None, goal=None)
+    scene = Scene(HAND, TASK, state, features=None, goal=None, surface=None)
     values = np.asarray(privileged.observe(scene, Parameters(*row, sensors=None)))
     return dict(
         zip((name for name, _ in privileged.layout(HAND, TASK)), values[0].tolist(), strict=True)

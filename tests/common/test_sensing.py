@@ -15,10 +15,14 @@ from hypothesis import strategies as st
 
 from congrasp.common import rotations as module
 from congrasp.common.ranges import task_faults
-from congrasp.common.task import observation, sensing
+from congrasp.common.task import observation
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.features import scene_of
-from congrasp.common.task.sensing import Readings, Sensors
+from congrasp.common.task.readings import Readings, push, still
+from congrasp.common.task.sensors import get_sensor
+from congrasp.common.task.sensors.base import EpisodeStart, Moment
+from congrasp.common.task.sensors.parameters import SensorParameters, draw_parameters, longest
+from congrasp.common.task.types import SceneState
 from tests.compiled import Compiled
 from tests.scenes import HAND, F, L, N, scene
 
@@ -30,7 +34,7 @@ STEPS = 40
 rotations = Compiled(module)
 
 
-_draw_sensors = jax.jit(sensing.draw_sensors, static_argnums=(0, 1, 3))
+_draw_sensors = jax.jit(draw_parameters, static_argnums=(0, 1, 3))
 
 
 def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **given):
@@ -53,7 +57,7 @@ def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **give
     biases = {
         name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")
     }
-    return Sensors(
+    return SensorParameters(
         key=np.array([[3, 7]], np.uint32), **arrays, **biases, eye=np.ones((1, 3), np.float32)
     )
 
@@ -67,16 +71,35 @@ def truth(step):
     )
 
 
+def moment_of(task, time, pose, table=True):
+    """Control steps (B,) with objects at poses (B, 7), all that a tracker measures."""
+    unknown = dict.fromkeys(SceneState._fields)
+    state = SceneState(**{**unknown, "object_quaternion": pose[:, 3:], "table": table})
+    return Moment(
+        hand=HAND,
+        task=task,
+        time=time,
+        state=state,
+        object_position=pose[:, :3],
+        lift=None,
+        surface=None,
+    )
+
+
 @functools.partial(jax.jit, static_argnames="room")
 def shown(own, poses, room):
     """(1 + T, 7) poses that a tracker with room for so many shows at the start and after T steps (1
     + T, 7).
     """
-    tracker = sensing.begin(own, room, poses[:1, :3], poses[:1, 3:])
+    delay = (room - 1) * TASK.control_dt
+    task = dataclasses.replace(TASK, sensing=SensingConfig(delay=(0.0, delay)))
+    sensor = get_sensor(task)
+    start = EpisodeStart(hand=HAND, task=task, pose=poses[:1], surface=None, goal=None)
+    tracker = sensor.begin(own, start)
 
     def step(tracker, now):
         time, pose = now
-        tracker = sensing.track(tracker, time[None], pose[None, :3], pose[None, 3:])
+        tracker = sensor.step(own, tracker, moment_of(task, time[None], pose[None]))
         return tracker, tracker.shown[0]
 
     _, rows = jax.lax.scan(step, tracker, (jnp.arange(1, len(poses)), poses[1:]))
@@ -121,24 +144,26 @@ def test_what_is_lost_leaves_the_last_pose(dropout, period):
 
 
 def test_errors_have_their_declared_size():
-    still = np.broadcast_to(PATH[5], (4000, 7))
-    found = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1))
-    away = found[:, :3] - still[:, :3]
+    resting = np.broadcast_to(PATH[5], (4000, 7))
+    found = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), resting, 1))
+    away = found[:, :3] - resting[:, :3]
     np.testing.assert_allclose(away.std(0), 0.005, rtol=0.05)
     np.testing.assert_allclose(away.mean(0), 0.0, atol=3e-4)
-    turn = rotations.multiply(found[:, 3:], rotations.conjugate(jnp.asarray(still[:, 3:])))
+    turn = rotations.multiply(found[:, 3:], rotations.conjugate(jnp.asarray(resting[:, 3:])))
     np.testing.assert_allclose(2.0 * np.std(turn[:, 1:], 0), 0.05, rtol=0.05)
     np.testing.assert_allclose(np.linalg.norm(found[:, 3:], axis=1), 1.0, atol=1e-5)
     assert not np.array_equal(found[0], found[1])
-    again = shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1)
+    again = shown(sensors(position_noise=0.005, rotation_noise=0.05), resting, 1)
     np.testing.assert_array_equal(found, again)
 
 
 def test_an_offset_is_that_of_every_sample():
     """The object lies turned by 0.1 rad about z; half a turn about x more takes its z axis down."""
-    still = np.broadcast_to(np.append([0.1, 0.2, 0.3], PATH[5, 3:]), (20, 7)).astype(np.float32)
+    resting = np.broadcast_to(np.append([0.1, 0.2, 0.3], PATH[5, 3:]), (20, 7)).astype(np.float32)
     found = np.asarray(
-        shown(sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), still, 1)
+        shown(
+            sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), resting, 1
+        )
     )
     np.testing.assert_allclose(found[:, :3], np.tile([0.11, 0.2, 0.28], (20, 1)), atol=1e-6)
     np.testing.assert_array_equal(found, np.broadcast_to(found[0], found.shape))
@@ -162,13 +187,22 @@ def test_resting_pose_is_the_mean_of_readings():
     )
     rows = rows.astype(np.float32)
 
-    track = jax.jit(sensing.track, static_argnums=5)
+    own = sensors()
 
     def means(table, settle):
-        tracker, found = sensing.begin(sensors(), 1, rows[:1, :3], rows[:1, 3:]), []
+        task = dataclasses.replace(TASK, sensing=SensingConfig(settle=settle))
+        sensor = get_sensor(task)
+
+        @jax.jit
+        def track(tracker, time, pose, present):
+            return sensor.step(own, tracker, moment_of(task, time, pose, present))
+
+        start = EpisodeStart(hand=HAND, task=task, pose=rows[:1], surface=None, goal=None)
+        tracker = sensor.begin(own, start)
+        found = []
         for step, row in enumerate(rows[1:], 1):
-            there = jnp.array([step < table])
-            tracker = track(tracker, jnp.array([step]), row[None, :3], row[None, 3:], there, settle)
+            present = jnp.array([step < table])
+            tracker = track(tracker, jnp.array([step]), row[None], present)
             found.append(np.asarray(tracker.first[0]))
         return np.array(found)
 
@@ -188,7 +222,7 @@ def test_trackers_are_drawn_from_their_ranges():
         (0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03)
     )
     drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 500))
-    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and sensing.longest(config, 0.01) == 11
+    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and longest(config, 0.01) == 11
     assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
     assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
     assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
@@ -198,7 +232,7 @@ def test_trackers_are_drawn_from_their_ranges():
     assert not any(np.any(field) for field in perfect[3:-1]) and (perfect.period == 1.0).all()
 
 
-_push = jax.jit(sensing.push)
+_push = jax.jit(push)
 
 
 @settings(max_examples=8, deadline=None)
@@ -210,7 +244,7 @@ def test_readings_are_the_last_ones_newest_first(pushed, steps):
     def reading(row):
         return Readings(*[row] * len(Readings._fields))
 
-    readings = sensing.still(reading(pushed[0]), steps)
+    readings = still(reading(pushed[0]), steps)
     for row in pushed[1:]:
         readings = _push(readings, reading(row))
     for field in readings:
@@ -236,7 +270,7 @@ def readings_of(seed, state):
 @jax.jit
 def both(state, surface, goal, readings):
     """The full observation of a state, and the tracked one."""
-    seen = sensing.seen_by(TASK, state, readings)
+    seen = get_sensor(TASK).seen(TASK, state, readings)
     whole = observation.observe(scene_of(HAND, FULL, state, surface, goal))
     return whole, observation.observe(scene_of(HAND, TASK, seen, surface, goal, readings))
 
@@ -299,7 +333,7 @@ def test_its_past_is_worked_out_by_hand():
         u=np.zeros_like(state.u), base_quaternion=np.tile([1, 0, 0, 0], (4, 1)).astype(np.float32)
     )
     present = Readings(*(jnp.asarray(getattr(state, name)) for name in Readings._fields))
-    readings = sensing.still(present, TASK.history)
+    readings = still(present, TASK.history)
     quarter = np.array([np.cos(0.1), 0, 0, np.sin(0.1)], np.float32)  # 0.2 rad about z later
     now = present._replace(
         q=present.q + 0.1,
@@ -307,7 +341,7 @@ def test_its_past_is_worked_out_by_hand():
         object_quaternion=rotations.multiply(jnp.asarray(quarter), present.object_quaternion),
     )
     state = state._replace(q=now.q)
-    found = named(np.asarray(tracked(state, surface, goal, sensing.push(readings, now)))[0])
+    found = named(np.asarray(tracked(state, surface, goal, push(readings, now)))[0])
     past = {
         name.removeprefix("past "): part.reshape(TASK.history - 1, -1)
         for (_, name), part in found.items()
@@ -329,7 +363,7 @@ def test_its_past_is_worked_out_by_hand():
 def test_wrist_velocity_is_the_last_displacement():
     state, _, _ = scene(4)
     readings = readings_of(4, state)
-    seen = sensing.seen_by(TASK, state, readings)
+    seen = get_sensor(TASK).seen(TASK, state, readings)
     np.testing.assert_allclose(
         seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5
     )
@@ -338,7 +372,7 @@ def test_wrist_velocity_is_the_last_displacement():
         and not seen.contact_force.any()
         and not seen.object_velocity.any()
     )
-    full = sensing.seen_by(FULL, state, readings)
+    full = get_sensor(FULL).seen(FULL, state, readings)
     np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
     np.testing.assert_array_equal(full.contact_force, state.contact_force)
     assert full.q_velocity.shape == (4, F) and full.contact_found.shape[1] == L

@@ -18,9 +18,9 @@ import pytest
 import trimesh
 import tyro
 
-from congrasp.actors.env import episode_fields
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli import main, parser
 from congrasp.services.viz.plots import TITLES
 from tests.base_install import run_in_base_install, steady_server

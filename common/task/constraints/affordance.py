@@ -198,8 +198,7 @@ class Affordance(Constraint):
 
     def cloud_labels(self, scene: Scene) -> Array | None:
         """One for points of the avoid region, while it is active."""
-        assert scene.cloud is not None, "a camera observation needs a cloud"
-        return scene.cloud.avoid * scene.gate("affordance")[:, None]
+        return scene.surface.avoid * scene.gate("affordance")[:, None]
 
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
         """Contacts on the graspable region only: pressing on the avoid region earns nothing."""

@@ -15,9 +15,9 @@ from PIL import Image
 from congrasp.actors import initial
 from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.task import sensing
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import set_bank
+from congrasp.common.task.sensors.parameters import longest
 from congrasp.services.evaluate import experiment as experiments
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import protocol
@@ -111,7 +111,7 @@ def test_a_level_is_what_it_says(bank):
     np.testing.assert_allclose(nominal.sensors.position_noise, 0.005)
     np.testing.assert_allclose(nominal.sensors.rotation_noise, math.pi / 60, rtol=1e-6)
     assert (found["100 ms"].sensors.delay == 10).all()
-    assert sensing.longest(sensed.sensing, sensed.control_dt) == 11, "room for the longest delay"
+    assert longest(sensed.sensing, sensed.control_dt) == 11, "room for the longest delay"
     np.testing.assert_allclose(found["10 Hz"].sensors.period, 10.0)
     np.testing.assert_allclose(found["30 % dropped"].sensors.dropout, 0.3)
     np.testing.assert_allclose(found["friction 0.5"].reset_state.friction, 0.5)

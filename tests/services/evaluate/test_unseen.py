@@ -9,10 +9,10 @@ import types
 import numpy as np
 import pytest
 
-from congrasp.actors.env import metric_names
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
+from congrasp.common.task.metrics import metric_names
 from congrasp.services.evaluate import experiment
 from congrasp.services.evaluate import pools as of_objects
 from congrasp.services.evaluate.episodes import Sample

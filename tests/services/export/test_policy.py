@@ -26,7 +26,7 @@ from congrasp.common.task import observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, goal_of
 from congrasp.common.task.features import scene_of
-from congrasp.common.task.sensing import Readings
+from congrasp.common.task.readings import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.services.client.limits import JointLimits, Limiter
 from congrasp.services.export import policy as exports

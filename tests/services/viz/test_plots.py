@@ -9,11 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from congrasp.actors.env import metric_names
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.metrics import episode_fields
+from congrasp.common.task.metrics import episode_fields, metric_names
 from congrasp.services.cli.plot import plot
 from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.plots import compared, plot_evaluation

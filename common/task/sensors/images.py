@@ -1,16 +1,13 @@
-"""Depth camera instead of a tracker: a cloud of the visible part of an object's surface, and no
-pose of the object.
+"""Images of depth cameras: the part of an object's surface that neither the object itself nor the
+hand hides.
 
-An image is taken periodically or once, before the reach (`SensingConfig`). Its points are the
-object's surface points that no other part of the object hides (z-buffer on a coarse grid) nor the
-hand's capsules, with errors. The policy's object frame is the world frame: surface and goal of its
-scene are the cloud and the goal as stated at the start, both with the camera's constant error. The
-true pose is not part of that scene.
+A point is visible if no other part of the object hides it (z-buffer on a coarse grid) nor the
+hand's capsules.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,32 +15,14 @@ import jax.numpy as jnp
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.constraints import known
 from congrasp.common.task.normals import estimated_normals
-from congrasp.common.task.sensing import Sensors, arrival
-from congrasp.common.task.settings import TaskSettings
-from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.task.sensors.parameters import SensorParameters
+from congrasp.common.task.types import Array, Surface
 
 IMAGES_TOGETHER = 512
 """Images that are taken together: few of a batch are due in one control step."""
 _LEAST_DEPTH = 1e-6
 """Distance and width that a division may have at least, m."""
-
-
-class Camera(NamedTuple):
-    """State of the cameras of B episodes after a control step; world frame."""
-
-    sensors: Sensors
-    origin: Array
-    """(B, 3) true position of the object at the start; the constant rotation error is about it."""
-    poses: Array
-    """(B, K, 7) true poses of the object in the last K control steps, newest first."""
-    goal: Goal
-    """Goal of the episode, with the constant error."""
-    cloud: Surface
-    """Latest cloud, N points with labels, and normals estimated from them if the policy observes
-    normals.
-    """
 
 
 class Capsules(NamedTuple):
@@ -58,83 +37,16 @@ class Capsules(NamedTuple):
 class Images(NamedTuple):
     """Images of B cameras."""
 
+    parameters: SensorParameters
+    """Cameras and their errors."""
+    origin: Array
+    """(B, 3) true position of the object at the start; the constant rotation error is about it."""
     time: Array
     """(B,) int control steps since the start of the episodes."""
     pose: Array
     """(B, 7) poses of the objects in the images."""
     surface: Surface
     """Labelled surface points of the objects, object frame."""
-
-
-def begin(
-    task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal
-) -> Camera:
-    """Returns cameras with one image before the reach, in which the hand hides nothing.
-
-    Args:
-      task: the task.
-      sensors: cameras and their errors.
-      steps: control steps K for which a pose may be in transit.
-      pose: (B, 7) resting poses of the objects.
-      surface: their labelled surface points, object frame.
-      goal: goals, object frame.
-    """
-    batch = len(pose)
-    origin = pose[:, :3]
-    position = origin + sensors.position_bias
-    turn = rotations.from_rotation_vector(sensors.rotation_bias)
-    quaternion = rotations.multiply(turn, pose[:, 3:])
-    empty_cloud = Surface(
-        points=jnp.broadcast_to(position[:, None], surface.points.shape),
-        avoid=jnp.zeros_like(surface.avoid),
-    )
-    if surface.normals is not None:
-        empty_cloud = empty_cloud._replace(normals=jnp.zeros_like(surface.normals))
-    camera = Camera(
-        sensors=sensors,
-        origin=origin,
-        poses=jnp.broadcast_to(pose[:, None], (batch, steps, 7)),
-        goal=goal_in_world(task, goal, position, quaternion),
-        cloud=empty_cloud,
-    )
-    images = Images(time=jnp.zeros(batch, jnp.int32), pose=pose, surface=surface)
-    return with_images(camera, images, jnp.ones(batch, bool), None)
-
-
-def look(
-    hand: Hand, camera: Camera, time: Array, state: Any, start: Any, surface: Surface
-) -> Camera:
-    """Advances the cameras by one control step.
-
-    An image that arrives shows the object as it was `Sensors.delay` steps ago, behind the hand of
-    this step.
-
-    Args:
-      hand: the hand.
-      camera: state after the previous step.
-      time: (B,) int control steps since the start of the episodes, including this one.
-      state: true state of the engine after the step (`actors.physics.engine.PhysicsState`).
-      start: initial state of the episodes (`actors.physics.engine.ResetState`), for the wrist's
-        base.
-      surface: labelled surface points, object frame.
-    """
-    pose = jnp.concatenate([state.object_position, state.object_quaternion], -1)
-    poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)
-    turn = rotations.euler_to_quaternion(state.u[:, 3:])
-    position, quaternion = rotations.compose_pose(
-        start.base_position, start.base_quaternion, state.u[:, :3], turn
-    )
-
-    def capsules(rows: Array) -> Capsules:
-        return hand_capsules(hand, state.q[rows], position[rows], quaternion[rows])
-
-    images = Images(time=time, pose=arrived, surface=surface)
-    return with_images(camera._replace(poses=poses), images, due, capsules)
-
-
-def world(batch: int) -> Array:
-    """Returns the pose (B, 7) of the policy's object frame: position, m, and quaternion."""
-    return jnp.broadcast_to(jnp.array((0.0, 0, 0, 1, 0, 0, 0)), (batch, 7))
 
 
 def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> Capsules:
@@ -147,22 +59,22 @@ def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> C
 
 
 def with_images(
-    camera: Camera,
+    cloud: Surface,
     images: Images,
     due: Array,
     hand: Callable[[Array], Capsules] | None,
-) -> Camera:
+) -> Surface:
     """Replaces the clouds of cameras with a due image (B,) in which any point is visible, a small
     batch at a time.
 
     Args:
-      camera: the cameras.
+      cloud: latest clouds of the B cameras.
       images: images of all B cameras, of which the due ones are taken.
       due: (B,) bool.
       hand: returns the capsules of these environments' hands; None if the hands hide nothing.
     """
     # Rows of NumPy arrays cannot be selected by traced indices.
-    camera, images = jax.tree.map(jnp.asarray, (camera, images))
+    cloud, images = jax.tree.map(jnp.asarray, (cloud, images))
     batch = len(due)
     together = min(batch, IMAGES_TOGETHER)
 
@@ -171,9 +83,8 @@ def with_images(
         cloud, left = carry
         rows = jnp.nonzero(left, size=together, fill_value=batch)[0]
         capsules = None if hand is None else hand(rows)
-        inputs = camera.sensors, camera.origin, images
-        sensors, origin, selected = jax.tree.map(lambda array: array[rows], inputs)
-        visible, fresh = _taken(capsules, sensors, origin, selected)
+        selected = jax.tree.map(lambda array: array[rows], images)
+        visible, fresh = _taken(capsules, selected)
         replaced = jnp.where(jnp.any(visible, -1), rows, batch)
         cloud = jax.tree.map(
             lambda array, new: array.at[replaced].set(new, mode="drop"), cloud, fresh
@@ -184,27 +95,27 @@ def with_images(
         _, left = carry
         return jnp.any(left)
 
-    cloud, _ = jax.lax.while_loop(is_any_left, take_some, (camera.cloud, due))
-    return camera._replace(cloud=cloud)
+    cloud, _ = jax.lax.while_loop(is_any_left, take_some, (cloud, due))
+    return cloud
 
 
-def _taken(
-    hand: Capsules | None, sensors: Sensors, origin: Array, images: Images
-) -> tuple[Array, Surface]:
+def _taken(hand: Capsules | None, images: Images) -> tuple[Array, Surface]:
     """Returns which points (B, N) are visible, and the clouds of B images, world frame."""
+    parameters = images.parameters
+    origin = images.origin
     surface = images.surface
     pose = images.pose
-    depth_noise, luck = _image_noise(sensors.key, images.time, surface.points.shape[1])
-    eye = origin + sensors.eye
+    depth_noise, luck = _image_noise(parameters.key, images.time, surface.points.shape[1])
+    eye = origin + parameters.eye
     points = rotations.transform(pose[:, :3], pose[:, 3:], surface.points)
-    visible = facing(eye, points) & (luck >= sensors.dropout[:, None])
+    visible = facing(eye, points) & (luck >= parameters.dropout[:, None])
     if hand is not None:
         visible &= ~behind(eye, points, hand)
     ray = points - eye[:, None]
     ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), _LEAST_DEPTH)
-    measured = points + (sensors.position_noise[:, None] * depth_noise)[..., None] * ray
-    shift = origin + sensors.position_bias
-    turn = rotations.from_rotation_vector(sensors.rotation_bias)
+    measured = points + (parameters.position_noise[:, None] * depth_noise)[..., None] * ray
+    shift = origin + parameters.position_bias
+    turn = rotations.from_rotation_vector(parameters.rotation_bias)
     measured = rotations.transform(shift, turn, measured - origin[:, None])
     index = _filled(visible)
     cloud = Surface(
@@ -212,7 +123,7 @@ def _taken(
         avoid=jnp.take_along_axis(surface.avoid, index, 1),
     )
     if surface.normals is not None:
-        biased_eye = rotations.transform(shift, turn, sensors.eye[:, None])[:, 0]
+        biased_eye = rotations.transform(shift, turn, parameters.eye[:, None])[:, 0]
         cloud = cloud._replace(normals=estimated_normals(cloud.points, biased_eye))
     return visible, cloud
 
@@ -295,30 +206,3 @@ def _filled(flags: Array) -> Array:
     true_first = jnp.zeros(flags.shape, jnp.int32).at[row, rank].set(numbers, mode="drop")
     spread = jnp.arange(size) * jnp.sum(flags, -1, keepdims=True) // size
     return jnp.take_along_axis(true_first, spread, 1)
-
-
-def goal_in_world(task: TaskSettings, goal: Goal, position: Array, quaternion: Array) -> Goal:
-    """Returns goals of the object frame in the world frame, for objects at (B, 3), (B, 4)."""
-
-    def turned(value: Array, turn: Callable[[Array, Array], Array]) -> Array:
-        """Applies a rotation function to the objects' orientations and a goal array."""
-        orientation = jnp.broadcast_to(_rows(quaternion, value), (*value.shape[:-1], 4))
-        return turn(orientation, value)
-
-    for constraint in known(task):
-        moved = {}
-        for name, array in constraint.arrays.items():
-            value = getattr(goal[constraint.name], name)
-            if array.kind == "position":
-                moved[name] = _rows(position, value) + turned(value, rotations.rotate)
-            elif array.kind == "direction":
-                moved[name] = turned(value, rotations.rotate)
-            elif array.kind == "quaternion":
-                moved[name] = turned(value, rotations.multiply)
-        goal = goal.replace(constraint.name, **moved)
-    return goal
-
-
-def _rows(array: Array, like: Array) -> Array:
-    """An array (B, n) as (B, 1, ..., n), with as many axes as another (B, ..., m)."""
-    return jnp.expand_dims(array, tuple(range(1, like.ndim - 1)))
