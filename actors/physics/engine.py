@@ -166,7 +166,9 @@ def physics_state(
     batch = qpos.shape[0]
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)
     found = contacts[..., 0] > 0
-    local, normal, tangent = contacts[..., 1:4], contacts[..., 7:10], contacts[..., 10:13]
+    local = contacts[..., 1:4]
+    normal = contacts[..., 7:10]
+    tangent = contacts[..., 10:13]
     # MuJoCo gives the force of the first body (the link) on the second (the object), in the contact
     # frame.
     on_object = (
@@ -174,7 +176,8 @@ def physics_state(
         + tangent * local[..., 1:2]
         + xp.cross(normal, tangent) * local[..., 2:3]
     )
-    object_qpos, object_qvel = qpos[:, where.object_qpos], qvel[:, where.object_qvel]
+    object_qpos = qpos[:, where.object_qpos]
+    object_qvel = qvel[:, where.object_qvel]
     quaternion = object_qpos[:, 3:] / xp.linalg.norm(object_qpos[:, 3:], axis=-1, keepdims=True)
     angular = object_qvel[:, 3:]
     axis = quaternion[:, 1:]

@@ -22,8 +22,8 @@ from congrasp.actors.physics.engine import (
     physics_state,
     where_environments,
 )
+from congrasp.actors.physics.pooled_model import PooledModel
 from congrasp.actors.physics.scene import GAINS, MASS_POWERS, SENSOR_WIDTH, TABLE_AWAY, addresses
-from congrasp.actors.physics.slots import Pool
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import CONTACT
@@ -31,6 +31,20 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
+
+_PER_ENVIRONMENT = ("body_pos", "body_quat", "geom_friction", *GAINS)
+"""Fields of the model that differ between environments with the same object."""
+_RESET_DATA = (
+    "qpos",
+    "qvel",
+    "ctrl",
+    "qacc_warmstart",
+    "mocap_pos",
+    "mocap_quat",
+    "eq_active",
+    "time",
+)
+"""Fields of `mjx.Data` that a restart replaces."""
 
 
 class MjxState(NamedTuple):
@@ -43,7 +57,7 @@ class MjxState(NamedTuple):
     qpos_start: Array
     """(B, nq) initial positions, to which a diverged environment is reset."""
     pool: dict[str, Array]
-    """Fields of the model for each object (N, ...); see `actors.physics.slots.LEAVES`."""
+    """Fields of the model for each object (N, ...); see `actors.physics.pooled_model.LEAVES`."""
 
 
 class MjxPhysics:
@@ -70,35 +84,33 @@ class MjxPhysics:
                 "Use native or warp, or import a custom hand without --collision own.",
             )
         self._task = task
-        self._pool = pool = Pool(hand, task, objects)
-        self._where = addresses(pool.model, hand)
-        self._links = np.array([pool.model.body(link.name).id for link in hand.links])
-        self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
+        self._pool = PooledModel(hand, task, objects)
+        model = self._pool.model
+        self._where = addresses(model, hand)
+        self._links = np.array([model.body(link.name).id for link in hand.links])
         # MJX has no elliptic cones without friction: links get the hand's sliding friction, a
         # tenth.
-        pool.model.geom_condim[:] = CONTACT.condim
+        model.geom_condim[:] = CONTACT.condim
         # MJX has no contact sensor between bodies; contacts are read from the contact list instead.
-        pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
-        pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
-        self._host_model = pool.model
-        self._body_of_geom = np.array(pool.model.geom_bodyid)
+        model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
+        model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
+        self._host_model = model
+        self._body_of_geom = np.array(model.geom_bodyid)
+        self._geoms = np.flatnonzero(model.geom_bodyid == self._where.object_body)
         self._device = jax.local_devices()[0]  # by default MJX uses the first device of all ranks
-        self._model = mjx.put_model(pool.model, device=self._device, impl="jax")
+        self._model = mjx.put_model(model, device=self._device, impl="jax")
         self._objects = self._leaves(objects)
-        self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
-        self._shared = {
-            name: jnp.asarray(getattr(pool.model, name), jnp.float32)
-            for name in ("body_pos", "body_quat", "geom_friction", *GAINS)
-        }
+        self._shared = {}
+        for name in _PER_ENVIRONMENT:
+            self._shared[name] = jnp.asarray(getattr(model, name), jnp.float32)
         axes = dict.fromkeys([*self._objects, *self._shared], 0)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(**axes)
-        self._object_body = self._where.object_body
 
     def start(self, reset_state: ResetState) -> MjxState:
         """Starts environments; see `Physics.start`."""
         batch = reset_state.object_index.shape[0]
         data = mjx.make_data(self._host_model, device=self._device, impl="jax")
-        data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
+        data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._host_model.nq)))
         return self._place(data, self._objects, reset_state)
 
     def replace_objects(self, state: MjxState, objects: Sequence[GraspObject]) -> MjxState:
@@ -110,22 +122,15 @@ class MjxPhysics:
     def reset(self, state: MjxState, mask: Array, reset_state: ResetState) -> MjxState:
         """Restarts the masked environments; see `Physics.reset`."""
         fresh = self._place(state.data, state.pool, reset_state)
-        names = (
-            "qpos",
-            "qvel",
-            "ctrl",
-            "qacc_warmstart",
-            "mocap_pos",
-            "mocap_quat",
-            "eq_active",
-            "time",
+        started = {name: getattr(fresh.data, name) for name in _RESET_DATA}
+        continuing = {name: getattr(state.data, name) for name in _RESET_DATA}
+        data = state.data.replace(**where_environments(mask, started, continuing))
+        return MjxState(
+            data=data,
+            leaves=where_environments(mask, fresh.leaves, state.leaves),
+            qpos_start=where_environments(mask, fresh.qpos_start, state.qpos_start),
+            pool=state.pool,
         )
-        started, going = (
-            ({name: getattr(batch.data, name) for name in names}, batch.leaves, batch.qpos_start)
-            for batch in (fresh, state)
-        )
-        merged, leaves, qpos_start = where_environments(mask, started, going)
-        return MjxState(state.data.replace(**merged), leaves, qpos_start, state.pool)
 
     def step(
         self, state: MjxState, target: Array, table: Array, force: Array | None = None
@@ -154,10 +159,10 @@ class MjxPhysics:
             qacc_warmstart=jnp.where(diverged, 0.0, data.qacc_warmstart),
         )
         sensors = jnp.where(diverged, 0.0, self._contacts(data))
-        state = state._replace(data=data)
-        return state, physics_state(
+        moved = physics_state(
             jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(3)
         )
+        return state._replace(data=data), moved
 
     def read(self, state: MjxState) -> PhysicsState:
         """Returns the current state of the environments, without contacts; see `Physics.read`."""
@@ -173,60 +178,64 @@ class MjxPhysics:
 
     def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
         """Fields (N, ...) of the model for each object, on the device."""
-        return {
-            name: jnp.asarray(value, jnp.float32).reshape(
-                len(objects), *getattr(self._model, name).shape
-            )
-            for name, value in self._pool.leaves(objects).items()
-        }
+        leaves = {}
+        for name, value in self._pool.leaves(objects).items():
+            shape = (len(objects), *getattr(self._model, name).shape)
+            leaves[name] = jnp.asarray(value, jnp.float32).reshape(shape)
+        return leaves
 
     def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
         """Places environments at their start, with the fields of their objects from the rows `pool`
         (N, ...).
         """
-        where, batch = self._where, reset_state.object_index.shape[0]
+        where = self._where
+        model = self._host_model
+        batch = reset_state.object_index.shape[0]
+        qpos = initial_qpos(where, model.nq, reset_state)
+        mocap_pos = data.mocap_pos.at[:, where.table_mocap].set(0.0)
+        stationary = reset_state.stationary.astype(data.eq_active.dtype)
+        data = data.replace(
+            qpos=qpos,
+            qvel=initial_qvel(where, model.nv, reset_state),
+            ctrl=jnp.zeros((batch, model.nu)),
+            qacc_warmstart=jnp.zeros((batch, model.nv)),
+            mocap_pos=mocap_pos.at[:, where.anchor_mocap].set(reset_state.object_position),
+            mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(reset_state.object_quaternion),
+            eq_active=data.eq_active.at[:, where.weld].set(stationary),
+        )
+        return MjxState(data, self._model_leaves(pool, reset_state), qpos, pool)
+
+    def _model_leaves(self, pool: dict[str, Array], reset_state: ResetState) -> dict[str, Array]:
+        """Fields (B, ...) of the model of environments that start, see `_place`."""
+        where = self._where
+        batch = reset_state.object_index.shape[0]
         leaves = {name: value[reset_state.object_index] for name, value in pool.items()}
         for name, power in MASS_POWERS.items():
             leaf = leaves[name]
-            rows = where.object_qvel if name.startswith("dof") else np.array([self._object_body])
+            rows = where.object_qvel if name.startswith("dof") else np.array([where.object_body])
             factor = reset_state.mass_scale.reshape(-1, *[1] * (leaf.ndim - 1)) ** power
             leaves[name] = leaf.at[:, rows].multiply(factor)
-        tiled = {
-            name: jnp.tile(value, (batch, *([1] * value.ndim)))
-            for name, value in self._shared.items()
-        }
-        leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(reset_state.base_position)
-        leaves["body_quat"] = (
-            tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)
-        )
-        leaves["geom_friction"] = (
-            tiled["geom_friction"].at[:, self._geoms, 0].set(reset_state.friction[:, None])
-        )
+
+        def tiled(name: str) -> Array:
+            """A shared field, once for each environment."""
+            value = self._shared[name]
+            return jnp.tile(value, (batch, *([1] * value.ndim)))
+
+        position = tiled("body_pos").at[:, where.base_body]
+        leaves["body_pos"] = position.set(reset_state.base_position)
+        quaternion = tiled("body_quat").at[:, where.base_body]
+        leaves["body_quat"] = quaternion.set(reset_state.base_quaternion)
+        friction = tiled("geom_friction").at[:, self._geoms, 0]
+        leaves["geom_friction"] = friction.set(reset_state.friction[:, None])
         for name in GAINS:
-            leaves[name] = (
-                tiled[name].at[:, where.motors].multiply(reset_state.gain_scale[:, None, None])
-            )
-        qpos = initial_qpos(where, self._nq, reset_state)
-        data = data.replace(
-            qpos=qpos,
-            qvel=initial_qvel(where, self._nv, reset_state),
-            ctrl=jnp.zeros((batch, self._nu)),
-            qacc_warmstart=jnp.zeros((batch, self._nv)),
-            mocap_pos=data.mocap_pos.at[:, where.table_mocap]
-            .set(0.0)
-            .at[:, where.anchor_mocap]
-            .set(reset_state.object_position),
-            mocap_quat=data.mocap_quat.at[:, where.anchor_mocap].set(reset_state.object_quaternion),
-            eq_active=data.eq_active.at[:, where.weld].set(
-                reset_state.stationary.astype(data.eq_active.dtype)
-            ),
-        )
-        return MjxState(data, leaves, qpos, pool)
+            gains = tiled(name).at[:, where.motors]
+            leaves[name] = gains.multiply(reset_state.gain_scale[:, None, None])
+        return leaves
 
     def _contacts(self, data: Any) -> Array:
         """Contacts (B, L * C * 13) in the layout of the contact sensors."""
         strongest = functools.partial(
-            _strongest_contacts, self._body_of_geom, self._links, self._object_body
+            _strongest_contacts, self._body_of_geom, self._links, self._where.object_body
         )
         return jax.vmap(strongest)(data)
 

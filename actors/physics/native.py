@@ -20,9 +20,10 @@ from congrasp.common.runtime.parallel import memory
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 
-_ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
+_ENVIRONMENT_BYTES = 860_000
+"""Memory of a stepped environment: model, data and their stack."""
 
-
+_TABLE_PRESENT = (0.0, 0.0, 0.0)
 _physics_state = jax.jit(physics_state, static_argnums=(0, 1))
 
 
@@ -57,7 +58,9 @@ class EnvInstance:
         """Copies the model of a scene."""
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.ctrl, self.qpos, self.qvel = self.data.ctrl, self.data.qpos, self.data.qvel
+        self.ctrl = self.data.ctrl
+        self.qpos = self.data.qpos
+        self.qvel = self.data.qvel
         self.sensordata = self.data.sensordata
 
 
@@ -76,7 +79,9 @@ class NativePhysics:
           objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        self._hand, self._task, self._objects = hand, task, objects
+        self._hand = hand
+        self._task = task
+        self._objects = objects
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(
             self.threads, thread_name_prefix="physics"
@@ -93,10 +98,11 @@ class NativePhysics:
           CongraspError: they would not fit into free memory.
         """
         batch = len(np.asarray(reset_state.object_index))
-        if (free := memory()) < batch * _ENVIRONMENT:
+        needed = batch * _ENVIRONMENT_BYTES
+        free = memory()
+        if free < needed:
             raise CongraspError(
-                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of "
-                f"memory, but "
+                f"{batch:,} environments of MuJoCo C need {needed / 1e9:.0f} GB of memory, but "
                 f"{free / 1e9:.0f} GB are free.",
                 "Pass a smaller --environments, or run the actor on a GPU.",
             )
@@ -124,19 +130,19 @@ class NativePhysics:
         """Simulates one control step; see `Physics.step`. Resets and flags diverged
         environments.
         """
-        target, table = np.asarray(target), np.asarray(table)
-        self.place_tables(table)
+        target = np.asarray(target)
+        self.place_tables(np.asarray(table))
         if force is not None:
             for instance, push in zip(self.instances, np.asarray(force), strict=True):
                 instance.data.xfrc_applied[self._where.object_body, :3] = push
         # Threads take environments from one shared iterator, since contacts make some slower than
         # others.
         environments = iter(range(len(self.instances)))
-        list(
-            self._pool.map(
-                self._step_instances, [environments] * self.threads, [target] * self.threads
-            )
-        )
+        steps = []
+        for _ in range(self.threads):
+            steps.append(self._pool.submit(self._step_instances, environments, target))
+        for step in steps:
+            step.result()
         diverged = has_diverged(np, self._qpos, self._qvel)
         for i in np.flatnonzero(diverged):
             self._restore(int(i))
@@ -145,9 +151,8 @@ class NativePhysics:
     def place_tables(self, table: np.ndarray) -> None:
         """Places the tables where `table` (B,) is true, and removes the others."""
         for i in np.flatnonzero(table != self._table):
-            self.instances[i].data.mocap_pos[self._where.table_mocap] = (
-                (0.0, 0.0, 0.0) if table[i] else TABLE_AWAY
-            )
+            position = _TABLE_PRESENT if table[i] else TABLE_AWAY
+            self.instances[i].data.mocap_pos[self._where.table_mocap] = position
         self._table = table.copy()
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
@@ -167,33 +172,22 @@ class NativePhysics:
     def _scene(self, index: int) -> Scene:
         """Returns the compiled scene of an object, compiling it on first use."""
         if index not in self._compiled:
-            self._compiled[index] = Scene(
-                compile_scene(self._hand, self._task, self._objects[index])
-            )
+            model = compile_scene(self._hand, self._task, self._objects[index])
+            self._compiled[index] = Scene(model)
         return self._compiled[index]
 
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
         """Places environment i at row i of its reset states, in an instance of its object's
         scene.
         """
-        where, scene = self._where, self._scene(int(reset_state.object_index[i]))
+        where = self._where
+        scene = self._scene(int(reset_state.object_index[i]))
         self.scenes[i].spare.append(self.instances[i])
-        self.scenes[i], instance = scene, scene.take()
+        instance = scene.take()
+        self.scenes[i] = scene
         self.instances[i] = instance
-        model, data = instance.model, instance.data
-        model.body_pos[where.base_body] = reset_state.base_position[i]
-        model.body_quat[where.base_body] = reset_state.base_quaternion[i]
-        for name, power in MASS_POWERS.items():
-            rows = where.object_qvel if name.startswith("dof") else where.object_body
-            getattr(model, name)[rows] = (
-                getattr(scene.model, name)[rows] * reset_state.mass_scale[i] ** power
-            )
-        geoms = model.geom_bodyid == where.object_body
-        model.geom_friction[geoms, 0] = reset_state.friction[i]
-        for name in GAINS:
-            getattr(model, name)[where.motors] = (
-                getattr(scene.model, name)[where.motors] * reset_state.gain_scale[i]
-            )
+        self._set_model(instance.model, scene.model, i, reset_state)
+        data = instance.data
         data.qpos[where.finger_qpos] = reset_state.q[i]
         data.qvel[where.wrist_qvel] = reset_state.u_velocity[i]
         data.qpos[where.object_qpos] = np.concatenate(
@@ -206,32 +200,50 @@ class NativePhysics:
         self._start[i] = data.qpos
         self._copy_out(i)
 
+    def _set_model(
+        self, model: mujoco.MjModel, unscaled: mujoco.MjModel, i: int, reset_state: ResetState
+    ) -> None:
+        """Writes base pose, mass, friction and gains of row i of the reset states into the model of
+        an instance; `unscaled` is the model of its scene.
+        """
+        where = self._where
+        model.body_pos[where.base_body] = reset_state.base_position[i]
+        model.body_quat[where.base_body] = reset_state.base_quaternion[i]
+        for name, power in MASS_POWERS.items():
+            rows = where.object_qvel if name.startswith("dof") else where.object_body
+            nominal = getattr(unscaled, name)[rows]
+            getattr(model, name)[rows] = nominal * reset_state.mass_scale[i] ** power
+        geoms = model.geom_bodyid == where.object_body
+        model.geom_friction[geoms, 0] = reset_state.friction[i]
+        for name in GAINS:
+            nominal = getattr(unscaled, name)[where.motors]
+            getattr(model, name)[where.motors] = nominal * reset_state.gain_scale[i]
+
     def _restore(self, i: int) -> None:
         """Resets a diverged environment to its start."""
-        model, data = self.instances[i].model, self.instances[i].data
-        mocap = data.mocap_pos.copy(), data.mocap_quat.copy()
+        data = self.instances[i].data
+        mocap_pos = data.mocap_pos.copy()
+        mocap_quat = data.mocap_quat.copy()
         weld = int(data.eq_active[self._where.weld])
-        mujoco.mj_resetData(model, data)
+        mujoco.mj_resetData(self.instances[i].model, data)
         data.qpos[:] = self._start[i]
-        data.mocap_pos[:], data.mocap_quat[:] = mocap
+        data.mocap_pos[:] = mocap_pos
+        data.mocap_quat[:] = mocap_quat
         data.eq_active[self._where.weld] = weld
         self._copy_out(i)
 
     def _copy_out(self, i: int) -> None:
         """Copies an instance's state into row i of the batch's arrays."""
         instance = self.instances[i]
-        self._qpos[i], self._qvel[i], self._sensors[i] = (
-            instance.qpos,
-            instance.qvel,
-            instance.sensordata,
-        )
+        self._qpos[i] = instance.qpos
+        self._qvel[i] = instance.qvel
+        self._sensors[i] = instance.sensordata
 
     def _step_instances(self, environments: Iterator[int], target: np.ndarray) -> None:
         """Steps environments from a shared iterator until it is exhausted; runs in each thread."""
         substeps = self._task.substeps
-        with np.errstate(
-            over="ignore"
-        ):  # a diverged environment's values may be too large for float32
+        # A diverged environment's values may be too large for float32
+        with np.errstate(over="ignore"):
             for i in environments:
                 instance = self.instances[i]
                 instance.ctrl[:] = target[i]
@@ -243,6 +255,13 @@ class NativePhysics:
         """Returns the physics state from the batch's arrays; `diverged` (B,) is passed through."""
         # Copies: the next step writes into the buffers while JAX may still read.
         occupancy = np.array([0.0, 0.0, self._limited.mean()], np.float32)
-        arrays = self._qpos.copy(), self._qvel.copy(), self._sensors.copy()
-        state: PhysicsState = _physics_state(jnp, self._where, *arrays, diverged, occupancy)
+        state: PhysicsState = _physics_state(
+            jnp,
+            self._where,
+            self._qpos.copy(),
+            self._qvel.copy(),
+            self._sensors.copy(),
+            diverged,
+            occupancy,
+        )
         return state

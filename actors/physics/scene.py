@@ -70,10 +70,10 @@ class Addresses:
     @functools.cached_property
     def _key(self) -> tuple[tuple[int, ...], ...]:
         """All addresses, in order."""
-        return tuple(
-            tuple(np.ravel(getattr(self, field.name)).tolist())
-            for field in dataclasses.fields(self)
-        )
+        key = []
+        for field in dataclasses.fields(self):
+            key.append(tuple(np.ravel(getattr(self, field.name)).tolist()))
+        return tuple(key)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Addresses) and self._key == other._key
@@ -107,6 +107,16 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
         contact_time=task.contact_time,
         torsional_friction=task.torsional_friction,
     )
+    _add_table(spec, task)
+    spec.worldbody.add_body(name="anchor", mocap=True)
+    return spec
+
+
+def _add_table(spec: mujoco.MjSpec, task: TaskConfig) -> None:
+    """Adds the table, which objects and, depending on the task, hands collide with."""
+    collides_with = OBJECT_CONTYPE
+    if task.hand_table_collision:
+        collides_with |= HAND_CONTYPE
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",
@@ -114,13 +124,11 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(0.6, 0.6, 0.05),
         contype=0,
-        conaffinity=OBJECT_CONTYPE | (HAND_CONTYPE if task.hand_table_collision else 0),
+        conaffinity=collides_with,
         condim=CONTACT.condim,
         friction=CONTACT.friction,
         solref=CONTACT.solref,
     )
-    spec.worldbody.add_body(name="anchor", mocap=True)
-    return spec
 
 
 def object_contact(task: TaskConfig) -> ContactSettings:
@@ -175,7 +183,8 @@ def addresses(model: mujoco.MjModel, hand: Hand) -> Addresses:
     wrist = np.array([joint(name) for name in WRIST_JOINTS])
     fingers = np.array([joint(j.name) for j in hand.joints])
     body = model.body("object")
-    qpos, qvel = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
+    qpos = model.jnt_qposadr[body.jntadr[0]]
+    qvel = model.jnt_dofadr[body.jntadr[0]]
     return Addresses(
         wrist_qpos=wrist[:, 0],
         finger_qpos=fingers[:, 0],

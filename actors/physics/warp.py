@@ -6,23 +6,16 @@ on a CPU, for tests. The state is a small pytree and every call can be traced, s
 rollout compiles into one program.
 
 `control_step` is the interface to JAX: a pure function of small arrays. Model and data stay in
-buffers allocated once per batch, so that their addresses never change and one CUDA graph of a
-control step serves every program that calls it, wherever JAX places its arrays.
+buffers allocated once per batch (`actors.physics.warp_buffers`), so that their addresses never
+change and one CUDA graph of a control step serves every program that calls it, wherever JAX places
+its arrays.
 """
 
-import concurrent.futures
-import contextlib
 import dataclasses
-import functools
-import hashlib
 import itertools
-import logging
-import pathlib
-import threading
-import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, BinaryIO, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,300 +33,35 @@ from congrasp.actors.physics.engine import (
     physics_state,
     where_environments,
 )
-from congrasp.actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, Addresses, addresses
-from congrasp.actors.physics.slots import Catalogue
-from congrasp.actors.physics.warp_kernels import (
-    DATA_LEAVES,
-    MODEL_LEAVES,
-    OBJECT_FIELDS,
-    Leaves,
-    Objects,
-    count,
-    place,
-)
-from congrasp.common.errors import CongraspError
+from congrasp.actors.physics.object_rows import ObjectRows
+from congrasp.actors.physics.scene import SENSOR_WIDTH, addresses
+from congrasp.actors.physics.slots import mesh_count
+from congrasp.actors.physics.warp_buffers import WarpBuffers
+from congrasp.actors.physics.warp_kernels import OBJECT_FIELDS, Objects
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.locks import try_lock
-from congrasp.common.io.opening import open_to_append
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.physics_library import mujoco
-from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
-CONTACTS_PER_ENVIRONMENT = 40
-"""Average capacity of the shared contact list for each environment."""
-CONSTRAINTS_PER_ENVIRONMENT = 320
-"""Capacity of constraint rows for each environment."""
+wp.config.log_level = wp.LOG_WARNING  # no log line for each of some 50 loaded modules
 
-
-# Seconds until a process builds what another one builds, and until it says so
-_PATIENCE, _WORD = (
-    300.0,
-    2.0,
-)
-_BLOCK = 256  # Warp's block size of a launch without one; on a CPU all are 1
-_log = logging.getLogger(__name__)
-_building = threading.Lock()
-"""Held while one of the `WarpBuffers` lists and builds its kernels; the next then finds those they
-share.
-"""
-
-
-class WarpBuffers:
-    """Buffers of a batch of environments on one device."""
-
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        where: Addresses,
-        geoms: np.ndarray,
-        substeps: int,
-        batch: int,
-        device: wp.Device,
-    ):
-        """Allocates the buffers.
-
-        Args:
-          model: model shared by the environments.
-          where: indices of the model.
-          geoms: (S,) geoms of the object's slots.
-          substeps: physics steps of a control step.
-          batch: number B of environments.
-          device: device of the buffers.
-        """
-        self._substeps, self._device = substeps, device
-        self._graph: wp.Graph | None = None
-        capacities = [
-            CONTACTS_PER_ENVIRONMENT * batch,
-            CONSTRAINTS_PER_ENVIRONMENT,
-            substeps * batch,
-        ]
-        self.limits = np.array(capacities, np.float32)
-        """(3,) capacities of contacts and constraint rows, and physics steps of all environments in
-        a control step.
-        """
-        with wp.ScopedDevice(device):
-            # A single row would mark the field as shared, and meshes could then never be absent.
-            self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
-            self._data = mujoco_warp.make_data(
-                model,
-                batch,
-                naconmax=CONTACTS_PER_ENVIRONMENT * batch,
-                njmax=CONSTRAINTS_PER_ENVIRONMENT,
-            )
-            self._occupancy = wp.zeros(3, dtype=int)
-            self._leaves = leaves = Leaves()
-            for name in MODEL_LEAVES:
-                setattr(leaves, name, getattr(self._model, name))
-            for name in DATA_LEAVES:
-                setattr(leaves, name, getattr(self._data, name))
-            leaves.geoms = wp.array(geoms, dtype=int)
-            leaves.motors = wp.array(where.motors, dtype=int)
-            leaves.gains = wp.array(
-                np.stack(
-                    [
-                        model.actuator_gainprm[where.motors, 0],
-                        *model.actuator_biasprm[where.motors, 1:3].T,
-                    ],
-                    -1,
-                ),
-                dtype=wp.vec3,
-            )
-        leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
-        leaves.base_body, leaves.table, leaves.anchor = (
-            where.base_body,
-            where.table_mocap,
-            where.anchor_mocap,
-        )
-        leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
-        # The kernels print every overflow; thousands of environments would flood the log.
-        self._model.opt.warn_overflow = 0
-        self._sensing = self._model.opt.disableflags
-        self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
-        self._kernels = concurrent.futures.ThreadPoolExecutor(1, "kernels").submit(
-            self._load_kernels
-        )
-        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
-
-    def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
-        """Sets the sources of the environments' fields: rows, and the fields of the model with
-        their meshes.
-        """
-        self._objects, self._graph = objects, None
-        for name, value in meshes.items():
-            setattr(self._model, name, value)
-
-    def control_step(
-        self,
-        qpos: Any,
-        qvel: Any,
-        qacc_warmstart: Any,
-        ctrl: Any,
-        placed: Sequence[Any],
-        sensordata: Any,
-        occupancy: Any,
-    ) -> None:
-        """Steps all environments on the current stream; modifies the first three arrays and writes
-        the last two.
-        """
-        self._kernels.result()
-        data = self._data
-        state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
-        for mine, given in (*state, (data.ctrl, ctrl)):
-            wp.copy(mine, given)
-        inputs = [*placed, self._objects, self._leaves, self._occupancy]
-        wp.launch(place, (data.nworld, self._leaves.geoms.size), inputs, device=self._device)
-        self._launch()
-        for mine, given in (*state, (data.sensordata, sensordata), (self._occupancy, occupancy)):
-            wp.copy(given, mine)
-
-    def repeat(self, steps: int) -> None:
-        """Repeats control steps from the last state with Warp only, and waits for them; for
-        benchmarks.
-        """
-        with wp.ScopedDevice(self._device):
-            for _ in range(steps):
-                self._launch()
-        wp.synchronize_device(self._device)
-
-    def _load_kernels(self) -> None:
-        """Builds the kernels of a control step in parallel, or reads them from Warp's cache.
-
-        Launches would do this one after another. Warp compiles without Python's lock.
-        """
-        with _building:
-            with stage("list of the kernels"):
-                variants = self._variants()
-            with (
-                stage("kernels"),
-                _one_builder(variants),
-                concurrent.futures.ThreadPoolExecutor(cores()) as threads,
-            ):
-                list(
-                    threads.map(
-                        lambda variant: wp.force_load(self._device, [variant[0]], variant[1]),
-                        variants,
-                    )
-                )
-
-    def _variants(self) -> list[tuple[wp.Module, int]]:
-        """Modules with the kernels of a control step, and their block sizes, the largest modules
-        first.
-
-        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and
-        not made. It also queries the occupancy of its largest kernels, each of which Warp would
-        build for the answer.
-        """
-        queried, launched = list[tuple[wp.Module, int]](), [(place.module, _BLOCK)]
-        me, options, conditional = (
-            threading.get_ident(),
-            self._model.opt,
-            self._model.opt.graph_conditional,
-        )
-        *launches, query = replaced = wp.launch, wp.launch_tiled, wp.get_suggested_block_size
-
-        def listed(
-            launch: Callable[..., None], kernel: wp.Kernel, *given: Any, **named: Any
-        ) -> None:
-            if threading.get_ident() == me:
-                launched.append((kernel.module, named.get("block_dim") or _BLOCK))
-            else:
-                launch(kernel, *given, **named)
-
-        def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
-            if threading.get_ident() != me:
-                return query(kernel, device)
-            queried.append((kernel.module, kernel.module.options["block_dim"]))
-            return 1, 1
-
-        options.graph_conditional = (
-            False  # a loop until the solver's kernels have converged would not end
-        )
-        wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
-        wp.get_suggested_block_size = suggested
-        try:
-            with wp.ScopedDevice(self._device):
-                self._substep_all()
-        finally:
-            wp.launch, wp.launch_tiled, wp.get_suggested_block_size = replaced
-            options.graph_conditional, options.disableflags = conditional, self._sensing
-        gpu = self._device.is_cuda
-        return list(
-            dict.fromkeys((module, size if gpu else 1) for module, size in (*queried, *launched))
-        )
-
-    def _launch(self) -> None:
-        """Launches the kernels of one control step."""
-        if not self._device.is_cuda:
-            self._substep_all()
-            return
-        if self._graph is None:
-            with wp.ScopedCapture() as capture:
-                self._substep_all()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
-
-    def _substep_all(self) -> None:
-        """Runs the physics steps of a control step; contacts are read in the last one."""
-        model, data = self._model, self._data
-        for left in reversed(range(self._substeps)):
-            model.opt.disableflags = self._blind if left else self._sensing
-            mujoco_warp.step(model, data)
-            counts = [
-                data.ncollision,
-                data.nacon,
-                data.nefc,
-                data.solver_niter,
-                model.opt.iterations,
-                self._occupancy,
-            ]
-            wp.launch(count, data.nworld, counts, device=self._device)
-
-
-@contextlib.contextmanager
-def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
-    """Context that one process of this machine enters first: the others then read from Warp's cache
-    what it built.
-
-    They wait for `_PATIENCE` seconds at most, and then build, too.
-    """
-    names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
-    name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
-    path = pathlib.Path(str(wp.config.kernel_cache_dir), name)
-    with contextlib.ExitStack() as stack:
-        try:
-            file = stack.enter_context(open_to_append(path))
-            _wait_for_lock(file)
-        except (OSError, CongraspError) as error:
-            _log.info("Kernels are built without waiting for other processes: %s.", error)
-        yield
-
-
-def _wait_for_lock(file: BinaryIO) -> None:
-    """Waits for the lock of the first builder, or that of all others, for `_PATIENCE` seconds."""
-    begun = time.monotonic()
-    is_reported = False
-    shared = False
-    while (waited := time.monotonic() - begun) < _PATIENCE:
-        if try_lock(file, shared=shared):
-            return
-        shared = True  # together, once the first is done
-        if waited > _WORD and not is_reported:
-            is_reported = True
-            _log.info(
-                "Waiting for the kernels that another process builds, at most %d s.", _PATIENCE
-            )
-        time.sleep(0.1)
+_LEAST_MESH_SLOTS = 8
+"""Mesh pieces: capacity for objects other than those of the first pool."""
+_SOLVER_TOLERANCE = 1e-5
+"""Single precision does not reach MuJoCo's default."""
+_buffers: "weakref.WeakValueDictionary[int, WarpBuffers]" = weakref.WeakValueDictionary()
+_handles = itertools.count()
 
 
 def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
-    """Transfers the rows of a catalogue to a device."""
+    """Transfers rows of objects to a device."""
     objects = Objects()
     for name, dtype in OBJECT_FIELDS.items():
-        value = rows[name].reshape(len(rows[name]), -1, 2, 3) if name == "geom_aabb" else rows[name]
+        value = rows[name]
+        if name == "geom_aabb":
+            value = value.reshape(len(value), -1, 2, 3)
         setattr(objects, name, wp.array(value, dtype=dtype, device=device))
     return objects
 
@@ -350,10 +78,6 @@ def meshes_on(device: wp.Device, model: mujoco.MjModel) -> dict[str, Any]:
                 getattr(model, field.name), dtype=kind.dtype, device=device
             )
     return values
-
-
-_buffers: "weakref.WeakValueDictionary[int, WarpBuffers]" = weakref.WeakValueDictionary()
-_handles = itertools.count()
 
 
 def register(buffers: WarpBuffers) -> int:
@@ -404,9 +128,6 @@ control_step = jax_callable(
 )
 
 
-wp.config.log_level = wp.LOG_WARNING  # no log line for each of some 50 loaded modules
-
-
 class WarpState(NamedTuple):
     """State on which a control step of a batch of environments depends."""
 
@@ -417,10 +138,7 @@ class WarpState(NamedTuple):
     qacc_warmstart: Array
     """(B, nv) warm start of the solver."""
     reset_state: ResetState
-    """Initial states of the episodes; `object_index` is a row of the engine's catalogue."""
-
-
-_LEAST_SLOTS = 8  # mesh pieces: capacity for objects other than those of the first pool
+    """Initial states of the episodes; `object_index` is a row of the engine's objects."""
 
 
 class WarpPhysics:
@@ -456,19 +174,17 @@ class WarpPhysics:
         """
         self._task = task
         if mesh_slots is None:
-            most = max(sum(piece.kind == "mesh" for piece in obj.pieces) for obj in objects)
-            mesh_slots = max(most, _LEAST_SLOTS)
-        self._catalogue = Catalogue(hand, task, objects[0], mesh_slots)
-        model = self._catalogue.model
+            mesh_slots = max(_LEAST_MESH_SLOTS, *map(mesh_count, objects))
+        self._object_rows = ObjectRows(hand, task, objects[0], mesh_slots)
+        model = self._object_rows.model
         # Dense Jacobians double the solver's time with elliptic cones.
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        model.opt.tolerance = 1e-5  # single precision does not reach the default
+        model.opt.tolerance = _SOLVER_TOLERANCE
         self._where = addresses(model, hand)
         self._sensors = len(hand.links) * CONTACTS_PER_LINK * SENSOR_WIDTH
         device = jax.local_devices()[0]
-        self._device = wp.get_device(
-            "cpu" if device.platform == "cpu" else f"cuda:{device.local_hardware_id}"
-        )
+        name = "cpu" if device.platform == "cpu" else f"cuda:{device.local_hardware_id}"
+        self._device = wp.get_device(name)
         self._buffers: dict[int, tuple[int, WarpBuffers]] = {}
         self._load(objects)
 
@@ -489,8 +205,10 @@ class WarpPhysics:
         self, state: WarpState, target: Array, table: Array, force: Array | None = None
     ) -> tuple[WarpState, PhysicsState]:
         """Simulates one control step; see `Physics.step`."""
-        reset_state, batch = state.reset_state, state.qpos.shape[0]
-        force = jnp.zeros((batch, 3)) if force is None else force.astype(jnp.float32)
+        reset_state = state.reset_state
+        batch = state.qpos.shape[0]
+        if force is None:
+            force = jnp.zeros((batch, 3))
         handle, buffers = self._buffers[batch]
         qpos, qvel, warmstart, sensors, counts = control_step(
             handle,
@@ -499,7 +217,7 @@ class WarpPhysics:
             state.qacc_warmstart,
             target.astype(jnp.float32),
             table,
-            force,
+            force.astype(jnp.float32),
             reset_state.object_index,
             reset_state.mass_scale,
             reset_state.friction,
@@ -536,8 +254,8 @@ class WarpPhysics:
         """
         index = np.asarray(jax.block_until_ready(state).reset_state.object_index)
         used, index = np.unique(index, return_inverse=True)
-        going = [self._objects[row] for row in used]
-        self._load([*objects, *going])
+        continuing = [self._objects[row] for row in used]
+        self._load([*objects, *continuing])
         moved = jnp.asarray(len(objects) + index, jnp.int32)
         return state._replace(reset_state=state.reset_state._replace(object_index=moved))
 
@@ -554,7 +272,8 @@ class WarpPhysics:
 
         Runs only MuJoCo Warp's kernels, without JAX, as a reference for benchmarks.
         """
-        self._buffers[batch][1].repeat(steps)
+        _, buffers = self._buffers[batch]
+        buffers.repeat(steps)
 
     def close(self) -> None:
         """Releases the memory of the environments."""
@@ -562,12 +281,18 @@ class WarpPhysics:
 
     def _allocated(self, batch: int) -> WarpBuffers:
         """Returns buffers of a batch, without objects, and begins to build their kernels."""
-        model, geoms = self._catalogue.model, self._catalogue.geoms
-        return WarpBuffers(model, self._where, geoms, self._task.substeps, batch, self._device)
+        return WarpBuffers(
+            self._object_rows.model,
+            self._where,
+            self._object_rows.geoms,
+            self._task.substeps,
+            batch,
+            self._device,
+        )
 
     def _load(self, objects: Sequence[GraspObject]) -> None:
         """Transfers objects to the device, and points every batch's buffers to them."""
-        rows, meshes = self._catalogue.rows(objects)
+        rows, meshes = self._object_rows.rows(objects)
         self._objects = objects
         self._loaded = objects_on(self._device, rows), meshes_on(self._device, meshes)
         wp.synchronize_device(self._device)  # JAX's stream does not wait for Warp's
@@ -578,18 +303,18 @@ class WarpPhysics:
         """Returns the state of environments that start now, with the types that the compiled calls
         expect.
         """
-        index, stationary = (
-            jnp.asarray(reset_state.object_index, jnp.int32),
-            jnp.asarray(reset_state.stationary, bool),
-        )
+        index = jnp.asarray(reset_state.object_index, jnp.int32)
+        stationary = jnp.asarray(reset_state.stationary, bool)
         reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
         reset_state = reset_state._replace(object_index=index, stationary=stationary)
-        model = self._catalogue.model
-        qpos, qvel = (
-            initial_qpos(self._where, model.nq, reset_state),
-            initial_qvel(self._where, model.nv, reset_state),
+        model = self._object_rows.model
+        qvel = initial_qvel(self._where, model.nv, reset_state)
+        return WarpState(
+            qpos=initial_qpos(self._where, model.nq, reset_state),
+            qvel=qvel,
+            qacc_warmstart=jnp.zeros_like(qvel),
+            reset_state=reset_state,
         )
-        return WarpState(qpos, qvel, jnp.zeros_like(qvel), reset_state)
 
 
 def begin_kernels(hand: Hand, task: TaskConfig) -> None:

@@ -11,7 +11,7 @@ from mujoco.mjx.third_party.mujoco_warp._src.types import vec10f
 
 @wp.struct
 class Objects:
-    """Rows of a catalogue; see `actors.physics.slots.Catalogue.rows`."""
+    """Rows of objects; see `actors.physics.object_rows.ObjectRows.rows`."""
 
     geom_size: wp.array2d[wp.vec3]
     geom_pos: wp.array2d[wp.vec3]

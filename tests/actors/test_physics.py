@@ -11,8 +11,8 @@ import pytest
 
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.pooled_model import LEAVES, PooledModel
 from congrasp.actors.physics.scene import TABLE_AWAY, compile_scene, scene_spec
-from congrasp.actors.physics.slots import LEAVES, Pool
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -243,7 +243,7 @@ def test_reset_changes_only_the_masked_environments(native, env):
 
 
 def test_slots_are_the_same_bodies_as_models_of_their_own():
-    pool = Pool(HAND, TASK, OBJECTS)
+    pool = PooledModel(HAND, TASK, OBJECTS)
     body = pool.model.body("object").id
     leaves = pool.leaves(OBJECTS)
     for i, obj in enumerate(OBJECTS):
@@ -257,8 +257,20 @@ def test_slots_are_the_same_bodies_as_models_of_their_own():
 def test_a_pool_may_begin_with_an_object_whose_inertia_is_diagonal():
     """MuJoCo has a shortcut for such bodies, which the other objects' inertias must not take."""
     upright, skewed = procedural.generate(9000, "capsule"), procedural.generate(9001, "mug")
-    leaves = Pool(HAND, TASK, [upright, skewed]).leaves([upright, skewed])
+    leaves = PooledModel(HAND, TASK, [upright, skewed]).leaves([upright, skewed])
     assert np.isfinite(leaves["body_inertia"]).all()
+
+
+def test_pooled_model_is_restored_after_an_error():
+    """Some pieces of the second object fill all slots, and the next one has none."""
+    box, cylinder = OBJECTS[:2]
+    pool = PooledModel(HAND, TASK, [box, cylinder])
+    before = {name: getattr(pool.model, name).copy() for name in LEAVES}
+    too_many = dataclasses.replace(cylinder, pieces=cylinder.pieces * 50)
+    with pytest.raises(CongraspError, match="pieces"):
+        pool.leaves([box, too_many])
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(pool.model, name), value)
 
 
 @pytest.fixture

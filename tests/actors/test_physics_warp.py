@@ -18,8 +18,8 @@ import trimesh
 
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics.object_rows import ObjectRows
 from congrasp.actors.physics.scene import compile_scene
-from congrasp.actors.physics.slots import Catalogue
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
@@ -171,7 +171,7 @@ def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends
 ):
     import warp as wp  # takes seconds in every worker
 
-    from congrasp.actors.physics.warp import WarpBuffers
+    from congrasp.actors.physics.warp_buffers import WarpBuffers
 
     monkeypatch.setattr(WarpBuffers, "_load_kernels", lambda buffers: None)
     monkeypatch.setattr(
@@ -193,8 +193,8 @@ def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends
 def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monkeypatch):
     import warp as wp  # takes seconds in every worker
 
-    from congrasp.actors.physics import warp
-    from congrasp.actors.physics.warp import _one_builder
+    from congrasp.actors.physics import warp_build
+    from congrasp.actors.physics.warp_build import one_builder
 
     program = (
         "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); "
@@ -204,7 +204,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
     entered = threading.Event()
 
     def build():
-        with _one_builder([]):
+        with one_builder([]):
             entered.set()
 
     build()
@@ -224,16 +224,16 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
         [sys.executable, "-c", program, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        monkeypatch.setattr(warp, "_PATIENCE", 0.1)
+        monkeypatch.setattr(warp_build, "_PATIENCE_S", 0.1)
         build()  # after a wait it builds, too
         other.kill()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
-    with _one_builder([]):
+    with one_builder([]):
         pass  # without a folder nothing is shared
 
 
 def test_rows_are_what_mujoco_compiles():
-    catalogue = Catalogue(HAND, TASK, OBJECTS[0], 8)
+    catalogue = ObjectRows(HAND, TASK, OBJECTS[0], 8)
     before = {
         name: getattr(catalogue.model, name).copy()
         for name in ("geom_dataid", "geom_size", "body_mass")
@@ -379,7 +379,10 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(st
 
 
 def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
-    from congrasp.actors.physics.warp import CONSTRAINTS_PER_ENVIRONMENT, CONTACTS_PER_ENVIRONMENT
+    from congrasp.actors.physics.warp_buffers import (
+        CONSTRAINTS_PER_ENVIRONMENT,
+        CONTACTS_PER_ENVIRONMENT,
+    )
 
     warp, engine = warp_engine(OBJECTS), native(OBJECTS)
     targets = [grasp(start, i) for i in range(5)]
@@ -393,7 +396,7 @@ def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
 
 
 def test_what_had_no_room_is_counted(start, monkeypatch):
-    monkeypatch.setattr("congrasp.actors.physics.warp.CONTACTS_PER_ENVIRONMENT", 2)
+    monkeypatch.setattr("congrasp.actors.physics.warp_buffers.CONTACTS_PER_ENVIRONMENT", 2)
     warp = warp_engine(OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]
@@ -406,7 +409,7 @@ def test_steps_whose_solver_reached_its_limit_are_counted(start):
     limited = []
     for iterations in (1, 100):
         warp = warp_engine(OBJECTS)
-        warp._catalogue.model.opt.iterations = iterations
+        warp._object_rows.model.opt.iterations = iterations
         _, after = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
         limited.append(float(after.occupancy[2]))
     assert limited == [1.0, 0.0]

@@ -1,0 +1,134 @@
+"""Builds the kernels of a control step: lists them without launching any, and builds them in
+parallel, in one process of a machine at a time.
+"""
+
+import concurrent.futures
+import contextlib
+import functools
+import hashlib
+import logging
+import pathlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, BinaryIO
+
+import warp as wp
+
+from congrasp.actors.physics.warp_kernels import place
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.locks import try_lock
+from congrasp.common.io.opening import open_to_append
+from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.stages import stage
+
+Variant = tuple[wp.Module, int]
+"""A module of kernels, and the block size of their launch."""
+
+_PATIENCE_S = 300.0
+"""Time until a process builds what another one builds."""
+_SILENT_S = 2.0
+"""Time until a waiting process logs that it waits."""
+_BLOCK = 256
+"""Warp's block size of a launch without one; on a CPU all are 1."""
+_log = logging.getLogger(__name__)
+_building = threading.Lock()
+"""Held while kernels are listed and built; the next list then contains what they share."""
+
+
+def build_kernels(device: wp.Device, list_variants: Callable[[], list[Variant]]) -> None:
+    """Builds the listed kernels in parallel, or reads them from Warp's cache.
+
+    Launches would do this one after another. Warp compiles without Python's lock.
+    """
+    with _building:
+        with stage("list of the kernels"):
+            variants = list_variants()
+        with (
+            stage("kernels"),
+            one_builder(variants),
+            concurrent.futures.ThreadPoolExecutor(cores()) as threads,
+        ):
+            builds = [threads.submit(wp.force_load, device, [m], size) for m, size in variants]
+            for build in builds:
+                build.result()
+
+
+def variants_of(device: wp.Device, launch_all: Callable[[], None]) -> list[Variant]:
+    """Modules with the kernels that `launch_all` launches, and their block sizes, the largest
+    modules first.
+
+    Its launches in this thread are listed and not made. It also queries the occupancy of its
+    largest kernels, each of which Warp would build for the answer.
+    """
+    queried: list[Variant] = []
+    launched: list[Variant] = [(place.module, _BLOCK)]
+    this_thread = threading.get_ident()
+    launch = wp.launch
+    launch_tiled = wp.launch_tiled
+    query = wp.get_suggested_block_size
+
+    def listed(make: Callable[..., None], kernel: wp.Kernel, *args: Any, **options: Any) -> None:
+        if threading.get_ident() == this_thread:
+            launched.append((kernel.module, options.get("block_dim") or _BLOCK))
+        else:
+            make(kernel, *args, **options)
+
+    def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
+        if threading.get_ident() != this_thread:
+            return query(kernel, device)
+        queried.append((kernel.module, kernel.module.options["block_dim"]))
+        return 1, 1
+
+    wp.launch = functools.partial(listed, launch)
+    wp.launch_tiled = functools.partial(listed, launch_tiled)
+    wp.get_suggested_block_size = suggested
+    try:
+        with wp.ScopedDevice(device):
+            launch_all()
+    finally:
+        wp.launch = launch
+        wp.launch_tiled = launch_tiled
+        wp.get_suggested_block_size = query
+    variants = []
+    for module, size in (*queried, *launched):
+        variants.append((module, size if device.is_cuda else 1))
+    return list(dict.fromkeys(variants))
+
+
+@contextlib.contextmanager
+def one_builder(variants: Sequence[Variant]) -> Iterator[None]:
+    """Context that one process of this machine enters first: the others then read from Warp's cache
+    what it built.
+
+    They wait for `_PATIENCE_S` seconds at most, and then build, too.
+    """
+    names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
+    name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
+    path = pathlib.Path(str(wp.config.kernel_cache_dir), name)
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(open_to_append(path))
+            _wait_for_lock(file)
+        except (OSError, CongraspError) as error:
+            _log.info("Kernels are built without waiting for other processes: %s.", error)
+        yield
+
+
+def _wait_for_lock(file: BinaryIO) -> None:
+    """Waits for the lock of the first builder, or that of all others, for `_PATIENCE_S` seconds."""
+    start = time.monotonic()
+    is_reported = False
+    shared = False
+    waited = 0.0
+    while waited < _PATIENCE_S:
+        if try_lock(file, shared=shared):
+            return
+        shared = True  # together, once the first is done
+        if waited > _SILENT_S and not is_reported:
+            is_reported = True
+            _log.info(
+                "Waiting for the kernels that another process builds, at most %d s.", _PATIENCE_S
+            )
+        time.sleep(0.1)
+        waited = time.monotonic() - start
