@@ -5,30 +5,23 @@ constraint excludes them (`Constraint.harvested`). Many of the goals of later ep
 feasible for this hand.
 """
 
-import contextlib
 import functools
-import hashlib
-import pathlib
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from congrasp.actors.physics.engine import where_environments
 from congrasp.common import rotations
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.files import read_kept, write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses
-from congrasp.common.task.sampling.references import make_references, reference_columns
+from congrasp.common.task.sampling.references import make_references
 from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import Array
-from congrasp.common.wire.codec import Message, encode
 
 
 class Grasps(NamedTuple):
@@ -133,58 +126,3 @@ def renew(
         pose_valid=bank.pose_valid.at[row, grasps.region, :, slot].set(valid, mode="drop"),
         grasps=seen,
     )
-
-
-_POSES = ("pose_q", "pose_position", "pose_quaternion")
-
-
-def references_file(run_dir: pathlib.Path, actor: str) -> pathlib.Path:
-    """Path of an actor's references in a run directory."""
-    return run_dir / "references" / f"{actor}.safetensors"
-
-
-def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
-    """Writes the bank's references for a restarted actor; a full disk is ignored, and the next
-    start lacks them.
-
-    They are collected over hundreds of updates. Without them, the goals of a restarted actor are
-    less feasible: a run on one H200 that was resumed at update 993 fell from 68 to 60 % of
-    reference poses held, and took 250 updates to recover. The file has the poses in half precision,
-    3 MB for 1,600 objects; trajectories to them are drawn again.
-    """
-    arrays = {name: np.asarray(getattr(bank, name), np.float16) for name in _POSES}
-    arrays["grasps"] = np.asarray(bank.grasps)
-    with contextlib.suppress(CongraspError, OSError):
-        write_atomically(path, encode(Message(arrays, {"objects": _digest(bank)})))
-
-
-def with_kept_references(
-    path: pathlib.Path, hand: Hand, task: TaskConfig, bank: ConstraintBank
-) -> ConstraintBank:
-    """Returns the bank with the references of a file; unchanged if the file is missing, damaged or
-    of other objects.
-    """
-    message = read_kept(path)
-    if (
-        message is None
-        or message.meta.get("objects") != _digest(bank)
-        or message.arrays.keys() != {*_POSES, "grasps"}
-    ):
-        return bank
-    if any(array.shape != getattr(bank, name).shape for name, array in message.arrays.items()):
-        return bank
-    poses = Poses(*(jnp.asarray(message.arrays[name], jnp.float32) for name in _POSES))
-    norm = jnp.linalg.norm(poses.quaternion, axis=-1, keepdims=True)
-    poses = poses._replace(quaternion=poses.quaternion / norm)
-    columns = reference_columns(
-        hand, poses, bank.rest, jax.random.key(0), task.trajectory_points, task.human_paths
-    )
-    return bank._replace(grasps=jnp.asarray(message.arrays["grasps"]), **columns)
-
-
-def _digest(bank: ConstraintBank) -> str:
-    """Digest of the objects of a bank, their resting poses and their order."""
-    digest = hashlib.sha256()
-    for array in (bank.points, bank.rest):
-        digest.update(np.ascontiguousarray(array, np.float32).tobytes())
-    return digest.hexdigest()

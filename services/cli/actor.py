@@ -94,7 +94,7 @@ class Actor:
         self, transport: Transport, name: str, metrics: ActorMetrics, stop: Stop, ready: float
     ) -> str:
         """Acts over a connected transport; returns the reason of the end."""
-        from congrasp.actors.process import run_actor
+        from congrasp.actors.process import ActorOptions, run_actor
         from congrasp.common.runtime.stages import imported
 
         def report(values: dict[str, float]) -> None:
@@ -106,11 +106,9 @@ class Actor:
             )
 
         imported(ready)
-        return run_actor(
-            transport,
+        options = ActorOptions(
             run=self.run,
             actor=name,
-            stop=stop,
             physics=self.physics,
             threads=self.threads or cores(),
             patience=math.inf if self.patience is None else self.patience,
@@ -118,6 +116,7 @@ class Actor:
             journal=None if self.no_audit else self._journal_of(name),
             references=self.references,
         )
+        return run_actor(transport, options, stop)
 
     def _journal_of(self, name: str) -> "OpenJournal":
         """Opens the journal named by --audit, or else that of the user's folder."""

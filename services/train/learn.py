@@ -10,9 +10,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from congrasp.actors.harvest import references_file
 from congrasp.actors.physics import prepare_physics
-from congrasp.actors.process import run_actor
+from congrasp.actors.process import ActorOptions, run_actor
+from congrasp.actors.references_file import references_file
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.policy.bundle import policy_spec
@@ -131,16 +131,15 @@ def _actor_thread(
     def act() -> None:
         try:
             with urls.connect(url, "actor") as transport:
-                run_actor(
-                    transport,
+                options = ActorOptions(
                     run=config.name,
                     actor=name,
-                    stop=ended,
                     physics=physics,
                     threads=cores(),
                     patience=ROUND_SECONDS,
                     references=references_file(run_dir, name),
                 )
+                run_actor(transport, options, ended)
         except BaseException as error:
             failures.append(error)
             stop.set()

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from congrasp.actors.harvest import references_file
 from congrasp.actors.physics import resolve_physics
+from congrasp.actors.references_file import references_file
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.io.files import write_atomically

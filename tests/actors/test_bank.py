@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.harvest import Grasps, renew, save_references, with_kept_references
+from congrasp.actors.harvest import Grasps, renew
+from congrasp.actors.references_file import save_references, with_saved_references
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.kinematics import capsules, link_transforms
@@ -167,7 +168,7 @@ def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(lying)
 
 def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):
     path = tmp_path / "new folder" / "a.safetensors"
-    read = functools.partial(with_kept_references, path, HAND, TASK)
+    read = functools.partial(with_saved_references, path, HAND, TASK)
     assert read(bank) is bank
     grown = bank._replace(
         pose_q=bank.pose_q.at[1, 1, 0].set(0.5), grasps=bank.grasps.at[1, 1].add(3)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from congrasp.actors import link as link_module
+from congrasp.actors import patience as patience_module
 from congrasp.actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys, below
@@ -270,7 +270,7 @@ def test_silent_learner_is_given_up(joined):
 
 
 def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch, caplog):
-    monkeypatch.setattr(link_module, "_NOTICED", 0.2)
+    monkeypatch.setattr(patience_module, "_NOTICED_S", 0.2)
     learner, link = joined(patience=20.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from congrasp.actors import process
-from congrasp.actors.env import episode_fields
+from congrasp.actors.follower import Follower
 from congrasp.actors.link import RunInfo
-from congrasp.actors.process import Follower
+from congrasp.actors.process import ActorOptions
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, to_json
@@ -24,6 +24,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
+from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Surface
 from congrasp.common.transport.keys import Keys
@@ -157,16 +158,10 @@ def heard(monkeypatch):
                 **policy._asdict(),
             )
             hub.publish_weights(bundle.to_message(), 0)
+            options = ActorOptions(run="t", actor="a", physics="native", patience=5.0)
             actor = threading.Thread(
                 target=process.run_actor,
-                args=(peer,),
-                kwargs={
-                    "run": "t",
-                    "actor": "a",
-                    "stop": stop,
-                    "physics": "native",
-                    "patience": 5.0,
-                },
+                args=(peer, options, stop),
             )
             actor.start()
             batch = rollouts.next_batch(1, 30.0)
@@ -184,7 +179,7 @@ def heard(monkeypatch):
 def started(info: RunInfo) -> None:
     """Starts the parts of an actor for a learner that gives this information."""
     link = types.SimpleNamespace(actor="a")
-    process._Actor(CONFIG, info, link, None, "native", 1, lambda values: None, None)
+    process._Actor(ActorOptions("t", "a", physics="native"), CONFIG, info, link, None)
 
 
 def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():

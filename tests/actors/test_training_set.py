@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from congrasp.actors import harvest
+from congrasp.actors.failure_weights import FailureWeights
 from congrasp.actors.harvest import Grasps
-from congrasp.actors.training_set import FailureWeights, training_set
+from congrasp.actors.training_set import training_set
 from congrasp.common.config import ObjectsConfig, RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
