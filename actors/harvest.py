@@ -101,15 +101,18 @@ def renew(
         task.trajectory_points,
         task.human_paths,
     )
+    objects_and_regions = (grasps.object_index, grasps.region)
     usable = grasps.found & valid.any(-1) & bank.renewable[grasps.object_index]
-    seen = bank.grasps.at[grasps.object_index, grasps.region].add(usable.astype(bank.grasps.dtype))
-    unused = ~bank.pose_valid[grasps.object_index, grasps.region].any(1)
-    places = unused.shape[1] // 2
-    chance = places / jnp.maximum(bank.grasps[grasps.object_index, grasps.region], places)
+    counts = bank.grasps.at[objects_and_regions].add(usable.astype(bank.grasps.dtype))
+    unused = ~bank.pose_valid[objects_and_regions].any(1)
+    entries = unused.shape[1]
+    places = entries // 2
+    chance = places / jnp.maximum(bank.grasps[objects_and_regions], places)
     usable &= unused.any(1) | (jax.random.uniform(chance_key, chance.shape) < chance)
-    own = jnp.arange(unused.shape[1]) < places
-    slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
-    place = grasps.object_index, grasps.region, slot
+    is_in_reservoir = jnp.arange(entries) < places
+    priority = is_in_reservoir * jax.random.uniform(slot_key, unused.shape)
+    slot = jnp.argmax(2.0 * unused + priority, -1)
+    place = (*objects_and_regions, slot)
     # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a
     # GPU.
     number = jnp.arange(slot.size)
@@ -124,5 +127,5 @@ def renew(
         trajectory_position=bank.trajectory_position.at[where].set(path, mode="drop"),
         trajectory_quaternion=bank.trajectory_quaternion.at[where].set(turns, mode="drop"),
         pose_valid=bank.pose_valid.at[row, grasps.region, :, slot].set(valid, mode="drop"),
-        grasps=seen,
+        grasps=counts,
     )

@@ -25,6 +25,10 @@ from congrasp.common.task.types import Array, Goal, Surface
 
 _CLEARANCE = 0.005
 """Least initial height of the hand over the table, m."""
+_TRAINING = "training"
+"""Name of the random numbers of `_TrainingNumbers`."""
+_EPISODE = "episode"
+"""Name of the random numbers of `_EpisodeNumbers`; those of constraints have their names."""
 
 
 class InitialConditions(NamedTuple):
@@ -90,6 +94,41 @@ class RequestedEpisodes(NamedTuple):
     """(B, 7) pose of the object on the table."""
 
 
+class _TrainingNumbers(NamedTuple):
+    """Random numbers (B,) in [0, 1) of episodes in training only."""
+
+    object: Array
+    rest: Array
+    joined: Array
+    is_disturbed: Array
+    disturbance: Array
+    distance: Array
+    margin: Array
+    speed: Array
+
+
+class _EpisodeNumbers(NamedTuple):
+    """Random numbers (B,) in [0, 1) of all drawn episodes."""
+
+    mass: Array
+    friction: Array
+    hold: Array
+    gain: Array
+    reference: Array
+
+
+class _Plan(NamedTuple):
+    """Properties of B episodes before their constraints are sampled, apart from those of `Draw`."""
+
+    uniform: Mapping[str, Array]
+    """Random numbers of `_uniforms`."""
+    sensors: SensorParameters
+    requested: Mapping[str, Array]
+    """(B,) bool for each optional constraint by name: True if requested."""
+    stationary: Array | bool
+    approach: Approach
+
+
 def sample(
     hand: Hand,
     task: TaskConfig,
@@ -136,47 +175,6 @@ def sample(
         approach=_varied(task, episode.distance, episode.margin, episode.speed),
     )
     return _drawn(hand, task, draw, plan)
-
-
-_TRAINING = "training"
-"""Name of the random numbers of `_TrainingNumbers`."""
-_EPISODE = "episode"
-"""Name of the random numbers of `_EpisodeNumbers`; those of constraints have their names."""
-
-
-class _TrainingNumbers(NamedTuple):
-    """Random numbers (B,) in [0, 1) of episodes in training only."""
-
-    object: Array
-    rest: Array
-    joined: Array
-    is_disturbed: Array
-    disturbance: Array
-    distance: Array
-    margin: Array
-    speed: Array
-
-
-class _EpisodeNumbers(NamedTuple):
-    """Random numbers (B,) in [0, 1) of all drawn episodes."""
-
-    mass: Array
-    friction: Array
-    hold: Array
-    gain: Array
-    reference: Array
-
-
-class _Plan(NamedTuple):
-    """Properties of B episodes before their constraints are sampled, apart from those of `Draw`."""
-
-    uniform: Mapping[str, Array]
-    """Random numbers of `_uniforms`."""
-    sensors: SensorParameters
-    requested: Mapping[str, Array]
-    """(B,) bool for each optional constraint by name: True if requested."""
-    stationary: Array | bool
-    approach: Approach
 
 
 def _requested(
