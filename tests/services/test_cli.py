@@ -290,6 +290,26 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     assert capsys.readouterr().err == f"congrasp: error: {line}. Correct or unset it.\n"
 
 
+def test_jax_variable_whose_value_an_error_quotes_is_named(monkeypatch, capsys):
+    error = RuntimeError("Unknown backend: 'abacus' requested")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.setenv("JAX_PLATFORM_NAME", "abacus")
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "JAX_PLATFORM_NAME is 'abacus'" in line
+
+
+@pytest.mark.parametrize("flags", ["--nonsense", "no_such_file"])
+def test_unknown_flags_of_xla_are_an_error(flags, tmp_path):
+    arguments = ("train", "--run-dir", tmp_path / "run")
+    done = python("-m", "congrasp", *arguments, env={"XLA_FLAGS": flags})
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"XLA_FLAGS is '{flags}'" in line
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_platform(monkeypatch):
     error = AssertionError()
     error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
