@@ -13,6 +13,8 @@ _JAX = "JAX_"
 """Begin of the variables that JAX reads; its errors quote a value, and not always its name."""
 _PLATFORMS = "JAX_PLATFORMS"
 _XLA_FLAGS = "XLA_FLAGS"
+_CHECKED = "CONGRASP_CHECKED_XLA_FLAGS"
+"""Variable with the flags that a process has checked for its children."""
 _XLA_CHECK = "from jaxlib import xla_client; xla_client.make_cpu_client()"
 _XLA_PATIENCE = 30.0
 """Longest time for the check of XLA's flags, s; it takes a third of one on an idle machine."""
@@ -23,7 +25,8 @@ def check_xla_flags() -> None:
 
     XLA reads them at its first use, and exits without an exception. A separate process tries them.
     """
-    if not os.environ.get(_XLA_FLAGS):
+    flags = os.environ.get(_XLA_FLAGS)
+    if not flags or os.environ.get(_CHECKED) == flags:
         return
     try:
         done = subprocess.run(
@@ -40,6 +43,7 @@ def check_xla_flags() -> None:
     named = [line for line in lines if _XLA_FLAGS in line]
     if done.returncode and named:
         raise CongraspError(*_unusable(_XLA_FLAGS, named[-1].partition("] ")[2]))
+    os.environ[_CHECKED] = flags
 
 
 def variable_error(error: Exception) -> CongraspError | None:
