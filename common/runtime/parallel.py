@@ -181,7 +181,10 @@ class _Helper:
                     stdin=subprocess.DEVNULL,
                     pass_fds=[number],
                     start_new_session=True,  # Ctrl-C on a terminal reaches only the caller
-                    env={**_ONE_THREAD, **child_environment(JAX_PLATFORMS="cpu")},
+                    env={
+                        **_ONE_THREAD,
+                        **child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore"),
+                    },
                 )
             self._running = process, here
         return self._running[1]

@@ -83,6 +83,13 @@ _OUTPUTS = ("out", "json", "png", "pictures", "video")
 """Parameters of commands with a file or a folder that they write."""
 _QUIET_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Categories that Python itself ignores."""
+_NUMPY_WARNINGS = (
+    "(divide by zero|invalid value|overflow|underflow) encountered",
+    "Mean of empty slice",
+    "All-NaN (slice|axis) encountered",
+    "Degrees of freedom <= 0",
+)
+"""Warnings of NumPy that tell a user nothing: commands check their results themselves."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
@@ -125,6 +132,10 @@ def main(arguments: Sequence[str] | None = None) -> None:  # noqa: C901
         code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
         if _last_words(sys.stdout, "\n"):  # another pipe broke
+            raise
+        code = UNREAD
+    except SystemExit as end:  # rich raises it for a broken pipe
+        if not isinstance(end.__context__, BrokenPipeError):
             raise
         code = UNREAD
     except OSError as error:
@@ -353,6 +364,8 @@ def _prepare_environment() -> None:
     """
     own_environment()
     ensure_width()
+    for message in _NUMPY_WARNINGS:
+        warnings.filterwarnings("ignore", message, RuntimeWarning)
     folder = cache_folder("jax")
     if not can_cache(folder.parent, "XDG_CACHE_HOME"):
         warnings.filterwarnings("ignore", "Error writing persistent compilation cache")
