@@ -134,7 +134,7 @@ def config_checksum(text: bytes) -> str:
     return hashlib.sha256(plain).hexdigest()
 
 
-def check_config(run_dir: pathlib.Path, kept: str) -> None:
+def check_config_unchanged(run_dir: pathlib.Path, kept: str) -> None:
     """Raises a CongraspError if the configuration file was changed by something else than congrasp.
 
     Args:
@@ -304,7 +304,7 @@ def continue_run(
         the run names, this is not a run directory, or a learner is using it.
     """
     before = open_run(run_dir)
-    check_config(run_dir, _kept_checksum(run_dir))
+    check_config_unchanged(run_dir, _kept_checksum(run_dir))
     restart = f"Start another run with --initial {run_dir / POLICY_FILE}."
     restore = f"Restore it, or start another run with --initial {run_dir / POLICY_FILE}."
     config = named_inputs.with_absolute_paths(config)

@@ -21,6 +21,7 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
     flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     flags += "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     os.environ.setdefault("XLA_FLAGS", flags)
+    os.environ["CONGRASP_CHECKED_XLA_FLAGS"] = os.environ["XLA_FLAGS"]  # by every command, else
 
 import gc
 import pathlib

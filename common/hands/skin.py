@@ -113,6 +113,7 @@ HUMAN_HANDS = ("human", "mano")
 MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
 """Materials of a surface."""
 _LARGEST = 0.5  # m
+_SHORTEST = 1e-12  # length of a normal that has a direction
 _SECTIONS = 20  # sides of a housing
 _BEVEL = 0.45  # bevel of a housing's ends, in radii
 # Radius and half length of a joint's drum, in radii of its link
@@ -172,7 +173,9 @@ class Skin(NamedTuple):
         )
         points = np.einsum("vij,vj->vi", mixed[..., :3], self.points) + mixed[..., 3]
         normals = np.einsum("vij,vj->vi", mixed[..., :3], self.normals)
-        return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        # The normals of a vertex between two links may cancel out
+        lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _SHORTEST)
+        return points, normals / lengths
 
 
 @functools.lru_cache(maxsize=16)

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.io.spelling import folded
 
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
@@ -103,9 +104,10 @@ def runs_back(times: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(times) - times > _JITTER * np.median(np.abs(np.diff(times)))
 
 
-def distinct_names(names: Iterable[str], key: Callable[[str], str] = str.casefold) -> list[str]:
-    """Returns the names, with a number at each whose `key` repeats one's (in upper or lower case),
-    such as mug-2.
+def distinct_names(names: Iterable[str], key: Callable[[str], str] = folded) -> list[str]:
+    """Returns the names, with a number at each whose `key` repeats one's, such as mug-2.
+
+    By default no two of them are one name on any file system.
     """
     names = list(names)
     taken, given = {key(name) for name in names}, list[str]()

@@ -12,7 +12,6 @@ import os
 import pathlib
 import re
 import select
-import signal
 import subprocess
 import sys
 import threading
@@ -181,7 +180,11 @@ class _Helper:
                     ],
                     stdin=subprocess.DEVNULL,
                     pass_fds=[number],
-                    env={**_ONE_THREAD, **child_environment(JAX_PLATFORMS="cpu")},
+                    start_new_session=True,  # Ctrl-C on a terminal reaches only the caller
+                    env={
+                        **_ONE_THREAD,
+                        **child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore"),
+                    },
                 )
             self._running = process, here
         return self._running[1]
@@ -210,17 +213,27 @@ def serve(descriptor: int) -> None:
     Args:
       descriptor: file descriptor of the socket.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     for module in _PRELOADED:
         importlib.import_module(module)
     connection = multiprocessing.connection.Connection(descriptor)
-    while True:
-        try:
-            connection.send(_results(descriptor, *connection.recv()))
-        except (EOFError, OSError):
-            return
-        except Exception:  # for instance, a class of the caller's `__main__`
-            connection.send([])
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            _answer(connection, descriptor)
+
+
+def _answer(connection: multiprocessing.connection.Connection, descriptor: int) -> None:
+    """Makes the calls of one message; sends no results if they cannot be made.
+
+    Raises:
+      EOFError, OSError: the process at the other end is gone.
+    """
+    try:
+        results = _results(descriptor, *connection.recv())
+    except (EOFError, OSError):
+        raise
+    except Exception:  # for instance, a class of the caller's `__main__`
+        results = []
+    connection.send(results)
 
 
 def _results(

@@ -27,6 +27,7 @@ from congrasp.services.cli import suggestions
 from congrasp.services.cli.not_a_number import check_numbers
 from congrasp.services.cli.shell_specs import spec_of
 from congrasp.services.cli.terminal import ensure_width
+from congrasp.services.cli.variables import check_xla_flags, variable_error
 from congrasp.services.ops.interrupts import ending, interrupts_reach
 from congrasp.services.ops.lifetime import SIGNALS, follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
@@ -82,11 +83,18 @@ _OUTPUTS = ("out", "json", "png", "pictures", "video")
 """Parameters of commands with a file or a folder that they write."""
 _QUIET_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Categories that Python itself ignores."""
+_NUMPY_WARNINGS = (
+    "(divide by zero|invalid value|overflow|underflow) encountered",
+    "Mean of empty slice",
+    "All-NaN (slice|axis) encountered",
+    "Degrees of freedom <= 0",
+)
+"""Warnings of NumPy that tell a user nothing: commands check their results themselves."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
-_TELL_THEIR_END = ("train", "learner", "actor", "serve", "record")
-"""Commands that print or log themselves that a signal stopped them."""
+_TELL_THEIR_END = ("train", "learner", "actor", "serve", "record", "view")
+"""Commands that print or log themselves that a signal stopped them, once they have started."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LESS_MEMORY = (
@@ -124,6 +132,10 @@ def main(arguments: Sequence[str] | None = None) -> None:  # noqa: C901
         code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
         if _last_words(sys.stdout, "\n"):  # another pipe broke
+            raise
+        code = UNREAD
+    except SystemExit as end:  # rich raises it for a broken pipe
+        if not isinstance(end.__context__, BrokenPipeError):
             raise
         code = UNREAD
     except OSError as error:
@@ -196,21 +208,9 @@ def _said_by(error: Exception) -> tuple[str, int]:
         # No bad input: a run restarts its processes, since another program may have held the
         # memory.
         return f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1
-    unnamed = (
-        isinstance(error, AssertionError)
-        and "JAX" in str(getattr(error, "__notes__", ""))
-        and not str(error)
-    )
-    # None of JAX's platforms is there
-    unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")
-    for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
-        if name in os.environ:
-            said = f" ({str(error).strip().splitlines()[0]})" if str(error).strip() else ""
-            return (
-                f"{name} is '{os.environ[name]}', which does not work here{said}. Correct or unset "
-                f"it.",
-                USAGE_ERROR,
-            )
+    unusable = variable_error(error)
+    if unusable is not None:
+        return str(unusable), USAGE_ERROR
     raise error
 
 
@@ -228,20 +228,23 @@ def run(arguments: list[str]) -> int:
         remedy = suggestions.command_remedy(arguments, list(COMMANDS))
         raise CongraspError(f"There is no {kind} '{name}'.", remedy)
     _check_files(rest)
+    check_xla_flags()
     _prepare_environment()
+    interrupted = False
     with on_signal(interrupt=True) as stop:
         try:
-            with announced(f"Loading 'congrasp {name}'"):
-                call = _parsed(name, load(name), rest)
-            check_numbers(getattr(call, "keywords", {}))
-            _check_outputs(call)
             with interrupts_reach(stop):
+                with announced(f"Loading 'congrasp {name}'"):
+                    call = _parsed(name, load(name), rest)
+                check_numbers(getattr(call, "keywords", {}))
+                _check_outputs(call)
                 result = call()
         except KeyboardInterrupt:
+            interrupted = True
             result = None
             stop.wait(1.0)  # the thread that records the signal may be slightly late
         code = stop.exit_code or (result if isinstance(result, int) else 0)
-    if code in SIGNALLED and name not in _TELL_THEIR_END:
+    if code in SIGNALLED and (interrupted or name not in _TELL_THEIR_END):
         _last_words(sys.stderr, f"{ending(code)}\n")
     return code
 
@@ -361,6 +364,8 @@ def _prepare_environment() -> None:
     """
     own_environment()
     ensure_width()
+    for message in _NUMPY_WARNINGS:
+        warnings.filterwarnings("ignore", message, RuntimeWarning)
     folder = cache_folder("jax")
     if not can_cache(folder.parent, "XDG_CACHE_HOME"):
         warnings.filterwarnings("ignore", "Error writing persistent compilation cache")

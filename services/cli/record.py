@@ -63,8 +63,9 @@ def record(
     with contextlib.ExitStack() as stack:
         name = process_name("recorder")
         stack.enter_context(logging_as(log_format, role="recorder", id=name, run=run))
-        stop = stack.enter_context(on_signal())
+        # Ctrl-C interrupts the connection attempts
         transport = stack.enter_context(urls.connect(connect, "observer", certs=certs, run=run))
+        stop = stack.enter_context(on_signal())
         sinks = [] if live is None else [stack.enter_context(LiveServer(live))]
         for server in sinks:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")

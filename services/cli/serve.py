@@ -74,33 +74,35 @@ class Serve:
         metrics = ServerMetrics()
         with (
             self.watch.watched("server", self.name, self.run if self.connect else "", metrics),
-            on_signal() as stop,
             starting,
             contextlib.ExitStack() as stack,
         ):
             if self.connect:
-                source = self._source_of_run(stack, stop)
+                with on_signal() as stop:
+                    source = self._source_of_run(stack, stop)
+                if source is None:
+                    log("info", f"The server ends: {stop.reason}.")
+                    return stop.exit_code
             else:
                 source = follow_file(policy_file(self.policy, self.hand))
-            if source is None:
-                log("info", f"The server ends: {stop.reason}.")
-                return stop.exit_code
             transport = stack.enter_context(
                 urls.listen(self.listen, "server", certs=self.certs, insecure=self.insecure)
             )
+            # Ctrl-C interrupts the compilation, which is a part of this
             server = PolicyServer(
                 transport, self.name, source, on_answer=metrics.answer, on_batch=metrics.batch
             )
             metrics.health = server.health
-            starting.close()
-            health = server.health()
-            log(
-                "info",
-                f"Serving '{self.name}' at {self.listen}: hand {health['hand']}, version "
-                f"{health['version']}.",
-            )
-            stop.wait()
-            server.close()
+            with on_signal() as stop:
+                starting.close()
+                health = server.health()
+                log(
+                    "info",
+                    f"Serving '{self.name}' at {self.listen}: hand {health['hand']}, version "
+                    f"{health['version']}.",
+                )
+                stop.wait()
+                server.close()
             log("info", f"The server ends: {stop.reason}.")
         return stop.exit_code
 

@@ -68,11 +68,13 @@ class View:
             starting.enter_context(
                 announced("Loading the policies and compiling the studio's rules")
             )
-            with on_signal() as stop, view._page() as url:
+            # Ctrl-C interrupts the start, which may compile for a minute
+            with view._page() as url, on_signal() as stop:
                 starting.close()
                 print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
                 stop.wait()
-                return stop.exit_code
+        print(f"The studio ends: {stop.reason}.")
+        return stop.exit_code
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":
         """The page of a run: of its learner if that responds, else of its newest policy."""

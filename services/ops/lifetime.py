@@ -23,6 +23,9 @@ from congrasp.services.ops import causes
 
 GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
+GRACE_ALONE = 1.7
+"""The same for a command that a signal interrupts and that has no children: it has nothing to
+drain, and its files are complete or absent."""
 CHILD_GRACE = 2.0
 """Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must
 end.
@@ -60,7 +63,7 @@ class Stop(threading.Event):
 
 
 @contextlib.contextmanager
-def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop]:
+def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterator[Stop]:
     """Context with a `Stop` that signals set; outside the main thread, which alone Python signals,
     nothing sets it.
 
@@ -71,7 +74,7 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
     (`follow_parent`).
 
     Args:
-      grace: seconds from the signal to the forced end.
+      grace: seconds from the signal to the forced end; by default `GRACE`, or `GRACE_ALONE`.
       interrupt: also raises KeyboardInterrupt in the main thread, for code that does not poll.
     """
     stop = Stop()
@@ -87,9 +90,10 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
             return
         stop.signal = number[0]
         stop.set()
-        ends = time.monotonic() + grace
-        why = f"it did not end within {grace:g} s"
-        reader.settimeout(grace)
+        seconds = grace or _default_grace(interrupt)
+        ends = time.monotonic() + seconds
+        why = f"it did not end within {seconds:g} s"
+        reader.settimeout(seconds)
         with contextlib.suppress(TimeoutError):
             if reader.recv(1):
                 why = "a second signal came"
@@ -112,6 +116,12 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         for number, handler in previous.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def _default_grace(interrupt: bool) -> float:
+    """Seconds from a signal to the forced end of this process."""
+    has_children = any(child.poll() is None for child in list(_children))
+    return GRACE_ALONE if interrupt and not has_children else GRACE
 
 
 def _write_last_line(text: str) -> None:

@@ -23,6 +23,7 @@ _PLAIN, _PAINTED = (
 )
 _RINGS, _SECTIONS = 72, 160  # of a table top
 _DENSER = 1.6  # exponent of the radii of its rings; above one they are denser around the middle
+_SHORTEST = 1e-30  # a sum of normals that has a direction, m²
 _FADES = 0.55  # share of its radius from which it fades into the background
 
 
@@ -222,7 +223,8 @@ def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         around = owner[groups]  # (groups, size) faces that share a vertex
         near = np.einsum("gik,gjk->gij", flat[around], flat[around]) > CREASE
         normals[order[groups]] = np.einsum("gij,gjk->gik", near, cross[around])
-    return corners, (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3, 3)
+    lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _SHORTEST)
+    return corners, (normals / lengths).reshape(-1, 3, 3)
 
 
 def cut(

@@ -1,6 +1,7 @@
 """Cores and memory of this process, and work spread over processes, as scripts of users have it."""
 
 import operator
+import os
 import pathlib
 import signal
 import subprocess
@@ -53,6 +54,12 @@ _SCRIPTS = {
         print("RESULT", sum(parallel_map(abs, [Mass() for _ in range(64)])) // 64)
     """,
 }
+_INTERRUPTED = f"""
+try:
+    {_SPREAD.strip().replace(chr(10), chr(10) + "    ")}
+except KeyboardInterrupt:
+    pass
+"""
 _UNTOUCHED = """
 import logging, os, signal
 import gymnasium, jax, mujoco, trimesh  # some set variables themselves
@@ -143,6 +150,29 @@ def test_workers_end_with_a_killed_parent(tmp_path):
         parent.wait()
         _, alive = psutil.wait_procs(workers, timeout=15)
         assert not alive
+    finally:
+        parent.kill()
+
+
+@two_cores
+def test_interrupted_workers_print_nothing(tmp_path):
+    script = tmp_path / "spread.py"
+    script.write_text(_INTERRUPTED)
+    command = [sys.executable, script]
+    parent = subprocess.Popen(
+        command, cwd=_ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        workers: list[psutil.Process] = []
+        while len(workers) < 3 and time.monotonic() < deadline:
+            time.sleep(0.1)
+            workers = psutil.Process(parent.pid).children(recursive=True)
+        os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+        _, error = parent.communicate(timeout=30)
+        _, alive = psutil.wait_procs(workers, timeout=15)
+        assert not alive
+        assert error == ""
     finally:
         parent.kill()
 

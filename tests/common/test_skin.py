@@ -136,6 +136,14 @@ def test_flesh_lies_on_the_capsules_of_the_fingers(closure: float) -> None:
         assert distance.max() < 2e-3 and distance.min() > -2e-3 - 2e-3 * closure
 
 
+def test_normals_that_cancel_out_are_zero() -> None:
+    hand = get_hand("allegro")
+    skin = skin_of(hand)._replace(normals=np.zeros_like(skin_of(hand).normals))
+    with np.errstate(all="raise"):
+        _, normals = skin.posed(skin.origins, np.tile(np.eye(3), (len(hand.links), 1, 1)))
+    assert not normals.any()
+
+
 @pytest.mark.parametrize("name", HANDS)
 def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
     hand, skin = get_hand(name), skin_of(get_hand(name))

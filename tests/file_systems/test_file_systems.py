@@ -123,10 +123,6 @@ CASES = {
         Journal(folder / "Mug.jsonl").write(a=1)
         Journal(folder / "mug.jsonl").write(a="second")
     """,
-    "names of one command": """
-        from congrasp.common.io.spelling import check_distinct
-        check_distinct(folder, ["mug", "cup", "Mug"])
-    """,
 }
 
 

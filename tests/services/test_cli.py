@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import threading
 from pathlib import Path
 from unittest import mock
@@ -288,6 +289,53 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     said = f"{name} is 'abacus', which does not work here (invalid value for {name})"
     line = said if name else "JAX_PLATFORMS is 'abacus', which does not work here"
     assert capsys.readouterr().err == f"congrasp: error: {line}. Correct or unset it.\n"
+
+
+def test_reader_that_is_gone_ends_a_table(monkeypatch):
+    """As rich reports it, whose consoles raise SystemExit(1)."""
+
+    def write(arguments):
+        try:
+            raise BrokenPipeError
+        except BrokenPipeError:
+            sys.exit(1)
+
+    monkeypatch.setattr(cli, "run", write)
+    with pytest.raises(SystemExit, match=str(cli.UNREAD)):
+        cli.main([])
+
+
+def test_numpy_warnings_reach_no_user():
+    program = """
+        import functools, numpy as np
+        from congrasp.services.cli import main
+        def work():
+            np.zeros(1) / np.zeros(1), np.mean(np.zeros(0)), np.float64(1e300) * np.float64(1e300)
+        main.load = lambda name: lambda rest: functools.partial(work)
+        main.main(["plot"])
+    """
+    done = python("-c", textwrap.dedent(program))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_jax_variable_whose_value_an_error_quotes_is_named(monkeypatch, capsys):
+    error = RuntimeError("Unknown backend: 'abacus' requested")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.setenv("JAX_PLATFORM_NAME", "abacus")
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "JAX_PLATFORM_NAME is 'abacus'" in line
+
+
+@pytest.mark.parametrize("flags", ["--nonsense", "no_such_file"])
+def test_unknown_flags_of_xla_are_an_error(flags, tmp_path):
+    arguments = ("train", "--run-dir", tmp_path / "run")
+    done = python("-m", "congrasp", *arguments, env={"XLA_FLAGS": flags})
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"XLA_FLAGS is '{flags}'" in line
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_platform(monkeypatch):

@@ -28,7 +28,7 @@ def swallow():
         pass
 
 def work():
-    if KIND == "callback":
+    if KIND in ("callback", "loading"):
         gc.callbacks.append(collect)
         gc.collect()
     elif KIND == "handler":
@@ -40,13 +40,18 @@ def work():
             check_stopped()
         time.sleep(0.01)
 
-main.COMMANDS["loop"] = "a loop"
-main.load = lambda name: lambda rest: __import__("functools").partial(work)
-main.main(["loop"])
+def load(name):
+    if KIND == "loading":
+        work()
+    return lambda rest: __import__("functools").partial(work)
+
+# A command that tells its end itself, but only after it has started
+main.load = load
+main.main(["serve" if KIND == "loading" else "plot"])
 """
 
 
-@pytest.mark.parametrize("kind", ["plain", "callback", "handler"])
+@pytest.mark.parametrize("kind", ["plain", "callback", "handler", "loading"])
 @pytest.mark.parametrize(
     ("number", "code", "word"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
 )
