@@ -107,7 +107,7 @@ class Grasp:
         from congrasp.actors.attempts import Phases
         from congrasp.services.grasp.grasper import open_grasper
         from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
-        from congrasp.services.viz.render import film_of
+        from congrasp.services.viz.film import film_of
         from congrasp.services.viz.views import view_of
 
         if not self.objects:

@@ -24,8 +24,8 @@ from congrasp.services.assets.objects.options import ImportOptions, check_option
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import read_request
+from congrasp.services.viz.film import Film
 from congrasp.services.viz.object_sheet import import_sheet, mesh_of_file
-from congrasp.services.viz.render import Film
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.views import View
 

@@ -19,16 +19,15 @@ from congrasp.common.hands.motors import (
 from congrasp.common.hands.skin import Skin
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.viz.camera import fit
+from congrasp.services.viz.hand_shapes import Look, posed_hand, upright
 from congrasp.services.viz.raster import render_fitted, render_scene
 from congrasp.services.viz.shapes import (
     Shape,
     arrow,
     beads,
-    fit,
     object_shape,
-    posed_hand,
     shape_points,
-    upright,
 )
 from congrasp.services.viz.sheets import contact_sheet, stacked
 
@@ -43,7 +42,8 @@ def _placed(
 ) -> list[Shape]:
     """The hand upright with finger angles (F,), some of its links in another colour."""
     shares = np.isin(np.arange(len(hand.links)), moved)
-    return [posed_hand(hand, q, np.zeros(3), upright(hand), OBJECT, shares, skin=skin)]
+    look = Look(OBJECT, shares)
+    return [posed_hand(hand, q, np.zeros(3), upright(hand), look, skin)]
 
 
 def _poses(hand: Hand, skin: Skin | None = None) -> dict[str, list[Shape]]:
@@ -180,4 +180,5 @@ def _grip(hand: Hand, grip: "Grip") -> list[Shape]:
     placed = turn * Rotation.from_quat(grip.object_quaternion, scalar_first=True)
     mesh = grip.obj.visual_vertices, grip.obj.visual_faces
     obj = object_shape(mesh, turn.apply(grip.object_position), placed.as_quat(scalar_first=True))
-    return [posed_hand(hand, grip.q, np.zeros(3), turn, WAYPOINT, grip.touching), obj]
+    look = Look(WAYPOINT, grip.touching)
+    return [posed_hand(hand, grip.q, np.zeros(3), turn, look), obj]

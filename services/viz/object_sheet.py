@@ -26,16 +26,15 @@ from congrasp.services.assets.objects.options import length, size_in_words
 from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.assets.objects.sources import Source
 from congrasp.services.record.palette import HEADING, OBJECT, PIECES, WAYPOINT, region_colours
+from congrasp.services.viz.hand_shapes import posed_hand, upright
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import (
     Shape,
     arrow,
     beads,
     object_shape,
-    posed_hand,
     shape_points,
     table_shape,
-    upright,
 )
 from congrasp.services.viz.sheets import contact_sheet
 

@@ -19,30 +19,33 @@ from congrasp.services.cli.main import load
 from congrasp.services.record.palette import FLESH
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
+from congrasp.services.viz.camera import Camera, fit
+from congrasp.services.viz.episode_scene import TOUCHING, episode_shapes
+from congrasp.services.viz.film import Film, save_episode_video
+from congrasp.services.viz.hand_shapes import capsule_shapes, skin_colours
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
-    Film,
     episode_sheet,
     episode_title,
     grasp_picture,
     key_steps,
     render_episode_frames,
-    save_episode_video,
 )
 from congrasp.services.viz.shapes import (
-    Camera,
     Shape,
     arrow,
     beads,
     between,
-    capsule_shapes,
-    fit,
-    skin_colours,
 )
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
-from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
+from congrasp.services.viz.views import (
+    View,
+    camera_of,
+    view_of,
+    views,
+)
 from tests.children import python
 from tests.episodes import CONTROL_DT, episode
 
@@ -150,7 +153,7 @@ def test_painted_regions_meet_where_their_points_do() -> None:
 
 def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     sphere = trimesh.creation.icosphere(2, 0.1)
-    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces), 0.005, 12_000)
+    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces))
     exact = corners / np.linalg.norm(corners, axis=-1, keepdims=True)
 
     def degrees_off(normals: np.ndarray) -> float:
@@ -160,7 +163,7 @@ def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     assert len(corners) > 2 * len(sphere.faces)
     assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
-    corners, smooth = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
+    corners, smooth = cut(*smooth_corners(box.vertices, box.faces))
     np.testing.assert_allclose(
         smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6
     )
@@ -173,7 +176,7 @@ def flat_normals(corners: np.ndarray) -> np.ndarray:
 
 def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     box = trimesh.creation.box((0.1, 0.06, 0.02))
-    corners, _ = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
+    corners, _ = cut(*smooth_corners(box.vertices, box.faces))
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert sides.max() <= 0.00501  # at most 5 mm
     mesh = trimesh.Trimesh(

@@ -17,8 +17,8 @@ from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.meshes import import_source
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import find_sources
+from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.shapes import Camera
 from congrasp.services.viz.views import _object
 from tests.episodes import episode
 
