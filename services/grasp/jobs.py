@@ -25,7 +25,7 @@ from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, s
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.viz.film import Film
-from congrasp.services.viz.object_sheet import import_sheet, mesh_of_file
+from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.views import View
 
