@@ -32,7 +32,7 @@ _CONTACT = 2.0
 _FINGER = 1.0
 _OBJECT = 1.0
 """Weights of the seen shares of touching links, of all fingers and of the object."""
-_BROAD = 1.0
+_BROAD = 2.5
 """Weight of the object's broad side."""
 _BEHIND = 1.5
 _BEFORE = 0.8
