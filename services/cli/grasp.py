@@ -65,7 +65,7 @@ class Grasp:
     """Constraints of the grasp."""
     video: bool = False
     """Also write grasp.mp4, from the reach to the end of the hold, in real time."""
-    size: str = "1280x720"
+    size: str = "960x720"
     """Width and height of the video, pixels."""
     fps: float = 25.0
     """Frames per second of the video."""

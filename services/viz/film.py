@@ -38,7 +38,7 @@ _LEAST_CAPTIONED_HEIGHT = 200
 class Film(NamedTuple):
     """Style of a film."""
 
-    size: tuple[int, int] = (1280, 720)
+    size: tuple[int, int] = (960, 720)
     """Width and height in pixels, both even."""
     fps: float = 25.0
     """Frames per second."""
