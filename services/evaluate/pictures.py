@@ -162,7 +162,7 @@ def _sheet(strips: Sequence[_Strip], title: str) -> np.ndarray:
             _SIZE,
             strip.first_caption,
             strip.last_caption,
-            until=strip.last_step,
+            last_step=strip.last_step,
         )
         images += frames
         captions += frame_captions
