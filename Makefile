@@ -1,5 +1,6 @@
 # quickstart: set up and train a small policy.  test, test-all, coverage, lint: check the code.  newest: test with the newest
-# versions that pyproject.toml admits.  docs: build the site.  bench: install its peers, print the benchmark tables.
+# versions that pyproject.toml admits.  docs: build the site.  pictures: draw the pictures of the
+# pages again (ARGS="--scans DIR …").  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_motors test_priority \
@@ -18,7 +19,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 # Modules are compiled when they are first imported: an environment that forbids it would pay in every process again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: quickstart test test-all newest check coverage lint docs bench install clean
+.PHONY: quickstart test test-all newest check coverage lint docs pictures bench install clean
 .DEFAULT_GOAL := quickstart
 
 # What the first minutes need; the other targets add the development dependencies.
@@ -51,6 +52,10 @@ lint: install
 docs: install
 	$(VENV)/bin/python -m congrasp.services.evaluate.results
 	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
+
+# External inputs are options: make pictures ARGS="--scans object_sim --run runs/quickstart"
+pictures: install
+	PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/python -m tests.pictures $(ARGS)
 
 bench:
 	$(MAKE) install EXTRA=bench

@@ -16,7 +16,7 @@ from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm.description import Arm
 from congrasp.services.assets.hands.link_geometry import geom_mesh
 from congrasp.services.record.episode import UNLIMITED, MovedArm
-from congrasp.services.viz.shapes import upright
+from congrasp.services.viz.hand_shapes import upright
 
 _HAND = "hand/"
 _TABLE, _OBJECT = "grasp_table", "grasp_object"

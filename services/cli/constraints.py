@@ -339,7 +339,7 @@ def show(
     in_range(0, len(constraints.arrays["rest"]), rest=rest)
     show_facts(describe(constraints))
     if png is not None:
-        from congrasp.services.viz.object_sheet import constraint_sheet
+        from congrasp.services.viz.constraint_sheet import constraint_sheet
 
         best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
         save_drawing(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))

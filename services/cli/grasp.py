@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 NOT_HELD, BAD_INPUT = 1, 2
 _MOST_ATTEMPTS = 1024
+_FILMED_APPROACH_S = 0.7
+_FILMED_LIFT_M = 0.12
+"""Approach and lift of a film, which shows the grasp on the table."""
 
 
 def _field(option: Option) -> tuple[str, Any, Any]:
@@ -61,8 +64,8 @@ class Grasp:
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints()  # noqa: RUF009
     """Constraints of the grasp."""
     video: bool = False
-    """Also write grasp.mp4, in real time."""
-    size: str = "1280x720"
+    """Also write grasp.mp4, from the reach to the end of the hold, in real time."""
+    size: str = "960x720"
     """Width and height of the video, pixels."""
     fps: float = 25.0
     """Frames per second of the video."""
@@ -81,13 +84,13 @@ class Grasp:
     """Number of attempts simulated in parallel, at most 1024."""
     seed: int = 0
     """Seed of the attempts."""
-    approach: float = 0.0
+    approach: float | None = None
     """Seconds in which the hand first comes from the side of the table; longer where an arm needs
-    it (1 m/s).
+    it (1 m/s). By default 0, and 0.7 with --video.
     """
-    lift: float = 0.0
+    lift: float | None = None
     """Metres by which the hand lifts the object off the table, which then stays; 0 removes the
-    table.
+    table. By default 0, and 0.12 with --video.
     """
     rest: str = ""
     """Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows
@@ -102,12 +105,18 @@ class Grasp:
     arm: Annotated[ArmOptions, tyro.conf.OmitArgPrefixes] = ArmOptions()  # noqa: RUF009
     """The arm that carries the hand."""
 
+    def _default(self, value: float | None, filmed: float) -> float:
+        """The value of an option; without one, `filmed` with a video and zero otherwise."""
+        if value is not None:
+            return value
+        return filmed if self.video else 0.0
+
     def __call__(self) -> int:
         """Grasps one object after another."""
         from congrasp.actors.attempts import Phases
         from congrasp.services.grasp.grasper import open_grasper
         from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
-        from congrasp.services.viz.render import film_of
+        from congrasp.services.viz.film import film_of
         from congrasp.services.viz.views import view_of
 
         if not self.objects:
@@ -116,10 +125,12 @@ class Grasp:
             )
         check_together(self, ("size", "fps", "overlays"), "video")
         in_range(1, _MOST_ATTEMPTS, "side by side", attempts=self.attempts)
-        in_range(0.0, 10.0, "seconds", approach=self.approach)
-        in_range(0.0, 0.5, "metres", lift=self.lift)
+        approach = self._default(self.approach, _FILMED_APPROACH_S)
+        lift = self._default(self.lift, _FILMED_LIFT_M)
+        in_range(0.0, 10.0, "seconds", approach=approach)
+        in_range(0.0, 0.5, "metres", lift=lift)
         in_range(1.0, 120.0, "frames a second", fps=self.fps)
-        phases = Phases(self.approach, self.lift)
+        phases = Phases(approach, lift)
         grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
         found, results = find_objects(self.objects, self.folder)
         settings = Settings(

@@ -56,7 +56,8 @@ def episode(
     from congrasp.services.grasp.files import save_robot_video
     from congrasp.services.record.episode import arm_of_episode
     from congrasp.services.record.reader import pick_episode
-    from congrasp.services.viz.render import Film, episode_sheet, save_episode_video
+    from congrasp.services.viz.film import Film, save_episode_video
+    from congrasp.services.viz.render import episode_sheet
     from congrasp.services.viz.sheets import save_png
 
     in_range(1, frames=frames)

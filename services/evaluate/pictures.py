@@ -17,8 +17,9 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.experiment import Experiment, Result
 from congrasp.services.record.episode import phases_of
 from congrasp.services.record.palette import OBJECT
+from congrasp.services.viz.hand_shapes import skin_colours
 from congrasp.services.viz.render import episode_strip, grasp_steps
-from congrasp.services.viz.shapes import Shape, skin_colours, table_shape
+from congrasp.services.viz.shapes import Shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.triangles import triangles_of
 
@@ -161,7 +162,7 @@ def _sheet(strips: Sequence[_Strip], title: str) -> np.ndarray:
             _SIZE,
             strip.first_caption,
             strip.last_caption,
-            until=strip.last_step,
+            last_step=strip.last_step,
         )
         images += frames
         captions += frame_captions

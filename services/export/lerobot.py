@@ -25,14 +25,13 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.services.export.frames import facts, skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.export.urdf import robot_urdf
+from congrasp.services.viz.camera import Camera, fit
+from congrasp.services.viz.hand_shapes import skin_shape
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.shapes import (
-    Camera,
     Shape,
     arm_shapes,
-    fit,
     object_shape,
-    skin_shape,
     table_shape,
 )
 from congrasp.services.viz.sheets import save_video

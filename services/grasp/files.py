@@ -21,18 +21,19 @@ from congrasp.services.export.motion_file import (
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.record.episode import MovedArm
 from congrasp.services.record.scene import save_episode
+from congrasp.services.viz.camera import Camera, fit
+from congrasp.services.viz.episode_scene import episode_shapes
+from congrasp.services.viz.film import Film, save_episode_video
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.render import (
-    Film,
     episode_sheet,
     grasp_picture,
     grasp_steps,
     render_episode_frames,
-    save_episode_video,
 )
-from congrasp.services.viz.shapes import Camera, Shape, arm_shapes, fit, shape_points
+from congrasp.services.viz.shapes import Shape, arm_shapes, shape_points
 from congrasp.services.viz.sheets import save_png
-from congrasp.services.viz.views import View, camera_of, episode_shapes, views
+from congrasp.services.viz.views import View, camera_of
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = (
     "grasp.npz",
@@ -51,8 +52,6 @@ OBJECT = "object.png"
 
 
 _SMALL = (320, 240)  # pixels
-_HELD = 0.5  # s of the hold in videos
-_FRAMED = 10  # control steps between the frames that the video's camera must contain
 ARM_CSV, ARM_TRAJECTORY, ARM_PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
 _SIZE = (1280, 960)  # pixels
 _AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
@@ -104,20 +103,10 @@ def save_grasp(
         save_png(folder / PORTRAIT, grasp_picture(episode, last, view=view))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
-        until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
-        # The hand enters the picture
-        filmed = [
-            *range(found.first("grasp") // 2, until, _FRAMED),
-            until,
-        ]
-        aspect = film.size[0] / film.size[1]
         if arm:
-            save_robot_video(folder / VIDEO, arm, episode, film, [*steps[:-1], until], until)
+            save_robot_video(folder / VIDEO, arm, episode, film, steps)
         else:
-            seen_from = camera_of(
-                episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays
-            )
-            save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
+            save_episode_video(folder / VIDEO, episode, film._replace(view=view))
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 
@@ -188,7 +177,6 @@ def save_robot_video(
     episode: Message,
     film: Film,
     steps: Sequence[int],
-    until: int | None = None,
 ) -> None:
     """Writes an MP4 of an episode with the whole robot.
 
@@ -198,14 +186,13 @@ def save_robot_video(
       episode: the episode.
       film: size, frame rate and overlays.
       steps: control steps in which the camera shows all of the robot.
-      until: see `save_episode_video`.
 
     Raises:
       CongraspError: see `save_episode_video`.
     """
     camera = _robot_camera(arm, episode, steps, film.size[0] / film.size[1])
     around = functools.partial(_robot_shapes, arm, episode)
-    save_episode_video(path, episode, film, camera, until=until, around=around)
+    save_episode_video(path, episode, film, camera, around=around)
 
 
 def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:

@@ -24,9 +24,10 @@ from congrasp.services.assets.objects.options import ImportOptions, check_option
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.viz.object_sheet import import_sheet, mesh_of_file
-from congrasp.services.viz.render import Film
+from congrasp.services.viz.film import Film
+from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
 from congrasp.services.viz.sheets import contact_sheet, save_png
+from congrasp.services.viz.version import RENDERER_VERSION
 from congrasp.services.viz.views import View
 
 SHEET, SUMMARY = "summary.png", "summary.json"
@@ -147,7 +148,11 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
         key = key_of(at.digest(), options, given, grasper.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
-        drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
+        drawn = [
+            RENDERER_VERSION,
+            settings.film and [*settings.film],
+            settings.view and [*settings.view],
+        ]
         filmed = settings.film is None or (
             before and json.loads(json.dumps(drawn)) == before.get("drawn")
         )

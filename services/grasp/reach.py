@@ -24,7 +24,7 @@ from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import EPISODE
-from congrasp.services.viz.shapes import link_frames, upright
+from congrasp.services.viz.hand_shapes import link_frames, upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """Limits of the wrist: m/s, m/s^2 and rad/s."""

@@ -49,7 +49,10 @@ INK = "#262b35"
 _EDGE, _MOST_FACES = 0.006, 12_000
 """Edge length below which no edge is split, m; most faces."""
 _OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # for coloured surfaces
-_AMONG = 8  # known points of a mean colour
+_NEIGHBOURS = 8
+"""Known points that determine a colour."""
+_SIMILAR = 24.0
+"""Distance of similar colours in sRGB from 0 to 255, a standard deviation."""
 
 
 def finer(
@@ -147,14 +150,25 @@ def region_colours(points: np.ndarray, avoid: np.ndarray) -> Colours:
 
 
 def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
-    """(n, 3) uint8 sRGB at points (n, 3) of a surface: means of the nearest known points, by their
-    distances.
+    """(n, 3) uint8 sRGB at points (n, 3) of a surface, from the nearest known points.
 
-    The single nearest one would give edges between two colours teeth.
+    The known point whose colour most of its neighbours share, by their distances, wins; the result
+    is the mean of the similar ones. So an edge between two colours is sharp, and has no teeth as
+    with the single nearest point.
     """
-    among = np.arange(min(_AMONG, len(colours.points))) + 1
-    distance, index = cKDTree(colours.points).query(points, k=among)
+    neighbours = np.arange(min(_NEIGHBOURS, len(colours.points))) + 1
+    distance, index = cKDTree(colours.points).query(points, k=neighbours)
     width = np.maximum(distance.mean(1, keepdims=True), 1e-9)
-    weight = np.exp(-((distance / width) ** 2))
-    mean = np.einsum("nk,nkd->nd", weight / weight.sum(1, keepdims=True), colours.values[index])
+    weight = np.exp(-((distance / width) ** 2)).astype(np.float32)
+    values = colours.values[index].astype(np.float32)
+    best = np.full(len(points), -1.0, np.float32)
+    mean = np.zeros((len(points), 3), np.float32)
+    for candidate in range(len(neighbours)):
+        apart = np.square(values - values[:, candidate, None]).sum(-1)
+        similar = weight * np.exp(-apart / (2 * _SIMILAR**2))
+        support = similar.sum(1)
+        is_better = support > best
+        best[is_better] = support[is_better]
+        total = np.einsum("nk,nkd->nd", similar[is_better], values[is_better])
+        mean[is_better] = total / support[is_better, None]
     return np.round(mean).astype(np.uint8)

@@ -41,13 +41,10 @@ from congrasp.services.record.scene import save_episode
 from congrasp.services.studio.drawing import vector
 from congrasp.services.studio.server import Download
 from congrasp.services.studio.state import Studio, tool_of
-from congrasp.services.viz.render import (
-    Film,
-    grasp_steps,
-    render_episode_frames,
-    save_episode_video,
-)
-from congrasp.services.viz.shapes import Camera, link_frames, skin_colours
+from congrasp.services.viz.camera import Camera
+from congrasp.services.viz.film import Film, save_episode_video
+from congrasp.services.viz.hand_shapes import link_frames, skin_colours
+from congrasp.services.viz.render import grasp_steps, render_episode_frames
 from congrasp.services.viz.sheets import png_of
 
 TOUCH = 0.05

@@ -1,113 +1,84 @@
-"""Figures of a run from its recordings: learning curves, reward terms, episodes and all other
-metrics.
-"""
+"""Figures of a run from its recordings: learning curves, reward terms, episodes, and details."""
 
 import dataclasses
 import io
-import json
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
-from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.metrics import DIVERGED
 from congrasp.services.record.palette import INK
 from congrasp.services.record.reader import read_metrics
-
-_KINDS = {"rad": "angle", "m": "distance", "": "share of links"}
-TITLES = {
-    **json.loads(pathlib.Path(__file__).with_name("titles.json").read_text()),
-    f"episode/{DIVERGED}": ("Diverged physics", "share of episodes"),
-    **{
-        f"success/{constraint.name}": (f"Success with {constraint.title}", "share of episodes")
-        for constraint in CONSTRAINTS
-        if constraint.blocks
-    },
-    **{
-        f"episode/mask_{block}": (f"Episodes with {block.replace('_', ', ')}", "share of episodes")
-        for constraint in CONSTRAINTS
-        for block in constraint.blocks
-    },
-    **{
-        f"episode/{spec.name}": (
-            f"{constraint.title.capitalize()} error: {_KINDS[spec.unit]}",
-            spec.unit or "share",
-        )
-        for constraint in CONSTRAINTS
-        for spec in constraint.errors
-    },
-}
-"""Title, unit and, where these are not enough, the meaning of each metric."""
-_UNITS = {
-    "_per_second": "1/s",
-    "_seconds": "s",
-    "_rad": "rad",
-    "_m": "m",
-    "_bytes": "bytes",
-    "_ratio": "share",
-}
-"""Units of metrics without a title, by the endings of their names."""
-
-
-def titled(metric: str) -> tuple[str, str]:
-    """Title and unit of a metric by its name after the process; the title of an unknown one is its
-    name in words.
-    """
-    if metric in TITLES:
-        title, unit, *_ = TITLES[metric]
-        return title, unit
-    group, _, name = metric.rpartition("/")
-    ending = next((end for end in _UNITS if name.endswith(end)), "")
-    words = name.removesuffix(ending).replace("_", " ")
-    if group == "term":
-        return words.capitalize(), "reward"
-    if group == "failure":
-        return f"Lost objects: {words}", "share of episodes"
-    return (f"{group.replace('_', ' ')}: {words}" if group else words).capitalize(), _UNITS.get(
-        ending, ""
-    )
-
+from congrasp.services.viz.metric_titles import titled
 
 Series = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Steps and values of each metric of a run, by `<role>/<name>/<metric>`."""
 Runs = Mapping[str, Series]
 """Runs by their names for a legend."""
-_COLUMNS = 4
-QUIET, _GRID = "#6b7280", "#e3e6ea"
+QUIET = "#6b7280"
+"""Colour of labels."""
+_GRID = "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
+"""Colours of lines, in turn."""
+_COLUMNS = 4
+_PANEL_WIDTH_IN = 3.6
+_PANEL_HEIGHT_IN = 2.5
+_TITLE_HEIGHT_IN = 0.6
+_DOTS_PER_IN = 130
 _MEANINGLESS = {"episode/object_index"}
-_LEGEND = 8
+"""Metrics whose mean has no meaning."""
+_MOST_IN_LEGEND = 8
 """Largest number of lines for which a panel has a legend."""
+_SMOOTHED_SHARE = 40
+"""A long curve is smoothed over this part of its length."""
+_LEAST_WINDOW = 3
+"""Shorter windows are not smoothed."""
+_FEW_POINTS = 20
+"""Fewer points are marked."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One plot: its title, the unit of its vertical axis, and the metrics (after the process's
-    name) it shows.
-    """
+    """One plot."""
 
     title: str
     unit: str
+    """Unit of its vertical axis."""
     metrics: tuple[str, ...]
+    """Its metrics, named without the process."""
+
+
+class _Line(NamedTuple):
+    """A line of a panel."""
+
+    label: str
+    steps: np.ndarray
+    values: np.ndarray
 
 
 def _panel(metric: str) -> Panel:
     """A panel of one metric."""
-    return Panel(*titled(metric), (metric,))
+    title, unit = titled(metric)
+    return Panel(title, unit, (metric,))
 
 
 LEARNING = (
-    *map(
-        _panel,
-        ("episode/return", "episode/success", "episode/links_at_removal", "steps_per_second"),
-    ),
+    _panel("episode/return"),
+    _panel("episode/success"),
+    _panel("episode/links_at_removal"),
+    _panel("steps_per_second"),
     Panel("Policy lag", "versions", ("staleness_mean", "staleness_max")),
-    *map(_panel, ("kl", "imitation_kl", "policy_loss", "value_loss", "explained_variance")),
-    *map(_panel, ("action_std", "learning_rate", "clip_fraction")),
+    _panel("kl"),
+    _panel("imitation_kl"),
+    _panel("policy_loss"),
+    _panel("value_loss"),
+    _panel("explained_variance"),
+    _panel("action_std"),
+    _panel("learning_rate"),
+    _panel("clip_fraction"),
 )
 """Panels of the first figure; those without data are left out."""
 
@@ -129,7 +100,7 @@ def plot_runs(
       CongraspError: there are no metrics, or a file cannot be written.
     """
     runs = {}
-    for path, label in zip(paths, _labels(paths), strict=True):
+    for path, label in zip(paths, _run_names(paths), strict=True):
         runs[label] = read_metrics(path)
         if not runs[label]:
             raise CongraspError(
@@ -141,27 +112,28 @@ def plot_runs(
     return written
 
 
-def _labels(paths: Sequence[pathlib.Path]) -> list[str]:
-    """Names of runs for a legend: those of their folders, or the whole paths if two have the same
-    name.
-    """
+def _run_names(paths: Sequence[pathlib.Path]) -> list[str]:
+    """Names of runs for a legend: their folders, or the whole paths if two have the same name."""
     names = [path.resolve().name for path in paths]
-    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        return [str(path) for path in paths]
+    return names
 
 
 def save(figure: Any, stem: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
     """Writes a figure as `<stem>.<format>` for each format; returns the files."""
     files = []
     for kind in formats:
-        files.append(stem.with_name(f"{stem.name}.{kind}"))
-        write_atomically(files[-1], encoded(figure, kind))
+        file = stem.with_name(f"{stem.name}.{kind}")
+        write_atomically(file, encoded(figure, kind))
+        files.append(file)
     return files
 
 
 def encoded(figure: Any, kind: str = "png") -> bytes:
     """A figure as the content of a file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=130)
+    figure.savefig(buffer, format=kind, dpi=_DOTS_PER_IN)
     # The layout is computed; another format would compute it again
     figure.set_layout_engine("none")
     return buffer.getvalue()
@@ -180,7 +152,7 @@ def panel_grid(count: int, height: float, title: str) -> tuple[Any, list[Any]]:
     """A figure of `count` panels, of a height in inches, in rows of up to four; and their axes."""
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
-    figure = new_figure(3.6 * columns, 0.6 + height * rows, title)
+    figure = new_figure(_PANEL_WIDTH_IN * columns, _TITLE_HEIGHT_IN + height * rows, title)
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for unused in axes[count:]:
         unused.set_axis_off()
@@ -205,63 +177,81 @@ def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
     Every metric of the runs is in exactly one panel, except those whose mean has no meaning, and
     constant ones outside of the learning curves.
     """
-    names = {_metric(name) for series in runs.values() for name in series} - _MEANINGLESS
-    learning = [
-        dataclasses.replace(panel, metrics=shown)
-        for panel in LEARNING
-        if (shown := tuple(metric for metric in panel.metrics if metric in names))
-    ]
-    rest = sorted(
-        names - {metric for panel in learning for metric in panel.metrics} - _constants(runs)
-    )
+    metrics = set()
+    for series in runs.values():
+        metrics |= {_metric(name) for name in series}
+    metrics -= _MEANINGLESS
+    learning = _learning_panels(metrics)
+    rest = metrics - _constants(runs)
+    for panel in learning:
+        rest -= set(panel.metrics)
+    terms: list[Panel] = []
+    episodes: list[Panel] = []
+    details: list[Panel] = []
+    for metric in sorted(rest):
+        if metric.startswith("term/"):
+            terms.append(_panel(metric))
+        elif metric.startswith("episode/"):
+            episodes.append(_panel(metric))
+        else:
+            details.append(_panel(metric))
     groups = {
         "learning": ("Learning", learning),
-        "reward_terms": ("Reward terms, sum over an episode", _panels(rest, "term/")),
-        "episodes": ("Episodes", _panels(rest, "episode/")),
-        "details": (
-            "Details",
-            [_panel(m) for m in rest if not m.startswith(("term/", "episode/"))],
-        ),
+        "reward_terms": ("Reward terms, sum over an episode", terms),
+        "episodes": ("Episodes", episodes),
+        "details": ("Details", details),
     }
-    return {name: group for name, group in groups.items() if group[1]}
+    return {name: (title, panels) for name, (title, panels) in groups.items() if panels}
+
+
+def _learning_panels(metrics: set[str]) -> list[Panel]:
+    """The learning curves with their present metrics, without empty ones."""
+    panels = []
+    for panel in LEARNING:
+        present = tuple(metric for metric in panel.metrics if metric in metrics)
+        if present:
+            panels.append(dataclasses.replace(panel, metrics=present))
+    return panels
 
 
 def _constants(runs: Runs) -> set[str]:
     """Metrics whose curves, each of several points, all have one value."""
-    values: dict[str, list[np.ndarray]] = {}
+    curves: dict[str, list[np.ndarray]] = {}
     for series in runs.values():
-        for name, (_, found) in series.items():
-            values.setdefault(_metric(name), []).append(found[np.isfinite(found)])
-    return {
-        metric
-        for metric, found in values.items()
-        if all(len(curve) > 1 for curve in found) and len(np.unique(np.concatenate(found))) == 1
-    }
+        for name, (_, values) in series.items():
+            curves.setdefault(_metric(name), []).append(values[np.isfinite(values)])
+    constants = set()
+    for metric, finite in curves.items():
+        have_several_points = all(len(values) > 1 for values in finite)
+        if have_several_points and len(np.unique(np.concatenate(finite))) == 1:
+            constants.add(metric)
+    return constants
 
 
 def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
-    """Draws one figure of small multiples.
-
-    The label of a line names its run if there are several, its process if there are several, and
-    its metric if the panel has two.
-    """
-    figure, grid = panel_grid(len(panels), 2.5, title)
+    """Draws one figure of small multiples."""
+    figure, grid = panel_grid(len(panels), _PANEL_HEIGHT_IN, title)
     for axes, panel in zip(grid, panels, strict=True):
-        lines = [
-            (_label(run, name, panel, runs), *curve)
-            for run, series in runs.items()
-            for name, curve in series.items()
-            if _metric(name) in panel.metrics
-        ]
-        for i, (label, steps, values) in enumerate(lines):
-            _curve(axes, steps, values, COLOURS[i % len(COLOURS)], label)
+        lines = _lines(panel, runs)
+        for i, line in enumerate(lines):
+            _draw_line(axes, line, COLOURS[i % len(COLOURS)])
         style(axes, panel.title, "update", panel.unit)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4), useOffset=False)
         axes.yaxis.get_offset_text().set(fontsize=7, color=QUIET)
         axes.margins(x=0.02)
-        if 1 < len(lines) <= _LEGEND:
+        if 1 < len(lines) <= _MOST_IN_LEGEND:
             axes.legend(fontsize=7, frameon=False, labelcolor=QUIET)
     return figure
+
+
+def _lines(panel: Panel, runs: Runs) -> list[_Line]:
+    """The lines of a panel."""
+    lines = []
+    for run, series in runs.items():
+        for name, (steps, values) in series.items():
+            if _metric(name) in panel.metrics:
+                lines.append(_Line(_label(run, name, panel, runs), steps, values))
+    return lines
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
@@ -276,17 +266,24 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
     return base + np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
 
 
-def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
-    """Draws a metric; a long one also smoothed."""
-    window = len(values) // 40
-    if window < 3:
-        marker = "o" if len(values) < 20 else ""
-        axes.plot(
-            steps, values, color=colour, linewidth=1.5, label=label, marker=marker, markersize=3
-        )
-    else:
-        axes.plot(steps, values, color=colour, linewidth=0.6, alpha=0.3)
-        axes.plot(steps, smooth(values, window), color=colour, linewidth=1.6, label=label)
+def _draw_line(axes: Any, line: _Line, colour: str) -> None:
+    """Draws a line; a long one also smoothed."""
+    window = len(line.values) // _SMOOTHED_SHARE
+    if window >= _LEAST_WINDOW:
+        axes.plot(line.steps, line.values, color=colour, linewidth=0.6, alpha=0.3)
+        smoothed = smooth(line.values, window)
+        axes.plot(line.steps, smoothed, color=colour, linewidth=1.6, label=line.label)
+        return
+    marker = "o" if len(line.values) < _FEW_POINTS else ""
+    axes.plot(
+        line.steps,
+        line.values,
+        color=colour,
+        linewidth=1.5,
+        label=line.label,
+        marker=marker,
+        markersize=3,
+    )
 
 
 def _metric(name: str) -> str:
@@ -295,22 +292,29 @@ def _metric(name: str) -> str:
 
 
 def _label(run: str, name: str, panel: Panel, runs: Runs) -> str:
-    """Label of a line in a legend."""
+    """Label of a line in a legend.
+
+    It names the run if there are several, the metric if the panel has several, and the process if
+    several processes of the run report the metric. A panel with one metric of one run names the
+    process in any case; one with several metrics of one run never does.
+    """
     role, process, metric = name.split("/", 2)
-    processes = {
-        found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric
-    }
-    who = process if process.startswith(role) else f"{role} {process}"
-    several = who if len(processes) > 1 or len(runs) == 1 else ""
-    words = [
-        run if len(runs) > 1 else "",
-        several if len(panel.metrics) == 1 or len(runs) > 1 else "",
-    ]
-    return ", ".join(
-        word for word in (*words, titled(metric)[0] if len(panel.metrics) > 1 else "") if word
-    )
+    has_several_runs = len(runs) > 1
+    has_several_metrics = len(panel.metrics) > 1
+    if has_several_runs:
+        names_process = len(_processes(runs[run], metric)) > 1
+    else:
+        names_process = not has_several_metrics
+    parts = []
+    if has_several_runs:
+        parts.append(run)
+    if names_process:
+        parts.append(process if process.startswith(role) else f"{role} {process}")
+    if has_several_metrics:
+        parts.append(titled(metric)[0])
+    return ", ".join(parts)
 
 
-def _panels(metrics: Sequence[str], prefix: str) -> list[Panel]:
-    """A panel for each metric with a prefix."""
-    return [_panel(metric) for metric in metrics if metric.startswith(prefix)]
+def _processes(series: Series, metric: str) -> set[str]:
+    """Roles and names of the processes that report a metric."""
+    return {name.removesuffix(f"/{metric}") for name in series if _metric(name) == metric}

@@ -1,77 +1,65 @@
-"""Pictures and videos of recorded episodes."""
+"""Pictures of recorded episodes: single steps, frames, contact sheets and strips."""
 
-import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.hands import known_hand
-from congrasp.common.io.opening import temporary_file
-from congrasp.common.io.spelling import check_spelling
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import active_blocks, grasp_span, phases_of
+from congrasp.services.viz.camera import Camera
+from congrasp.services.viz.episode_scene import episode_shapes
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.shapes import Camera, Shape
-from congrasp.services.viz.sheets import contact_sheet, save_video
-from congrasp.services.viz.views import View, camera_of, episode_shapes, views
+from congrasp.services.viz.shapes import Shape
+from congrasp.services.viz.sheets import contact_sheet
+from congrasp.services.viz.views import View, camera_of, views
 
 Around = Callable[[int], Sequence[Shape]]
 """Shapes around the grasp at a control step, such as the arm that carries the hand."""
-_GAP = 3  # pixels between two views of a picture
+_GAP_PIXELS = 3
+"""Gap between the two views of a picture."""
+_SHEET_COLUMNS = 4
+_TITLE_METRICS = ("return", "links_at_removal")
+"""Metrics in the title of an episode."""
 
 
-class Film(NamedTuple):
-    """Style of a video."""
-
-    size: tuple[int, int] = (1280, 720)
-    """Width and height in pixels, both even."""
-    fps: float = 25.0
-    """Frames per second."""
-    overlays: bool = False
-    """Draws the active constraints, and links in contact in green."""
-
-
-def film_of(size: str, fps: float, overlays: bool) -> Film:
-    """Style of a video, from its size as WIDTHxHEIGHT, both even and from 64 to 4096 pixels.
-
-    Raises:
-      CongraspError: the size is malformed, or a package for videos is missing.
-    """
-    need_package("--video", "imageio_ffmpeg")
-    numbers = size.lower().split("x")
-    if len(numbers) == 2 and all(word.isdecimal() and len(word) < 5 for word in numbers):
-        width, height = map(int, numbers)
-        if all(64 <= side <= 4096 and side % 2 == 0 for side in (width, height)):
-            return Film((width, height), fps, overlays)
-    raise CongraspError(
-        f"--size is '{size}'.", "Write two even numbers from 64 to 4096: --size 1920x1080"
-    )
+def nothing_around(step: int) -> Sequence[Shape]:
+    """No shapes around the grasp."""
+    del step
+    return ()
 
 
 def grasp_picture(
     episode: Message, step: int, size: tuple[int, int] = (1280, 720), view: View | None = None
 ) -> np.ndarray:
-    """(height, width, 3) uint8, a step without overlays: from a view, by default the best one, and
-    from its side.
+    """Two pictures of one step without overlays, from `view` and, on the right, from its side.
+
+    Args:
+      episode: the episode.
+      step: its control step.
+      size: width and height of both pictures together, pixels.
+      view: view of the left picture; the best one by default.
+
+    Returns:
+      (height, width, 3) uint8.
     """
     width, height = size
-    left = 2 * width // 3
-    shapes = episode_shapes(episode, step, overlays=False)
+    left_width = 2 * width // 3
+    right_width = width - left_width
     best, aside = views(episode, [step])
-    widths = left, width - left
-    cameras = [
-        camera_of(episode, [step], w / height, v)
-        for w, v in zip(widths, (view or best, aside), strict=True)
-    ]
-    halves = [
-        render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)
-    ]
-    halves[1][:, :_GAP] = 255
-    return np.concatenate(halves, 1)
+    left = _step_picture(episode, step, (left_width, height), view or best)
+    right = _step_picture(episode, step, (right_width, height), aside)
+    right[:, :_GAP_PIXELS] = 255
+    return np.concatenate([left, right], axis=1)
+
+
+def _step_picture(episode: Message, step: int, size: tuple[int, int], view: View) -> np.ndarray:
+    """(height, width, 3) uint8, one step without overlays from one view."""
+    width, height = size
+    camera = camera_of(episode, [step], width / height, view)
+    return render_scene(episode_shapes(episode, step, overlays=False), camera, size)
 
 
 def render_episode_frames(
@@ -81,7 +69,6 @@ def render_episode_frames(
     camera: Camera | None = None,
     *,
     overlays: bool = True,
-    around: Around = lambda step: [],
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -90,19 +77,42 @@ def render_episode_frames(
       steps: control steps, from 0.
       size: width and height in pixels.
       camera: the camera; by default one for the best view.
-      overlays: see `Film`.
-      around: further shapes at a control step.
+      overlays: draws the active constraints, and links in contact in green.
     """
     steps = list(steps)
-    seen_from = camera or camera_of(episode, steps, size[0] / size[1], overlays=overlays)
+    if camera is None:
+        width, height = size
+        camera = camera_of(episode, steps, width / height, overlays=overlays)
+    return draw_frames(episode, steps, size, [camera] * len(steps), overlays=overlays)
 
-    def drawn(step: int) -> np.ndarray:
-        return render_scene(
-            [*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size
-        )
+
+def draw_frames(
+    episode: Message,
+    steps: Sequence[int],
+    size: tuple[int, int],
+    cameras: Sequence[Camera],
+    *,
+    overlays: bool,
+    around: Around = nothing_around,
+) -> Iterator[np.ndarray]:
+    """Yields pictures (height, width, 3) uint8 of control steps, each from a camera of its own.
+
+    Args:
+      episode: the episode.
+      steps: its control steps.
+      size: width and height in pixels.
+      cameras: one for each step.
+      overlays: draws the active constraints, and links in contact in green.
+      around: further shapes at a control step.
+    """
+
+    def draw(step: int, camera: Camera) -> np.ndarray:
+        """Draws one picture."""
+        shapes = [*episode_shapes(episode, step, overlays=overlays), *around(step)]
+        return render_scene(shapes, camera, size)
 
     with ThreadPoolExecutor(cores()) as pool:
-        yield from pool.map(drawn, steps)
+        yield from pool.map(draw, steps, cameras)
 
 
 def episode_sheet(
@@ -113,21 +123,24 @@ def episode_sheet(
     steps: Sequence[int] | None = None,
     camera: Camera | None = None,
 ) -> np.ndarray:
-    """An episode in a few frames, by default with its first and last step and the table's removal,
-    and its metrics.
+    """An episode in a few frames, with its metrics in the title.
 
     Args:
       episode: the episode.
       frames: number of pictures.
       size: width and height of each, pixels.
-      steps: control steps of the pictures; spread evenly by default.
+      steps: control steps of the pictures; by default `key_steps`.
       camera: see `render_episode_frames`.
+
+    Returns:
+      (H, W, 3) uint8.
     """
     steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
     dt = float(episode.meta["control_dt"])
-    labels = [f"{dt * step:.2f} s   {_phase(episode, step)}".rstrip() for step in steps]
+    labels = [f"{dt * step:.2f} s   {phase_label(episode, step)}".rstrip() for step in steps]
     images = list(render_episode_frames(episode, steps, size, camera))
-    return contact_sheet(images, labels, columns=min(4, len(steps)), title=episode_title(episode))
+    columns = min(_SHEET_COLUMNS, len(steps))
+    return contact_sheet(images, labels, columns=columns, title=episode_title(episode))
 
 
 def episode_strip(
@@ -137,9 +150,9 @@ def episode_strip(
     first: str,
     last: str,
     *,
-    until: int | None = None,
+    last_step: int | None = None,
 ) -> tuple[list[np.ndarray], list[str]]:
-    """A contact sheet's row: pictures of an episode's key frames, and their labels.
+    """A contact sheet's row: pictures of an episode's key steps, and their labels.
 
     Args:
       episode: the episode.
@@ -147,30 +160,27 @@ def episode_strip(
       size: width and height of each, pixels.
       first: label of the first picture.
       last: text after the time of the last one.
-      until: step of the last one; by default that of the episode.
+      last_step: step of the last picture; by default that of the episode.
     """
     table = np.asarray(episode.arrays["table"], bool)
-    steps = key_steps(table if until is None else table[: until + 1], frames)
+    if last_step is not None:
+        table = table[: last_step + 1]
+    steps = key_steps(table, frames)
     seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-    return list(render_episode_frames(episode, steps, size)), [
-        first,
-        *seconds[1:-1],
-        f"{seconds[-1]}{last}",
-    ]
+    images = list(render_episode_frames(episode, steps, size))
+    return images, [first, *seconds[1:-1], f"{seconds[-1]}{last}"]
 
 
 def grasp_steps(episode: Message) -> tuple[int, int]:
-    """The first step of the grasp itself, and the first one after it: of the lift, or without the
-    table.
-    """
-    return grasp_span(
-        episode.meta, float(episode.meta["control_dt"]), np.asarray(episode.arrays["table"], bool)
-    )
+    """First step of the grasp, and the first one after it: of the lift, or without the table."""
+    dt = float(episode.meta["control_dt"])
+    return grasp_span(episode.meta, dt, np.asarray(episode.arrays["table"], bool))
 
 
-def _phase(episode: Message, step: int) -> str:
-    """Label of the phase of a step: table removed, or a phase of an episode with approach or lift;
-    else empty.
+def phase_label(episode: Message, step: int) -> str:
+    """Label of a step: its table is removed, or its phase if the episode has an approach or a lift.
+
+    Empty for other episodes.
     """
     if not episode.arrays["table"][step]:
         return "table removed"
@@ -178,13 +188,18 @@ def _phase(episode: Message, step: int) -> str:
     if not {"approach", "lift"} & phases.keys():
         return ""
     time = float(episode.meta["control_dt"]) * step + 1e-6
-    begun = [(begin, name) for name, begin in phases.items() if begin <= time]
-    return max(begun)[1] if begun else ""
+    past = [(start, name) for name, start in phases.items() if start <= time]
+    if not past:
+        return ""
+    return max(past)[1]
 
 
 def key_steps(table: np.ndarray, frames: int) -> list[int]:
-    """Steps spread evenly over an episode, with that of the table's removal; `table` (T,) bool is
-    True at first.
+    """Steps spread evenly over an episode: the first and the last, and that of the table's removal.
+
+    Args:
+      table: (T,) bool, True before the removal.
+      frames: number of steps.
     """
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, frames)})
     if not table.all() and len(steps) > 2:
@@ -196,67 +211,19 @@ def key_steps(table: np.ndarray, frames: int) -> list[int]:
 
 def episode_title(episode: Message) -> str:
     """Hand, object, constraints and result in one line."""
-    meta, active = episode.meta, active_blocks(episode.arrays)
-    names = [name.replace("_", " ") for name, on in active.items() if on]
-    result = "success" if meta["success"] else "no success"
-    metrics = meta.get("metrics", {})
-    shown = [
-        f"{name.replace('_', ' ')} {metrics[name]:.3g}"
-        for name in ("return", "links_at_removal")
-        if name in metrics
-    ]
+    meta = episode.meta
+    constraints = ["heading"]
+    for name, is_active in active_blocks(episode.arrays).items():
+        if is_active:
+            constraints.append(name.replace("_", " "))
     parts = [
         f"{known_hand(meta['hand']).name} hand, {meta['object']}",
-        " + ".join(["heading", *names]),
-        result,
-        *shown,
+        " + ".join(constraints),
+        "success" if meta["success"] else "no success",
     ]
-    return "   |   ".join([*parts, f"policy version {meta['version']}"])
-
-
-def save_episode_video(
-    path: pathlib.Path,
-    episode: Message,
-    film: Film = Film(),  # noqa: B008 - frozen
-    camera: Camera | None = None,
-    progress: Callable[[float], None] = lambda share: None,
-    *,
-    until: int | None = None,
-    around: Around = lambda step: [],
-) -> None:
-    """Writes an episode as MP4, in real time.
-
-    Args:
-      path: the file; written under another name and renamed when it is complete.
-      episode: the episode.
-      film: size, frame rate and overlays.
-      camera: see `render_episode_frames`.
-      progress: called with the share of drawn frames, from 0 to 1.
-      until: control step at which the video ends, exclusive; the end of the episode by default.
-      around: see `render_episode_frames`.
-
-    Raises:
-      CongraspError: the package for videos is absent, or the file cannot be written.
-    """
-    step = 1 / (film.fps * float(episode.meta["control_dt"]))
-    last = (
-        len(episode.arrays["table"]) if until is None else min(until, len(episode.arrays["table"]))
-    )
-    steps = [int(i * step) for i in range(int(np.ceil(last / step)))]
-
-    def frames() -> Iterator[np.ndarray]:
-        """Yields the frames in order."""
-        drawn = render_episode_frames(
-            episode, steps, film.size, camera, overlays=film.overlays, around=around
-        )
-        for done, frame in enumerate(drawn, 1):
-            yield frame
-            progress(done / len(steps))
-
-    with (
-        os_errors_as(f"{path} could not be written"),
-        temporary_file(path, path.suffix) as (unfinished, _),
-    ):
-        check_spelling(path)
-        save_video(unfinished, frames(), film.size, film.fps)
-        unfinished.replace(path)
+    metrics = meta.get("metrics", {})
+    for name in _TITLE_METRICS:
+        if name in metrics:
+            parts.append(f"{name.replace('_', ' ')} {metrics[name]:.3g}")
+    parts.append(f"policy version {meta['version']}")
+    return "   |   ".join(parts)

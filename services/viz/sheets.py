@@ -12,8 +12,17 @@ from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 
-_QUIET, _PAPER = (96, 103, 116), (251, 251, 252)
-_MARGIN, _LABEL, _TITLE = 10, 24, 44  # pixels
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+_QUIET = (96, 103, 116)
+_PAPER = (251, 251, 252)
+_MARGIN = 10
+_LABEL_HEIGHT = 24
+_TITLE_HEIGHT = 44
+_LABEL_SIZE = 14
+_TITLE_SIZE = 19
+_SMALLEST_SIZE = 8
+"""Sizes in pixels."""
 
 
 def contact_sheet(
@@ -40,24 +49,34 @@ def contact_sheet(
         )
     height, width = images[0].shape[:2]
     rows = -(-len(images) // columns)
-    top = _TITLE if title else _MARGIN
-    sheet = Image.new(
-        "RGB",
-        (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN),
-        _PAPER,
-    )
+    top = _TITLE_HEIGHT if title else _MARGIN
+    sheet_width = columns * (width + _MARGIN) + _MARGIN
+    sheet_height = top + rows * (height + _LABEL_HEIGHT) + _MARGIN
+    sheet = Image.new("RGB", (sheet_width, sheet_height), _PAPER)
     draw = ImageDraw.Draw(sheet)
     if title:
-        title, font = _fitted(title, 19, sheet.width - 2 * _MARGIN)
-        draw.text((_MARGIN + 2, _TITLE // 2), title, INK, font, anchor="lm")
-    cut = {label: _fitted(label, 14, width)[0] for label in labels}
-    for i, (image, label) in enumerate(zip(images, labels, strict=True)):
-        x, y = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * (height + _LABEL)
+        text, font = _fitted(title, _TITLE_SIZE, sheet_width - 2 * _MARGIN)
+        draw.text((_MARGIN + 2, _TITLE_HEIGHT // 2), text, INK, font, anchor="lm")
+    for i, (image, label) in enumerate(zip(images, _distinct(labels, width), strict=True)):
+        row, column = divmod(i, columns)
+        x = _MARGIN + column * (width + _MARGIN)
+        y = top + row * (height + _LABEL_HEIGHT)
         sheet.paste(Image.fromarray(image), (x, y))
-        alike = [*cut.values()].count(cut[label]) > 1
-        label, font = _fitted(f"{i + 1}: {label}" if alike else label, 14, width)
-        draw.text((x + 2, y + height + _LABEL // 2), label, _QUIET, font, anchor="lm")
+        text, font = _fitted(label, _LABEL_SIZE, width)
+        middle = y + height + _LABEL_HEIGHT // 2
+        draw.text((x + 2, middle), text, _QUIET, font, anchor="lm")
     return np.asarray(sheet)
+
+
+def _distinct(labels: Sequence[str], width: int) -> list[str]:
+    """Labels of pictures of a width; those that look equal when they are cut get a number."""
+    cut = {label: _fitted(label, _LABEL_SIZE, width)[0] for label in labels}
+    looks = list(cut.values())
+    distinct = []
+    for number, label in enumerate(labels, 1):
+        is_unclear = looks.count(cut[label]) > 1
+        distinct.append(f"{number}: {label}" if is_unclear else label)
+    return distinct
 
 
 def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
@@ -69,15 +88,47 @@ def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(wide)
 
 
-def _fitted(
-    text: str, size: int, width: int
-) -> tuple[str, ImageFont.FreeTypeFont | ImageFont.ImageFont]:
-    """A text and the largest font up to a size with which it fits a width in pixels; a longer one
-    loses its middle.
+def with_lines(sheet: np.ndarray, lines: Sequence[str]) -> np.ndarray:
+    """A sheet (H, W, 3) with lines of text below it; long ones continue in the next line."""
+    width = sheet.shape[1]
+    font = ImageFont.load_default(_LABEL_SIZE)
+    wrapped: list[str] = []
+    for line in lines:
+        wrapped += _wrapped(line, font, width - 2 * _MARGIN)
+    if not wrapped:
+        return sheet
+    below = Image.new("RGB", (width, len(wrapped) * _LABEL_HEIGHT + _MARGIN), _PAPER)
+    draw = ImageDraw.Draw(below)
+    for i, line in enumerate(wrapped):
+        middle = i * _LABEL_HEIGHT + _LABEL_HEIGHT // 2
+        draw.text((_MARGIN + 2, middle), line, _QUIET, font, anchor="lm")
+    return np.concatenate([sheet, np.asarray(below)])
+
+
+def _wrapped(text: str, font: Font, width: int) -> list[str]:
+    """A text in lines of at most a width in pixels, broken between words."""
+    lines: list[str] = []
+    line = ""
+    for word in text.split():
+        longer = f"{line} {word}".strip()
+        if line and font.getlength(longer) > width:
+            lines.append(line)
+            longer = word
+        line = longer
+    return [*lines, line]
+
+
+def _fitted(text: str, size: int, width: int) -> tuple[str, Font]:
+    """A text and the largest font up to a size with which it fits a width in pixels.
+
+    A text that is too long for the smallest font loses its middle.
     """
-    while (font := ImageFont.load_default(size)).getlength(text) > width and size > 8:
+    font = ImageFont.load_default(size)
+    while font.getlength(text) > width and size > _SMALLEST_SIZE:
         size -= 1
-    half, shown = len(text) // 2, text
+        font = ImageFont.load_default(size)
+    half = len(text) // 2
+    shown = text
     for cut in range(1, half):
         if font.getlength(shown) <= width:
             break

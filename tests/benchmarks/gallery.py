@@ -19,11 +19,13 @@ from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.jobs import Result, Settings, find_objects, grasp_object
 from congrasp.services.record.reader import pick_episode
-from congrasp.services.viz.render import grasp_steps, render_episode_frames
-from congrasp.services.viz.views import camera_of, views
+from congrasp.services.viz.film import Film, film_frames
+from congrasp.services.viz.render import render_episode_frames
+from tests.pictures import provenance
 
 _SIZE, _QUALITY = (480, 360), 88  # pixels, of JPEG
-_FILM_SIZE, _FILM_FPS, _HELD = (400, 300), 12.5, 0.5  # pixels, frames a second, s of the hold
+_FILM_SIZE = (400, 300)  # pixels
+_FILM_FPS = 12.5
 _COLOURS = 256  # of a film
 _PHASES = Phases(approach=0.7, lift=0.12)
 _HEAD = """# Gallery
@@ -157,15 +159,16 @@ def _results(
         if result.error:
             continue
         episode = pick_episode(settings.out / at.name / RECORDING, -1, success=False)
-        last = len(episode.arrays["table"]) - 1
-        (picture,) = render_episode_frames(episode, [last], _SIZE, overlays=False)
-        Image.fromarray(picture).save(out / f"{shown.name}.jpg", quality=_QUALITY)
+        portrait = out / f"{shown.name}.jpg"
+        save_portrait(portrait, episode)
+        origin = provenance.current(command_of(shown), (shown.hand,), rendered=True)
+        provenance.write(portrait, origin)
         if shown.film:
-            save_film(out / f"{shown.name}.gif", episode)
+            film = out / f"{shown.name}.gif"
+            save_film(film, episode)
+            provenance.write(film, origin)
         held = f"{result.facts['attempts_held']} of {result.facts['attempts']}"
-        rows.append(
-            f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{held} |\n"
-        )
+        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{command_of(shown)}`<br>{held} |\n")
     (out / "index.md").write_text(_HEAD + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
@@ -176,39 +179,36 @@ def _given(value: Any, work: pathlib.Path) -> Any:
     return value.format(out=work) if isinstance(value, str) else value
 
 
-def _command(shown: Shown, scan: pathlib.Path) -> str:
+def command_of(shown: Shown) -> str:
     """The command that makes the grasp."""
-    words = ["congrasp grasp", f"object_sim/{shown.object}" if scan.exists() else shown.object]
+    is_scan = ":" not in shown.object and "/" not in shown.object
+    words = ["congrasp grasp", f"object_sim/{shown.object}" if is_scan else shown.object]
     options = {"hand": shown.hand, "rest": shown.rest, **shown.options}
     for name, value in options.items():
-        if value and (name, value) != ("hand", "human"):
-            words.append(
-                f"--{name}"
-                if value is True
-                else f"--{name} {_given(value, pathlib.Path('runs/gallery'))}"
-            )
+        if not value or (name, value) == ("hand", "human"):
+            continue
+        words.append(f"--{name}")
+        if value is not True:
+            words.append(str(_given(value, pathlib.Path("runs/gallery"))))
     return " ".join([*words, f"--approach {_PHASES.approach:g} --lift {_PHASES.lift:g}"])
 
 
+def save_portrait(path: pathlib.Path, episode: Message) -> None:
+    """Writes the last step of a motion as JPEG."""
+    last = len(episode.arrays["table"]) - 1
+    (picture,) = render_episode_frames(episode, [last], _SIZE, overlays=False)
+    Image.fromarray(picture).save(path, quality=_QUALITY)
+
+
 def save_film(path: pathlib.Path, episode: Message) -> None:
-    """Writes a motion as an animated GIF, in real time, up to half a second of its hold."""
-    dt = float(episode.meta["control_dt"])
-    hold = float(episode.meta["phases"]["hold"])
-    steps = np.arange(0.0, hold + _HELD, 1 / _FILM_FPS) / dt
-    steps = [int(step) for step in steps if step < len(episode.arrays["table"])]
-    begin, lift = grasp_steps(episode)
-    view = views(episode, [lift, steps[-1]])[0]
-    # The hand comes into the picture as it reaches.
-    camera = camera_of(
-        episode, [step for step in steps if step >= begin], _FILM_SIZE[0] / _FILM_SIZE[1], view
-    )
-    frames = [
-        Image.fromarray(frame)
-        for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
-    ]
-    several = np.hstack([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 8)]])
+    """Writes a motion as an animated GIF, in real time, to the end of its hold."""
+    frames = list(film_frames(episode, Film(_FILM_SIZE, _FILM_FPS)))
+    several = np.hstack(frames[:: max(1, len(frames) // 8)])
     palette = Image.fromarray(several).quantize(_COLOURS, dither=Image.Dither.NONE)
-    drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    drawn = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
     drawn[0].save(
         path, save_all=True, append_images=drawn[1:], duration=round(1000 / _FILM_FPS), loop=0
     )

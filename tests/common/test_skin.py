@@ -24,7 +24,7 @@ from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
 from congrasp.services.export.frames import skin_of_motion
 from congrasp.services.export.motion_file import hand_arrays, motion_of_episode
-from congrasp.services.viz.shapes import posed_hand
+from congrasp.services.viz.hand_shapes import posed_hand
 from tests.episodes import episode
 
 HANDS = ("human", "allegro", "sharpa")

@@ -22,7 +22,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli import main, parser
-from congrasp.services.viz.plots import TITLES
+from congrasp.services.viz.metric_titles import TITLES
 from tests.base_install import run_in_base_install, steady_server
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 from trimesh.visual.color import uv_to_interpolated_color
 
 from congrasp.common.errors import CongraspError
@@ -15,12 +16,17 @@ from congrasp.services.assets.objects.options import Up
 
 _DEFAULT_COLOUR = (102, 102, 102)
 """Colour of a material in trimesh whose file does not specify one."""
+_DENSITY = 8
+"""Points that are compared, for each point of the result."""
+_NEIGHBOURS = 6
+_LEAST_CHANGE = 1e-3
+"""Change of colour that an even surface has, so that its points can be drawn."""
 
 
 def sample_colours(
     paths: Sequence[pathlib.Path], seed: int, up: Up = "auto", notes: list[str] | None = None
 ) -> Colours | None:
-    """Samples points evenly over the surfaces of mesh files, with their colours.
+    """Samples points of the surfaces of mesh files, more of them where colours change.
 
     Args:
       paths: the files.
@@ -74,9 +80,33 @@ def _image(material: Any) -> Any:
 
 
 def _sample_meshes(meshes: list[trimesh.Trimesh], rng: np.random.Generator) -> Colours:
-    """Samples `COLOUR_POINTS` of all meshes, in proportion to their areas."""
+    """Samples `COLOUR_POINTS` of all meshes.
+
+    The first half is spread evenly over the surfaces. The other half is where colours change, so
+    that their edges are known to a fraction of a millimetre.
+    """
+    dense = _sample_evenly(meshes, _DENSITY * COLOUR_POINTS, rng)
+    order = rng.permutation(len(dense.points))
+    even = order[: COLOUR_POINTS // 2]
+    others = order[COLOUR_POINTS // 2 :]
+    changes = _changes(dense)[others] + _LEAST_CHANGE
+    count = COLOUR_POINTS - len(even)
+    at_edges = rng.choice(others, count, replace=False, p=changes / changes.sum())
+    chosen = np.concatenate([even, at_edges])
+    return Colours(dense.points[chosen], dense.values[chosen])
+
+
+def _changes(dense: Colours) -> np.ndarray:
+    """(n,) largest difference of a point's colour to those of its nearest points, 0 to 255."""
+    nearest = cKDTree(dense.points).query(dense.points, k=_NEIGHBOURS)[1]
+    values = dense.values.astype(np.int16)
+    return np.abs(values[nearest] - values[:, None]).max(axis=(1, 2)).astype(float)
+
+
+def _sample_evenly(meshes: list[trimesh.Trimesh], total: int, rng: np.random.Generator) -> Colours:
+    """Samples points of all meshes, in proportion to their areas."""
     areas = np.array([mesh.area for mesh in meshes])
-    counts = rng.multinomial(COLOUR_POINTS, areas / areas.sum())
+    counts = rng.multinomial(total, areas / areas.sum())
     points = []
     colours = []
     for mesh, count in zip(meshes, counts, strict=True):

@@ -21,7 +21,7 @@ from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sources import Source
 
-_CACHE_VERSION = 14
+_CACHE_VERSION = 15
 _DRAWS_VERSION = 8
 """A new one changes the surface points of every object, and with them all measurements."""
 _PATIENCE_S = 600.0

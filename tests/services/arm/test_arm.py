@@ -280,7 +280,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
         str(folder),
     ]
     shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]
-    film = ["--video", "--size", "320x240", "--fps", "2"]
+    film = ["--video", "--size", "320x240", "--fps", "2", "--approach", "0"]
     assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1", *film])() == 0
     facts = json.loads((tmp_path / "block" / "result.json").read_text())
     assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]

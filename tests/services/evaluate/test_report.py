@@ -27,7 +27,7 @@ from congrasp.services.evaluate.report import Commands, ReportContent, write_rep
 from congrasp.services.evaluate.tables import Evaluation
 from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.train.command import untrained
-from congrasp.services.viz.shapes import skin_shape
+from congrasp.services.viz.hand_shapes import skin_shape
 from congrasp.services.viz.sheets import save_png
 from tests import task
 from tests.episodes import episode

@@ -18,7 +18,8 @@ from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.plots import compared, plot_evaluation
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.record.writer import JsonChannels, LogWriter, nest
-from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth, titled
+from congrasp.services.viz.metric_titles import titled
+from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
 from tests.rows import summarised
 
 METRICS = {

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,30 +20,36 @@ from congrasp.services.cli.main import load
 from congrasp.services.record.palette import FLESH
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
+from congrasp.services.viz.camera import Camera, fit
+from congrasp.services.viz.camera_path import following_cameras
+from congrasp.services.viz.episode_scene import TOUCHING, episode_shapes
+from congrasp.services.viz.film import Film, save_episode_video
+from congrasp.services.viz.hand_shapes import capsule_shapes, skin_colours
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
-    Film,
     episode_sheet,
     episode_title,
     grasp_picture,
     key_steps,
     render_episode_frames,
-    save_episode_video,
 )
 from congrasp.services.viz.shapes import (
-    Camera,
     Shape,
     arrow,
     beads,
     between,
-    capsule_shapes,
-    fit,
-    skin_colours,
 )
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
-from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
+from congrasp.services.viz.views import (
+    View,
+    camera_of,
+    extent,
+    object_points,
+    view_of,
+    views,
+)
 from tests.children import python
 from tests.episodes import CONTROL_DT, episode
 
@@ -137,6 +144,23 @@ def test_a_ball_darkens_the_ground_beneath_it() -> None:
     np.testing.assert_array_equal(marked.astype(int).sum(-1)[inside], bare[inside])
 
 
+def test_a_border_between_two_colours_is_sharp_and_straight() -> None:
+    """A pixel is 1 mm wide, and the known points are 5 mm apart."""
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    sides = np.linspace(-0.05, 0.05, 21)
+    y, z = np.meshgrid(sides, sides)
+    points = np.column_stack([np.full(y.size, 0.05), y.ravel(), z.ravel() + 0.0025])
+    is_red = points[:, 2:] > 0
+    paint = Colours(points, np.where(is_red, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
+    shape = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)
+    camera = Camera(np.array([0.55, 0.0, 0.0]), np.zeros(3), np.degrees(2 * np.arctan(0.1)))
+    image = render_scene([shape], camera, (100, 100))[:, 15:85].astype(int)
+    mixed = (np.minimum(image[..., 0], image[..., 2]) > 60).sum(0)
+    assert mixed.max() <= 2
+    border = (image[..., 0] > image[..., 2]).sum(0)
+    assert np.ptp(border) <= 2
+
+
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array(
@@ -150,7 +174,7 @@ def test_painted_regions_meet_where_their_points_do() -> None:
 
 def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     sphere = trimesh.creation.icosphere(2, 0.1)
-    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces), 0.005, 12_000)
+    corners, smooth = cut(*smooth_corners(sphere.vertices, sphere.faces))
     exact = corners / np.linalg.norm(corners, axis=-1, keepdims=True)
 
     def degrees_off(normals: np.ndarray) -> float:
@@ -160,7 +184,7 @@ def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
     assert len(corners) > 2 * len(sphere.faces)
     assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
-    corners, smooth = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
+    corners, smooth = cut(*smooth_corners(box.vertices, box.faces))
     np.testing.assert_allclose(
         smooth, np.broadcast_to(flat_normals(corners), smooth.shape), atol=1e-6
     )
@@ -173,7 +197,7 @@ def flat_normals(corners: np.ndarray) -> np.ndarray:
 
 def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     box = trimesh.creation.box((0.1, 0.06, 0.02))
-    corners, _ = cut(*smooth_corners(box.vertices, box.faces), 0.005, 12_000)
+    corners, _ = cut(*smooth_corners(box.vertices, box.faces))
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
     assert sides.max() <= 0.00501  # at most 5 mm
     mesh = trimesh.Trimesh(
@@ -215,6 +239,27 @@ def test_the_camera_just_contains_all_points() -> None:
     assert span.max() < 0.02  # in the middle
 
 
+def cameras(**changes: Any) -> list[Camera]:
+    steps = range(0, 80, 4)
+    return following_cameras(episode(80, **changes), steps, 16 / 9, View(30.0, 20.0))
+
+
+def test_a_following_camera_keeps_hand_and_object_in_view() -> None:
+    long = episode(80)
+    for step, camera in zip(range(0, 80, 4), cameras(), strict=True):
+        places = projected(camera, extent(long, step))
+        assert np.abs(places[:, 0]).max() < 16 / 9 and np.abs(places[:, 1]).max() < 1
+
+
+def test_a_following_camera_shows_the_object_a_third_wide_if_the_hand_fits() -> None:
+    """The cylinder is 6 cm wide: the hand needs more room, so that it is smaller than a third."""
+    long = episode(80)
+    long.arrays["visual_vertices"] = long.arrays["visual_vertices"] * [8.0, 8.0, 1.0]
+    camera = following_cameras(long, range(0, 80, 4), 16 / 9, View(30.0, 20.0))[0]
+    across = projected(camera, object_points(long, 0))[:, 0] / (16 / 9)
+    assert np.ptp(across) / 2 == pytest.approx(1 / 3, rel=0.15)
+
+
 def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
     table = np.arange(75) < 50
     steps = key_steps(table, 8)
@@ -242,11 +287,20 @@ def test_links_in_contact_and_the_avoid_region_are_coloured() -> None:
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint is None
 
 
-def test_the_table_is_drawn_until_its_removal_and_the_reference_pose_is_transparent() -> None:
-    def flat(step: int) -> bool:
-        return any(shape.kind == "table" for shape in episode_shapes(episode(), step))
+def table_height(step: int) -> float:
+    (table,) = [shape for shape in episode_shapes(episode(), step) if shape.kind == "table"]
+    return float(table.position[2])
 
-    assert flat(7) and not flat(8)
+
+def test_a_removed_table_sinks_below_the_object() -> None:
+    assert table_height(7) == 0.0
+    assert 0.0 > table_height(8) > table_height(11)
+    long = episode(80)
+    (table,) = [shape for shape in episode_shapes(long, 79) if shape.kind == "table"]
+    assert table.position[2] == pytest.approx(-0.12)
+
+
+def test_the_reference_pose_is_transparent() -> None:
     (ghost,) = [
         shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1
     ]
@@ -376,16 +430,16 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
 
 
 def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_path) -> None:
-    """Ten of twelve steps of 10 ms at 50 frames a second are five frames; a constraint's arrow is
-    an overlay.
+    """Twelve steps of 10 ms at 50 frames a second are six frames; a constraint's arrow is an
+    overlay.
     """
     path = tmp_path / "film.mp4"
-    save_episode_video(path, episode(), Film((64, 48), 0.5 / CONTROL_DT), until=10)
+    save_episode_video(path, episode(), Film((64, 48), 0.5 / CONTROL_DT))
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (5, 5 * 2 * CONTROL_DT)
+    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (6, 6 * 2 * CONTROL_DT)
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
     bare, marked = episode_shapes(episode(), 11, overlays=False), episode_shapes(episode(), 11)
-    assert len(bare) == 2 and len(marked) > 2
+    assert len(bare) == 3 and len(marked) > 3
 
 
 def test_pictures_need_no_writable_folder() -> None:

@@ -17,9 +17,9 @@ from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.meshes import import_source
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import find_sources
+from congrasp.services.viz.camera import Camera
+from congrasp.services.viz.episode_scene import object_at
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.shapes import Camera
-from congrasp.services.viz.views import _object
 from tests.episodes import episode
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -52,8 +52,12 @@ def test_an_image_is_looked_up_where_it_lies_on_the_surface(tmp_path):
     x = found.points[:, 0]
     assert (found.values[x < 0.04] == RED).all() and (found.values[x > 0.06] == BLUE).all()
     assert (np.abs(found.points).min(0) >= 0).all() and found.points.max() <= SIDE + 1e-6
+    even = x[: COLOUR_POINTS // 2]
     # As many points on each face, as it has a sixth of the area.
-    assert np.isclose(x, 0).mean() == pytest.approx(1 / 6, abs=0.02)
+    assert np.isclose(even, 0).mean() == pytest.approx(1 / 6, abs=0.02)
+    # Four faces have a border between the two colours: eight times as many points are known there.
+    near_border = np.abs(x - SIDE / 2) < 0.001
+    assert near_border.mean() > 5 * (0.002 / SIDE) * (4 / 6)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
@@ -103,7 +107,7 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
     shown = episode()
     shown.arrays.update(_geometry(obj))
     picture = render_scene(
-        [_object(shown, 0, painted=False)],
+        [object_at(shown, 0, painted=False)],
         Camera(
             shown.arrays["object_position"][0] + [0, -0.5, 0.0], shown.arrays["object_position"][0]
         ),
