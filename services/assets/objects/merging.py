@@ -29,12 +29,15 @@ limit of pieces, m.
 """
 GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
+_ERROR_EXPONENT = 4
+"""Exponent of the deviation in the cost of a join: the largest one counts, whereas volumes add up.
+"""
 _HULL_PROBES = 200
 """Points on the hull of two pieces, whose distances from the mesh are computed."""
 _DIRECTIONS = 300
 """Directions whose extreme vertices larger hulls are reduced to."""
 _NEIGHBOUR_DISTANCE = 5e-4
-"""Distance of the boxes of neighbouring pieces, m."""
+"""Largest gap between neighbouring pieces, m."""
 _INNER_POINTS = 60_000
 """Points inside of the mesh."""
 _MAX_INNER_TESTED = 500
@@ -158,7 +161,9 @@ class _Merger:
         part = self._part(shapes.hull_of(vertices))
         growth = max(0.0, part.hull.volume - first.hull.volume - second.hull.volume)
         filled = max(0.0, part.hollow - first.hollow - second.hollow)
-        cost = part.error / MOST_SURFACE + filled / (MOST_VOLUME * self._volume)
+        cost = (part.error / MOST_SURFACE) ** _ERROR_EXPONENT + filled / (
+            MOST_VOLUME * self._volume
+        )
         join = _Join(cost=cost, first=i, second=j, growth=growth, part=part)
         heapq.heappush(self._joins, join)
 
@@ -182,8 +187,8 @@ def merge(
 ) -> list[np.ndarray]:
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
-    The cost of a join is the volume that it adds and its deviation from the surface, each as a
-    share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
+    The cost of a join is the volume that it adds and the fourth power of its deviation from the
+    surface, each as a share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
     the deepest surface point in the piece, the way that thinning moves its sides, or the distance
     of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
     that more than `max_pieces` remain if there are more separate bodies.
@@ -217,10 +222,18 @@ def _thinned(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
 
 
 def _touch(first: ConvexHull, second: ConvexHull) -> bool:
-    """True if the boxes around two hulls touch."""
+    """True if the boxes around two hulls touch, and no side of one separates it from the other."""
     before = (first.min_bound < second.max_bound + _NEIGHBOUR_DISTANCE).all()
     after = (second.min_bound < first.max_bound + _NEIGHBOUR_DISTANCE).all()
-    return bool(before and after)
+    if not (before and after):
+        return False
+    return not (_separates(first, second) or _separates(second, first))
+
+
+def _separates(hull: ConvexHull, other: ConvexHull) -> bool:
+    """True if all of another hull is in front of one side of a hull."""
+    distances = corners_of(other) @ hull.equations[:, :3].T + hull.equations[:, 3]
+    return bool((distances.min(0) > _NEIGHBOUR_DISTANCE).any())
 
 
 def _sorted(points: np.ndarray) -> np.ndarray:
