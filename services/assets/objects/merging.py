@@ -34,7 +34,7 @@ _ERROR_EXPONENT = 4
 """
 _HULL_PROBES = 200
 """Points on the hull of two pieces, whose distances from the mesh are computed."""
-_DIRECTIONS = 300
+_DIRECTIONS = 150
 """Directions whose extreme vertices larger hulls are reduced to."""
 _NEIGHBOUR_DISTANCE = 5e-4
 """Largest gap between neighbouring pieces, m."""
@@ -188,10 +188,10 @@ def merge(
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
     The cost of a join is the volume that it adds and the fourth power of its deviation from the
-    surface, each as a share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
-    the deepest surface point in the piece, the way that thinning moves its sides, or the distance
-    of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
-    that more than `max_pieces` remain if there are more separate bodies.
+    surface, each as a share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The
+    deviation is the depth of the deepest surface point in the piece, the way that thinning moves
+    its sides, or the distance of its farthest point from the mesh, by samples. Pieces that do not
+    touch are never joined, so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.

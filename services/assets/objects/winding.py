@@ -104,8 +104,8 @@ def _directions() -> Iterator[_Direction]:
 def _both_ways(on_lattice: np.ndarray, shape: np.ndarray, direction: _Direction) -> np.ndarray:
     """Sum of the winding numbers (X, Y, Z) by the rays along a direction and its opposite.
 
-    The mesh is sheared so that the rays are parallel to an axis; points of the lattice remain points
-    of the lattice.
+    The mesh is sheared so that the rays are parallel to an axis; points of the lattice remain on
+    the lattice.
 
     Args:
       on_lattice: (F, 3, 3) corners; the points of the lattice are the integers.
