@@ -29,9 +29,6 @@ limit of pieces, m.
 """
 GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
-_ERROR_EXPONENT = 4
-"""Exponent of the deviation in the cost of a join: the largest one counts, whereas volumes add up.
-"""
 _HULL_PROBES = 200
 """Points on the hull of two pieces, whose distances from the mesh are computed."""
 _DIRECTIONS = 150
@@ -161,9 +158,7 @@ class _Merger:
         part = self._part(shapes.hull_of(vertices))
         growth = max(0.0, part.hull.volume - first.hull.volume - second.hull.volume)
         filled = max(0.0, part.hollow - first.hollow - second.hollow)
-        cost = (part.error / MOST_SURFACE) ** _ERROR_EXPONENT + filled / (
-            MOST_VOLUME * self._volume
-        )
+        cost = part.error / MOST_SURFACE + filled / (MOST_VOLUME * self._volume)
         join = _Join(cost=cost, first=i, second=j, growth=growth, part=part)
         heapq.heappush(self._joins, join)
 
@@ -187,11 +182,11 @@ def merge(
 ) -> list[np.ndarray]:
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
-    The cost of a join is the volume that it adds and the fourth power of its deviation from the
-    surface, each as a share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The
-    deviation is the depth of the deepest surface point in the piece, the way that thinning moves
-    its sides, or the distance of its farthest point from the mesh, by samples. Pieces that do not
-    touch are never joined, so that more than `max_pieces` remain if there are more separate bodies.
+    The cost of a join is the volume that it adds and its deviation from the surface, each as a
+    share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
+    the deepest surface point in the piece, the way that thinning moves its sides, or the distance
+    of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
+    that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
