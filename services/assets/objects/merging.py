@@ -31,7 +31,7 @@ GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
 _HULL_PROBES = 200
 """Points on the hull of two pieces, whose distances from the mesh are computed."""
-_DIRECTIONS = 150
+_DIRECTIONS = 300
 """Directions whose extreme vertices larger hulls are reduced to."""
 _NEIGHBOUR_DISTANCE = 5e-4
 """Largest gap between neighbouring pieces, m."""
