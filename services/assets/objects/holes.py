@@ -50,7 +50,7 @@ def fill(mesh: trimesh.Trimesh, loops: list[np.ndarray]) -> trimesh.Trimesh:
     vertices = np.asarray(mesh.vertices)
     edges = {tuple(edge) for edge in np.sort(mesh.edges_unique, axis=1).tolist()}
     covers = [np.asarray(mesh.faces)]
-    middles = []
+    middles: list[np.ndarray] = []
     for loop in loops:
         cover = _cover(vertices, loop, edges)
         if cover is None:
@@ -76,8 +76,8 @@ def _cover(
       The triangles; None if every base left would repeat an edge in use.
     """
     rim = loop.tolist()
-    faces = []
-    bases_in_use = set()
+    faces: list[list[int]] = []
+    bases_in_use: set[tuple[int, ...]] = set()
     while len(rim) > 3:
         before = np.roll(rim, 1)
         after = np.roll(rim, -1)
