@@ -30,6 +30,10 @@ _PARENT_CHECK_S = 0.5
 """Time between two checks whether the parent is still there."""
 
 
+class OutOfResources(ChildProcessError):
+    """The child reached its limit of processor time, or was killed by the system."""
+
+
 def call_confined(
     function: Callable[..., Any],
     folder: pathlib.Path,
@@ -54,6 +58,8 @@ def call_confined(
     Raises:
       CongraspError: of the function.
       TimeoutError: it did not end within `patience`.
+      OutOfResources: it reached its limit of processor time, or the system killed it, as it does
+        without memory.
       ChildProcessError: it ended without an answer; the message states the reason.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
@@ -72,7 +78,9 @@ def call_confined(
     except subprocess.TimeoutExpired:
         raise TimeoutError from None
     if child.returncode == -signal.SIGPROF:
-        raise ChildProcessError(f"took longer than {seconds:g} s of processor time")
+        raise OutOfResources(f"took longer than {seconds:g} s of processor time")
+    if child.returncode == -signal.SIGKILL:
+        raise OutOfResources("was killed by the system, which may be out of memory")
     try:
         answer = json.loads((folder / _ANSWER).read_text())
     except (OSError, ValueError):

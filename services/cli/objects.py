@@ -117,8 +117,8 @@ def import_meshes(
                 if not obj.shape_reliable:
                     unreliable += 1
                     print(
-                        f"{obj.name}: its shape is unreliable. Repair the mesh, or set "
-                        f"--time-limit or --max-pieces."
+                        f"{obj.name}: its shape is unreliable. Repair the mesh, or raise "
+                        f"--max-pieces."
                     )
             progress.advance(task)
     if done:

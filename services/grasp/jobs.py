@@ -75,8 +75,8 @@ class Result(NamedTuple):
         outcome = "held" if facts["success"] else "not held"
         if not facts["shape_reliable"]:
             outcome += (
-                ", but its shape is unreliable (see its notes; repair the mesh, or set "
-                "--time-limit)"
+                ", but its shape is unreliable (see its notes; repair the mesh, or raise "
+                "--max-pieces)"
             )
         outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"

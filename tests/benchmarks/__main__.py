@@ -9,7 +9,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.cli.parser import of_group
 
 NAMES = (
-    *("pieces", "gallery", "screens", "speeds", "measures", "dexgraspbench"),
+    *("pieces", "shapes", "gallery", "screens", "speeds", "measures", "dexgraspbench"),
     *("robot", "sensors", "attacks", "crowding", "transport", "faults", "ceiling"),
 )
 """Each is a module of this folder with a function of its name."""

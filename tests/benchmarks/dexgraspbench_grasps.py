@@ -32,7 +32,6 @@ STATES = ("pregrasp", "grasp", "squeeze")
 _MOTION = "grasp.npz"  # of `congrasp grasp`, in an object's folder
 _STEADY = 10  # frames of the mean torque of the squeeze
 _DENSITY = 500.0  # kg/m^3
-_SECONDS = 60.0  # deadline of the convex decomposition of a body
 
 
 class State(NamedTuple):
@@ -203,7 +202,7 @@ def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     volume = float(body.volume) if body.is_volume else None
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
     try:
-        found = decompose(vertices, faces, volume=volume, time_limit=_SECONDS, max_pieces=most)
+        found = decompose(vertices, faces, volume=volume, max_pieces=most)
         hulls = [simplify(piece) for piece in found.pieces]
     except QhullError:
         return []

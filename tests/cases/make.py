@@ -11,8 +11,6 @@ import zipfile
 import numpy as np
 import trimesh
 
-from tests.solids import ell
-
 HERE = pathlib.Path(__file__).parent
 BOX = trimesh.creation.box((0.04, 0.06, 0.1))
 
@@ -204,7 +202,6 @@ def main() -> None:
         "names/कटोरी.stl": box,
         "names/mug.stl": box,
         "names/mug.obj": BOX.export(file_type="obj").encode(),
-        "cut_fallback/ell.stl": stl(ell()),
         "hand_collada/link.dae": collada(trimesh.creation.box((20, 14, 50))),
         "hand_mm/link.stl": stl(trimesh.creation.box((20, 14, 50))),
         "hand_called_xml/parts/link.stl": stl(trimesh.creation.box((0.02, 0.014, 0.05))),

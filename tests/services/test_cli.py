@@ -168,7 +168,6 @@ def test_help_names_every_command_and_every_command_exists():
                 ),
                 *(
                     ("scale", "inf", "1e9"),
-                    ("time-limit", "nan", "1e6 s"),
                     ("max-pieces", "0", "1e19"),
                 ),
             )

@@ -26,6 +26,7 @@ from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import METRES, ImportOptions, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.sources import Source
+from congrasp.services.assets.objects.winding import open_volume
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
@@ -236,7 +237,7 @@ def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list
     """The surfaces of meshes, closed ones without hollows that no finger enters."""
     if solid is None:
         triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in meshes])
-        return Surfaces(meshes, meshes, triangles, None)
+        return Surfaces(meshes, meshes, triangles, None, open_volume(triangles))
     approximated = [without_hollows(mesh, notes) for mesh in meshes]
     triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in approximated])
     if any(new is not old for new, old in zip(approximated, meshes, strict=True)):

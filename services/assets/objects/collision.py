@@ -30,6 +30,8 @@ class Surfaces(NamedTuple):
     """(F, 3, 3) of all that are shown."""
     volume: float | None
     """Volume that they enclose (`interior.enclosed`), m^3; None if one is open."""
+    open_volume: float | None = None
+    """Volume that open ones enclose by winding numbers (`winding.open_volume`), m^3, if any."""
 
 
 class Collision(NamedTuple):
@@ -109,7 +111,7 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
     hulls: list[np.ndarray] = []
     owners: list[int] = []
     for owner, limit in enumerate(limits):
-        pieces = _cut_mesh(surfaces, owner, limit, options.time_limit, notes)
+        pieces = _cut_mesh(surfaces, owner, limit, notes)
         hulls += pieces
         owners += [owner] * len(pieces)
     cut = _simplified(surfaces, hulls, owners)
@@ -126,7 +128,7 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
 
 
 def _cut_mesh(
-    surfaces: Surfaces, owner: int, max_pieces: int, time_limit: float, notes: list[str]
+    surfaces: Surfaces, owner: int, max_pieces: int, notes: list[str]
 ) -> list[np.ndarray]:
     """Vertices (V, 3) of the pieces of one of the meshes."""
     mesh = surfaces.meshes[owner]
@@ -141,7 +143,6 @@ def _cut_mesh(
         np.asarray(small.faces),
         shown=None if shown is mesh else np.asarray(shown.triangles),
         volume=volume,
-        time_limit=time_limit,
         max_pieces=max_pieces,
     )
     notes += decomposition.notes
@@ -157,5 +158,6 @@ def _filled(surfaces: Surfaces, mesh_hulls: Sequence[ConvexHull]) -> Collision:
 def _simplified(surfaces: Surfaces, pieces: list[np.ndarray], owners: list[int]) -> Collision:
     """Pieces (V, 3) of few vertices, and their errors."""
     hulls = [simplify(piece) for piece in pieces]
-    errors = fidelity(surfaces.triangles, hulls, surfaces.volume is not None)
+    is_closed = surfaces.volume is not None
+    errors = fidelity(surfaces.triangles, hulls, is_closed, surfaces.open_volume)
     return Collision(hulls, owners, errors)

@@ -1,8 +1,11 @@
 """Decomposition of a mesh into convex pieces.
 
-A convex mesh is its hull. Others are cut by CoACD under limits, by V-HACD if that fails, or else
-are their hull. The decomposers are native code, which runs in a confined process. Their pieces are
-joined (`merging`).
+A convex mesh is its hull. Others are cut by CoACD, by V-HACD if that fails, or else are their hull.
+The decomposers are native code, which runs in a confined process. Their pieces are joined
+(`merging`).
+
+The pieces depend on the mesh alone: the work is limited by the settings of the search, each process
+has one thread, and a process that is short of time or memory is an error, not another shape.
 """
 
 import pathlib
@@ -17,23 +20,30 @@ from trimesh.graph import is_watertight
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
-from congrasp.common.runtime.parallel import cores, memory
-from congrasp.services.assets.confined import call_confined
+from congrasp.services.assets.confined import OutOfResources, call_confined
 from congrasp.services.assets.objects.bodies import bodies
 from congrasp.services.assets.objects.hulls import corners_of, deepest, solid_hull
 from congrasp.services.assets.objects.interior import enclosed
 from congrasp.services.assets.objects.merging import DEPTH, GROWTH, merge
 
-FALLBACK_LIMIT = 30.0
-"""Limit of V-HACD's processor time, s."""
+PROCESSOR_LIMIT = 300.0
+"""Processor time of a decomposer, s, after which the import is an error; most take 1 to 15 s."""
 STARVED = 20.0
 """Ratio of wall-clock to processor time above which the machine counts as too busy."""
 LEAST_MEMORY = 2 << 30
 """Bytes of memory for which a child is started."""
-_MAX_MEMORY = 6 << 30
-"""Bytes of address space of a child, where there is enough for one on every core."""
+_ADDRESS_SPACE = 6 << 30
+"""Bytes of address space of a child: the same on every machine."""
 _FINEST_THRESHOLD = 0.01
 """The smallest threshold that CoACD takes, as a share of half the longest side."""
+_SEARCH = {"mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1, "resolution": 1500}
+"""Work of CoACD for each cut. Measured: fine cuts that are joined afterwards are as faithful as a
+longer search, in a third of the time.
+"""
+_RESOLUTION = 50
+"""Cells along a closed surface that is repaired by CoACD."""
+_WALL_RESOLUTION = 40
+"""Cells along an open surface from which CoACD makes a thin wall."""
 _MAX_VHACD_HULLS = 1 << 20
 _MESH = "mesh.npz"
 _PIECES = "pieces.npz"
@@ -55,7 +65,6 @@ def decompose(
     faces: np.ndarray,
     *,
     volume: float | None,
-    time_limit: float,
     max_pieces: int = MAX_MESH_PIECES,
     shown: np.ndarray | None = None,
 ) -> Decomposition:
@@ -66,13 +75,13 @@ def decompose(
       faces: (F, 3).
       volume: volume that the approximated surface encloses if the mesh is closed
         (`interior.enclosed`), m^3; one close to that of the hull needs no decomposition.
-      time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
       shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its
         hollows; by default the mesh's.
 
     Raises:
-      CongraspError: the machine is too busy for the child to reach its limit.
+      CongraspError: a decomposer exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for
+        it.
     """
     if shown is None:
         shown = vertices[faces]
@@ -81,9 +90,9 @@ def decompose(
         return Decomposition([corners_of(hull)], "convex", [])
     mesh = {"vertices": vertices, "faces": faces, "shown": shown}
     notes: list[str] = []
-    for method, limit in (("coacd", time_limit), ("vhacd", FALLBACK_LIMIT)):
+    for method in ("coacd", "vhacd"):
         try:
-            pieces = _in_child(method, mesh, volume, max_pieces, limit)
+            pieces = _in_child(method, mesh, volume, max_pieces)
             return Decomposition(pieces, method, notes)
         except ChildProcessError as error:
             notes.append(f"{method} {error}")
@@ -96,7 +105,6 @@ def _in_child(
     mesh: dict[str, Any],
     volume: float | None,
     max_pieces: int,
-    time_limit: float,
 ) -> list[np.ndarray]:
     """Vertices (V, 3) of the pieces that a confined process cuts.
 
@@ -105,15 +113,12 @@ def _in_child(
       mesh: arrays `vertices`, `faces` and `shown`; see `decompose`.
       volume: see `decompose`.
       max_pieces: most pieces.
-      time_limit: processor time, s.
 
     Raises:
-      CongraspError: the machine is too busy for it to reach its limit.
-      ChildProcessError: it failed, reached its limit, or found no piece; a predicate without a
-        subject.
+      CongraspError: it exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for it.
+      ChildProcessError: it failed, or found no piece; a predicate without a subject.
     """
-    max_memory = min(_MAX_MEMORY, max(LEAST_MEMORY, memory() // cores()))
-    patience = STARVED * time_limit + STARVED
+    patience = STARVED * PROCESSOR_LIMIT + STARVED
     options = {"method": method, "volume": volume, "max_pieces": max_pieces}
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder = pathlib.Path(name)
@@ -123,15 +128,20 @@ def _in_child(
                 write_pieces,
                 folder,
                 options,
-                memory=max_memory,
-                seconds=time_limit,
+                memory=_ADDRESS_SPACE,
+                seconds=PROCESSOR_LIMIT,
                 patience=patience,
             )
         except TimeoutError:
             raise CongraspError(
-                f"The machine is too busy: {method} got less than {time_limit:g} s of processor "
-                f"time in {patience:.0f} s.",
+                f"The machine is too busy: {method} got less than {PROCESSOR_LIMIT:g} s of "
+                f"processor time in {patience:.0f} s.",
                 "Stop other programs and try again.",
+            ) from None
+        except OutOfResources as error:
+            raise CongraspError(
+                f"The mesh cannot be cut into convex pieces: {method} {error}.",
+                "Simplify it to fewer triangles, or put convex pieces 'contact*' next to it.",
             ) from None
         with np.load(folder / _PIECES) as arrays:
             pieces = list(arrays.values())
@@ -186,25 +196,17 @@ def _body_by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> 
         if _is_convex(hull, triangles, enclosed(triangles).volume):
             return [corners_of(hull)]
     size = np.ptp(vertices, axis=0).max()
-    # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth
-    # of the time. An open surface becomes a thin wall, which the same search would cut into
-    # hundreds of pieces: a sphere without its top took 71 s and was 4.0 mm off, and takes 18 s and
-    # is 4.1 mm off.
-    if closed:
-        threshold = 2 * DEPTH / size
-        search = {"mcts_iterations": 20, "mcts_nodes": 10, "mcts_max_depth": 2}
-    else:
-        threshold = 3 * DEPTH / size
-        search = {"mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1}
-        search["preprocess_resolution"] = 40
+    # An open surface becomes a thin wall, which a finer cut would divide into hundreds of pieces.
+    depth = 2 * DEPTH if closed else 3 * DEPTH
     is_manifold = closed and is_watertight(faces_to_edges(faces))[0]
     pieces = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
-        threshold=min(1.0, max(_FINEST_THRESHOLD, threshold)),
+        threshold=min(1.0, max(_FINEST_THRESHOLD, depth / size)),
         preprocess_mode="off" if is_manifold else "auto",
+        preprocess_resolution=_RESOLUTION if closed else _WALL_RESOLUTION,
         merge=False,
         seed=0,
-        **search,
+        **_SEARCH,
     )
     return [piece[0] for piece in pieces]
 

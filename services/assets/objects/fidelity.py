@@ -44,8 +44,8 @@ class Fidelity(NamedTuple):
     """Errors of an object's convex pieces relative to its mesh."""
 
     volume: float | None
-    """(Volume of the pieces' union - the mesh's) / the mesh's; None for an open mesh, which
-    encloses no volume.
+    """(Volume of the pieces' union - the mesh's) / the mesh's; None for an open mesh that encloses
+    no volume.
     """
     surface: float
     """Hausdorff distance of the two outer surfaces, m: the larger of both directions, by sampled
@@ -87,13 +87,16 @@ class _Body(NamedTuple):
     surface: _Surface
 
 
-def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fidelity:
+def fidelity(
+    mesh: np.ndarray, pieces: list[np.ndarray], closed: bool, open_volume: float | None = None
+) -> Fidelity:
     """Compares the union of convex pieces with a mesh.
 
     Args:
       mesh: (F, 3, 3) corners of its triangles, m; they wind outwards where it is closed.
       pieces: (V, 3) vertices of each piece, in the same frame.
       closed: True if the mesh encloses a volume; otherwise all of it counts as surface.
+      open_volume: volume that an open mesh encloses (`winding.open_volume`), m^3, if any.
     """
     piece_triangles = [np.asarray(shapes.triangulate(piece).triangles) for piece in pieces]
     union_triangles = np.concatenate(piece_triangles)
@@ -101,7 +104,8 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
     union = _cut(union_triangles, grid)
     if not closed:
         distance = _hausdorff_distance(union.surface, _sampled(mesh))
-        return Fidelity(None, distance)
+        volume_error = union.volume / open_volume - 1 if open_volume else None
+        return Fidelity(volume_error, distance)
     reference = _cut(mesh, grid)
     union_volume = union.volume
     mesh_volume = reference.volume

@@ -37,17 +37,59 @@ def hole_loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
 
 
 def fill(mesh: trimesh.Trimesh, loops: list[np.ndarray]) -> trimesh.Trimesh:
-    """Returns the mesh with every hole closed by a fan around its middle.
+    """Returns the mesh with every hole closed.
+
+    Triangles between the vertices of the rim close it: they join the sides of a slit along a bend,
+    which a fan around its middle would cut short. Where they would repeat an edge of the mesh, a
+    fan closes it.
 
     Args:
       mesh: the mesh.
       loops: vertices around every hole (`hole_loops`).
     """
-    middles = [mesh.vertices[loop].mean(0) for loop in loops]
-    fans = []
-    for place, loop in enumerate(loops):
-        middle = np.full(len(loop), len(mesh.vertices) + place)
-        fans.append(np.stack([np.roll(loop, -1), loop, middle], -1))
-    vertices = np.concatenate([mesh.vertices, middles])
-    faces = np.concatenate([mesh.faces, *fans])
-    return trimesh.Trimesh(vertices, faces, process=False)
+    vertices = np.asarray(mesh.vertices)
+    edges = {tuple(edge) for edge in np.sort(mesh.edges_unique, axis=1).tolist()}
+    covers = [np.asarray(mesh.faces)]
+    middles: list[np.ndarray] = []
+    for loop in loops:
+        cover = _cover(vertices, loop, edges)
+        if cover is None:
+            middle = np.full(len(loop), len(vertices) + len(middles))
+            cover = np.stack([np.roll(loop, -1), loop, middle], -1)
+            middles.append(vertices[loop].mean(0))
+        covers.append(cover)
+    all_vertices = np.concatenate([vertices, np.reshape(middles, (-1, 3))])
+    return trimesh.Trimesh(all_vertices, np.concatenate(covers), process=False)
+
+
+def _cover(
+    vertices: np.ndarray, loop: np.ndarray, edges: set[tuple[int, ...]]
+) -> np.ndarray | None:
+    """Triangles (N - 2, 3) that close a loop: each cuts off the corner with the shortest base.
+
+    Args:
+      vertices: (V, 3) of the mesh.
+      loop: (N,) vertices around the hole.
+      edges: edges in use, to which the bases are added.
+
+    Returns:
+      The triangles; None if every base left would repeat an edge in use.
+    """
+    rim = loop.tolist()
+    faces: list[list[int]] = []
+    bases_in_use: set[tuple[int, ...]] = set()
+    while len(rim) > 3:
+        before = np.roll(rim, 1)
+        after = np.roll(rim, -1)
+        lengths = np.linalg.norm(vertices[after] - vertices[before], axis=-1)
+        bases = [tuple(base) for base in np.sort([before, after], axis=0).T.tolist()]
+        is_used = np.array([base in edges or base in bases_in_use for base in bases])
+        if is_used.all():
+            return None
+        corner = int(np.where(is_used, np.inf, lengths).argmin())
+        faces.append([after[corner], rim[corner], before[corner]])
+        bases_in_use.add(bases[corner])
+        del rim[corner]
+    faces.append(rim[::-1])
+    edges |= bases_in_use
+    return np.array(faces)

@@ -34,7 +34,7 @@ _HULL_PROBES = 200
 _DIRECTIONS = 300
 """Directions whose extreme vertices larger hulls are reduced to."""
 _NEIGHBOUR_DISTANCE = 5e-4
-"""Distance of the boxes of neighbouring pieces, m."""
+"""Largest gap between neighbouring pieces, m."""
 _INNER_POINTS = 60_000
 """Points inside of the mesh."""
 _MAX_INNER_TESTED = 500
@@ -217,10 +217,18 @@ def _thinned(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
 
 
 def _touch(first: ConvexHull, second: ConvexHull) -> bool:
-    """True if the boxes around two hulls touch."""
+    """True if the boxes around two hulls touch, and no side of one separates it from the other."""
     before = (first.min_bound < second.max_bound + _NEIGHBOUR_DISTANCE).all()
     after = (second.min_bound < first.max_bound + _NEIGHBOUR_DISTANCE).all()
-    return bool(before and after)
+    if not (before and after):
+        return False
+    return not (_separates(first, second) or _separates(second, first))
+
+
+def _separates(hull: ConvexHull, other: ConvexHull) -> bool:
+    """True if all of another hull is in front of one side of a hull."""
+    distances = corners_of(other) @ hull.equations[:, :3].T + hull.equations[:, 3]
+    return bool((distances.min(0) > _NEIGHBOUR_DISTANCE).any())
 
 
 def _sorted(points: np.ndarray) -> np.ndarray:

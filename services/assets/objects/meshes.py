@@ -16,7 +16,7 @@ from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects.assembly import assemble
-from congrasp.services.assets.objects.decompose import FALLBACK_LIMIT, LEAST_MEMORY
+from congrasp.services.assets.objects.decompose import LEAST_MEMORY, PROCESSOR_LIMIT, STARVED
 from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sources import Source
@@ -87,7 +87,7 @@ def import_sources(
     for _ in range(min(len(sources), cores(), processes_in_memory)):
         threading.Thread(target=work, daemon=True).start()
     most_meshes = max((len(source.visuals) for source in sources), default=0)
-    patience = most_meshes * (options.time_limit + FALLBACK_LIMIT) + _PATIENCE_S
+    patience = STARVED * most_meshes * PROCESSOR_LIMIT + _PATIENCE_S
     try:
         for _ in sources:
             i, result = done.get(timeout=patience)

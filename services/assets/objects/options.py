@@ -47,7 +47,6 @@ _LIMITS = {
     "scale": "1e9",
     "density": "25000 kg/m^3",
     "mass": "50 kg. Give kilograms",
-    "time_limit": "1e6 s",
     "max_pieces": "1e19",
 }
 """Largest value of each option, and its unit for the message."""
@@ -89,8 +88,6 @@ class ImportOptions:
     within 500 to 2500 kg/m^3, and at most 0.5 kg."""
     mass: float | None = None
     """Mass in kg; a material or a density then only distributes it."""
-    time_limit: float = 60.0
-    """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
     """Largest number of convex pieces of an object; more are merged."""
     # And so not in the seed of surface points

@@ -94,6 +94,19 @@ def cast_rays(triangles: np.ndarray, grid: RayGrid) -> Iterator[Crossings]:
         )
 
 
+def line_crossings(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the crossings of triangles (F, 3, 3) with lines along the third axis.
+
+    Returns:
+      (N, 2) integers of the first two axes through which the line passes, (N,) where on the line,
+      and (N,) int change of the winding number.
+    """
+    normals = _unit_normals(triangles)
+    hits = _hits(triangles, normals)
+    change = -np.sign(normals[hits.triangle, 2]).astype(int)
+    return hits.rays, hits.place, change
+
+
 def intervals(crossings: Crossings, seam: float) -> Intervals:
     """Returns the parts of rays that are inside.
 

@@ -8,7 +8,10 @@ import json
 import os
 import re
 import struct
+import subprocess
+import sys
 import threading
+import types
 
 import numpy as np
 import pytest
@@ -193,34 +196,72 @@ def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
     assert obj.notes[0].endswith("; pieces cut from its mesh are no closer")
 
 
-def decomposed(mesh, time_limit):
-    return decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=time_limit)
+def decomposed(mesh):
+    return decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume)
 
 
 @SLOW
-def test_an_open_sphere_is_cut_within_the_default_limit(tmp_path):
+def test_an_open_sphere_is_cut_by_coacd():
     sphere = trimesh.creation.icosphere(4, 0.04)
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.02)
-    found = decompose.decompose(
-        sphere.vertices, sphere.faces, volume=None, time_limit=ImportOptions().time_limit
-    )
-    assert (found.method, found.notes) == ("coacd", [])
+    result = decompose.decompose(sphere.vertices, sphere.faces, volume=None)
+    assert (result.method, result.notes) == ("coacd", [])
 
 
-def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
+def break_module(folder, monkeypatch, name):
+    """Makes a module that child processes find first fail on import."""
+    (folder / f"{name}.py").write_text("raise RuntimeError('broken')")
+    monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+
+
+def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatch):
     mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
+    break_module(tmp_path, monkeypatch, "coacd")
+    result = decomposed(mesh)
     assert result.method == "vhacd"
-    assert result.notes == ["coacd took longer than 0.01 s of processor time"]
+    assert result.notes == ["coacd failed (RuntimeError: broken)"]
     volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
-    monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
+    break_module(tmp_path, monkeypatch, "vhacdx")
+    result = decomposed(mesh)
     assert (result.method, len(result.pieces)) == ("hull", 1)
     np.testing.assert_allclose(
         shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6
     )
     assert "hull" in result.notes[-1]
+
+
+def test_a_cut_beyond_its_limit_is_an_error(monkeypatch):
+    """No other shape replaces one that a slow machine does not finish."""
+    monkeypatch.setattr(decompose, "PROCESSOR_LIMIT", 0.01)
+    with pytest.raises(CongraspError, match=r"coacd took longer than 0\.01 s"):
+        decomposed(ell())
+
+
+def test_a_cut_that_the_system_kills_is_an_error(monkeypatch, tmp_path):
+    (tmp_path / "coacd.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    with pytest.raises(CongraspError, match="killed"):
+        decomposed(ell())
+
+
+def test_pieces_do_not_depend_on_free_memory_threads_or_load(monkeypatch):
+    pipe = trimesh.creation.annulus(0.02, 0.024, 0.05, sections=24)
+    idle = decomposed(pipe)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: types.SimpleNamespace(available=1 << 20))
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "3")
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    try:
+        loaded = decomposed(pipe)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert loaded.method == idle.method == "coacd"
+    assert len(loaded.pieces) == len(idle.pieces) > 4
+    for first, second in zip(idle.pieces, loaded.pieces, strict=True):
+        assert first.tobytes() == second.tobytes()
 
 
 def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
@@ -241,13 +282,12 @@ def test_a_busy_machine_changes_no_shape(monkeypatch):
     with pytest.raises(
         CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"
     ):
-        decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+        decomposed(mesh)
 
 
 def test_decomposer_that_dies_is_reported(monkeypatch):
     monkeypatch.setattr(decompose, "write_pieces", os.abort)  # which its arguments end at once
-    mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+    result = decomposed(ell())
     assert result.method == "hull"
     assert result.notes[0].startswith("coacd failed (")
     assert result.notes[1].startswith("vhacd failed (")
@@ -308,7 +348,7 @@ def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
 
 def test_coacd_cuts_an_ell_in_two():
     mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+    result = decomposed(mesh)
     assert result.method == "coacd"
     assert 2 <= len(result.pieces) <= 3
     np.testing.assert_allclose(

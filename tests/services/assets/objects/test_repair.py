@@ -9,6 +9,7 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.bodies import largest_body, without_table
+from congrasp.services.assets.objects.holes import fill, hole_loops
 from congrasp.services.assets.objects.hollows import without_hollows
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh
 from congrasp.services.assets.objects.named import one_object
@@ -354,3 +355,29 @@ def _moebius():
         c, d = (2 * i + 2, 2 * i + 3) if i < 23 else (1, 0)
         faces += [(a, b, c), (b, d, c)]
     return rim, faces
+
+
+def test_a_slit_along_a_bend_is_closed_along_the_bend():
+    """A fan around the middle of the slit's rim would cut a wedge of 1 cm out of the sphere."""
+    sphere = trimesh.creation.uv_sphere(0.04, count=[32, 32])
+    x, y, z = sphere.triangles_center.T
+    is_slit = (np.abs(np.arctan2(y, x) - 0.1) < 0.1) & (np.abs(z) < 0.03)
+    assert is_slit.sum() > 20
+    sphere.update_faces(~is_slit)
+    (loop,) = hole_loops(sphere)
+    filled = fill(sphere, [loop])
+    assert filled.is_watertight
+    assert len(filled.vertices) == len(sphere.vertices)
+    whole = trimesh.creation.uv_sphere(0.04, count=[32, 32])
+    np.testing.assert_allclose(filled.volume, whole.volume, rtol=5e-4)
+
+
+def test_a_hole_whose_bases_are_edges_of_the_mesh_is_closed_by_a_fan():
+    """The two diagonals of the square rim are edges already."""
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, -1]]
+    sides = [[4, 1, 0], [4, 2, 1], [4, 3, 2], [4, 0, 3]]
+    others = [[0, 2, 5], [1, 3, 5]]
+    mesh = trimesh.Trimesh([*corners, [0.5, 0.5, 3]], sides + others, process=False)
+    filled = fill(mesh, [np.array([1, 0, 3, 2])])
+    assert len(filled.vertices) == 7
+    np.testing.assert_allclose(filled.vertices[-1], [0.5, 0.5, 0])

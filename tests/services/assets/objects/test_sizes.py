@@ -26,9 +26,7 @@ from congrasp.services.studio.catalogue import Importer
 
 
 def test_numbers_at_their_limits_are_accepted() -> None:
-    options.check_options(
-        ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize)
-    )
+    options.check_options(ImportOptions(scale=1e9, density=25_000, mass=50, max_pieces=sys.maxsize))
 
 
 @pytest.mark.parametrize(
