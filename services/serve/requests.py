@@ -294,6 +294,10 @@ class Layout:
             )
         )
 
+    def pass_all(self, checks: np.ndarray) -> bool:
+        """True if no state of a batch fails a check (n, C) of `complete`."""
+        return bool((np.abs(checks - 1.0) <= _UNIT_TOLERANCE).all())
+
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
         """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`;
         None without one.
