@@ -72,7 +72,8 @@ class View:
                 starting.close()
                 print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
                 stop.wait()
-                return stop.exit_code
+            print(f"The studio ends: {stop.reason}.", flush=True)
+        return stop.exit_code
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":
         """The page of a run: of its learner if that responds, else of its newest policy."""

@@ -16,8 +16,8 @@ from concurrent.futures import Future, InvalidStateError
 from typing import Generic, NamedTuple, TypeVar
 
 from congrasp.common.errors import CongraspError, LateError, OverloadedError
+from congrasp.common.transport.fair_queue import FairQueue
 from congrasp.common.transport.senders import Peer
-from congrasp.services.serve.fair_queue import FairQueue
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from congrasp.common.transport.fair_queue import FairQueue
 from congrasp.common.transport.senders import Peer
-from congrasp.services.serve.fair_queue import FairQueue
 
 PEERS = st.builds(Peer, st.sampled_from("abc"), st.sampled_from("123"))
 
@@ -102,7 +102,11 @@ def test_peer_that_returns_before_its_turn_is_last(queued, returning):
     queue = filled(20, 20, f"{queued} {returning}")
     first_round = [take(queue) for _ in range(3)]
     queue.add(returning, peer(returning))
-    assert first_round + [take(queue) for _ in range(3)] == 2 * [queued[:2], queued[9:11], returning]
+    assert first_round + [take(queue) for _ in range(3)] == 2 * [
+        queued[:2],
+        queued[9:11],
+        returning,
+    ]
 
 
 @given(st.lists(PEERS, max_size=60), st.integers(1, 8), st.integers(1, 8))
