@@ -27,8 +27,11 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.episode_policy import EpisodePolicy
+from congrasp.services.client.left_policy import LeftPolicy
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.client.policy import PACKED, EpisodePolicy, LeftPolicy, Policy
+from congrasp.services.client.packer import PACKED
+from congrasp.services.client.policy import Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 4, 16, STATES_LIMIT)

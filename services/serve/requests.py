@@ -4,7 +4,7 @@ A query is one array `packed` (n, S) of float32: a row for each of n states unde
 constraints. Its metadata have the names of the `constraints`, the digest of the `layout`, and the
 `timeout` in seconds. One vector is transferred to the device at once, since the overhead of a
 transfer equals that of thirty times its size. The layout is part of `Policy.metadata`.
-`services.client.policy.Packer` writes and checks the fields; absent ones are zero.
+`services.client.packer.Packer` writes and checks the fields; absent ones are zero.
 
 The fields, without batch axis, are those of `common.task.types.SceneState`, the object's
 `surface_points` with `surface_avoid`, and the goal arrays of the constraints.
@@ -46,7 +46,8 @@ from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.policy import CAMERA, NORMALS, PACKED
+from congrasp.services.client.fields import CAMERA, NORMALS
+from congrasp.services.client.packer import PACKED
 
 STATES_LIMIT = 64
 """Most states in one query."""
