@@ -32,11 +32,12 @@ if TYPE_CHECKING:
     )
     from congrasp.common.request import GraspRequest
     from congrasp.services.assets.objects.options import ImportOptions
-    from congrasp.services.client.guard import Command, Guard, Ticker
+    from congrasp.services.client.guard import Command, Guard
     from congrasp.services.client.left_policy import LeftPolicy
     from congrasp.services.client.limits import JointLimits
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
+    from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasper, grasp
     from congrasp.services.grasp.motion import Grasp
@@ -85,7 +86,7 @@ _MODULES = {
     "LeftPolicy": "congrasp.services.client.left_policy",
     "Policy": "congrasp.services.client.policy",
     "PolicyClient": "congrasp.services.client.policy_client",
-    "Ticker": "congrasp.services.client.guard",
+    "Ticker": "congrasp.services.client.ticker",
     "grasp": "congrasp.services.grasp.grasper",
     "load_motion": "congrasp.services.export.motion_file",
     "load_policy": "congrasp.services.serve.inference",

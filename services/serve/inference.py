@@ -54,7 +54,7 @@ class Inference(NamedTuple):
 
 
 class _Outputs(NamedTuple):
-    """What the compiled function returns for n states."""
+    """Result of the compiled function for n states."""
 
     vectors: np.ndarray
     """(n, A + F + 6), see `Inference`."""
