@@ -15,9 +15,13 @@ import numpy as np
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport.base import Closing
-from congrasp.services.client.limits import Floor, JointLimits, Limiter, Speeds, as_numbers
+from congrasp.services.client.arrays import as_numbers
+from congrasp.services.client.floor import Floor
+from congrasp.services.client.limiter import Limiter
+from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer, Policy, State
 from congrasp.services.client.query_thread import Outcome, QueryThread
+from congrasp.services.client.speeds import Speeds
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
