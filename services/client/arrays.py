@@ -20,7 +20,8 @@ def bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:
     """
     clipped = np.clip(values, -most, most)
     for three in (slice(-6, -3), slice(-3, None)):
-        length, longest = np.linalg.norm(values[three]), most[three].min()
+        length = np.linalg.norm(values[three])
+        longest = most[three].min()
         if not length <= longest:
             # Rounding
             clipped[three] = np.clip(values[three] * (longest / length), -longest, longest)
