@@ -262,13 +262,14 @@ class FairQueue(Generic[T]):
 
     def in_turn(self) -> list[Peer]:
         """Peers in the order of their turns: one of each account, then again."""
-        rounds = [
-            [Peer(name, peer) for peer in self._accounts[name].names]
-            for name in self._turns
-            if name in self._accounts
-        ]
-        turns = itertools.zip_longest(*rounds)
-        return [peer for turn in turns for peer in turn if peer is not None]
+        by_account = []
+        for name in self._turns:
+            if name in self._accounts:
+                by_account.append([Peer(name, peer) for peer in self._accounts[name].names])
+        order: list[Peer] = []
+        for peers in itertools.zip_longest(*by_account):
+            order += [peer for peer in peers if peer is not None]
+        return order
 
     def first(self, peer: Peer) -> T:
         """Oldest item of a peer."""

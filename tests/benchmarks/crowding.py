@@ -201,7 +201,15 @@ def _setting(folder: pathlib.Path, has_certificates: bool) -> Iterator[_Setting]
         query = folder / "query"
         query.write_bytes(single_query(clients[0], episode))
         name = "certs" if has_certificates else "names"
-        yield _Setting(name, *ends, clients, certs[_HONEST:], query, episode)
+        yield _Setting(
+            name=name,
+            endpoint=ends[0],
+            elsewhere=ends[1],
+            clients=clients,
+            attacker=certs[_HONEST:],
+            query=query,
+            episode=episode,
+        )
 
 
 def _measured(setting: _Setting, seconds: float) -> _Outcome:
