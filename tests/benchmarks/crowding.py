@@ -182,7 +182,7 @@ def _setting(folder: pathlib.Path, has_certificates: bool) -> Iterator[_Setting]
         create_authority(authority)
         server = issue(authority, "server")
         certs = [issue(authority, "client") for _ in range(_HONEST + CONNECTIONS)]
-    honest = certs[:_HONEST] or [None] * _HONEST
+    honest: list[pathlib.Path | None] = [*certs[:_HONEST]] or [None] * _HONEST
     episode = example_episode(1_000_000)
     with contextlib.ExitStack() as stack:
         ends = [
