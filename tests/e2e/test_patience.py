@@ -77,19 +77,16 @@ def test_twenty_half_open_actors_are_replaced_under_their_name(cluster):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("isolated", ["a", "ab"])
-def test_actors_cut_off_for_over_a_minute_come_back(cluster, isolated):
-    """One of two, or the learner from both."""
+def test_an_actor_cut_off_for_over_a_minute_comes_back(cluster):
     learner = cluster.start_learner()
     with cuttable(cluster.endpoint) as link:
-        for name in "ab":
-            endpoint = link.endpoint if name in isolated else cluster.endpoint
-            cluster.start_actor(name, endpoint=endpoint)
+        cluster.start_actor("a", endpoint=link.endpoint)
+        cluster.start_actor("b")
         before = cluster.wait(
             lambda status: len(rollouts(status)) == 2 and all(rollouts(status).values())
         )
         link.cut()
-        cluster.wait(lambda status: len(rollouts(status)) == 2 - len(isolated))
+        cluster.wait(lambda status: len(rollouts(status)) == 1)
         time.sleep(PARTITION_SECONDS)
         link.heal()
         back = cluster.wait(lambda status: len(rollouts(status)) == 2)
