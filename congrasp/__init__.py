@@ -32,10 +32,12 @@ if TYPE_CHECKING:
     )
     from congrasp.common.request import GraspRequest
     from congrasp.services.assets.objects.options import ImportOptions
-    from congrasp.services.client.guard import Command, Guard, Ticker
+    from congrasp.services.client.guard import Command, Guard
+    from congrasp.services.client.left_policy import LeftPolicy
     from congrasp.services.client.limits import JointLimits
-    from congrasp.services.client.policy import Answer, LeftPolicy, Policy
+    from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
+    from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasper, grasp
     from congrasp.services.grasp.motion import Grasp
@@ -81,10 +83,10 @@ _MODULES = {
     "Guard": "congrasp.services.client.guard",
     "ImportOptions": "congrasp.services.assets.objects.options",
     "JointLimits": "congrasp.services.client.limits",
-    "LeftPolicy": "congrasp.services.client.policy",
+    "LeftPolicy": "congrasp.services.client.left_policy",
     "Policy": "congrasp.services.client.policy",
     "PolicyClient": "congrasp.services.client.policy_client",
-    "Ticker": "congrasp.services.client.guard",
+    "Ticker": "congrasp.services.client.ticker",
     "grasp": "congrasp.services.grasp.grasper",
     "load_motion": "congrasp.services.export.motion_file",
     "load_policy": "congrasp.services.serve.inference",

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.policy import Packer
+from congrasp.services.client.packer import Packer
 from congrasp.services.serve.requests import Layout
 
 _POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals", "camera_position")

@@ -109,6 +109,7 @@ class Transport(Closing, Protocol):
         depth: int = 4,
         on_damage: Damage | None = None,
         admission: Admission | None = None,
+        fair: bool = False,
     ) -> None:
         """Answers queries.
 
@@ -121,6 +122,8 @@ class Transport(Closing, Protocol):
           on_damage: called for requests that cannot be decoded; these are refused without calling
             the handler.
           admission: called before a request is decoded; it may reject it with a reply.
+          fair: waiting queries are answered in the order of their senders' turns instead of that of
+            their arrival, and those in excess of `depth` are refused (`FairQueue`).
         """
         ...
 

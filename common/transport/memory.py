@@ -92,6 +92,7 @@ class MemoryTransport(Transport):
         depth: int = 4,
         on_damage: Damage | None = None,
         admission: Admission | None = None,
+        fair: bool = False,
     ) -> None:
         """See `Transport.serve`; messages are never damaged here."""
         self._check_open()

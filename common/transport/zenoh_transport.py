@@ -25,13 +25,20 @@ from typing import Any, NamedTuple
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
+from congrasp.common.errors import (
+    CongraspError,
+    OverloadedError,
+    RefusedError,
+    TransportError,
+    error_of,
+)
 from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, Transport
 from congrasp.common.transport.keys import FLOWS, Flow, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
 from congrasp.common.transport.senders import sent_by
+from congrasp.common.transport.zenoh_arrivals import Arrival, Arrivals
 from congrasp.common.transport.zenoh_senders import Senders, Sources
 from congrasp.common.transport.zenoh_session import (
     STAMP,
@@ -312,6 +319,7 @@ class ZenohTransport(Transport):
         depth: int = 4,
         on_damage: Damage | None = None,
         admission: Admission | None = None,
+        fair: bool = False,
     ) -> None:
         """See `Transport.serve`."""
         hooks = on_damage or (lambda *_: None), admission or (lambda _: None)
@@ -319,7 +327,8 @@ class ZenohTransport(Transport):
             lambda: self._sessions.get(flow(key)), has_certificates=bool(self._identity)
         )
         server = _Server(handler, *hooks, self._max_message, self._outbox, senders)
-        works = [functools.partial(_serve, server=server)] * workers
+        receiver = _Receiver(server, depth)
+        works = [receiver.fair_work if fair else receiver.work] * workers
         self._sessions.declare(
             flow(key), lambda session: session.declare_queryable(key, FifoChannel(depth)), *works
         )
@@ -492,31 +501,62 @@ class _Server(NamedTuple):
     senders: Senders
 
 
-def _serve(queries: Any, server: _Server) -> None:
-    """Answers queries until the session closes; runs in a separate thread."""
-    for query in received(queries):
-        key = str(query.key_expr)
-        peer = server.senders.of_query(query, key)
-        wanted = query.attachment.to_bytes() if query.attachment else b""
-        if not is_request(wanted):
-            with sent_by(peer):
-                _reply(
-                    query,
-                    key,
-                    functools.partial(_answer, query, key, server),
-                    server.outbox,
-                    wanted,
-                    peer.account,
+class _Receiver:
+    """Work of the threads that answer the queries of a key until the session closes."""
+
+    def __init__(self, server: _Server, depth: int):
+        self._server = server
+        self._depth = depth
+        self._lock = threading.Lock()
+        self._channel: Any = None
+        self._arrivals: Arrivals | None = None
+
+    def work(self, channel: Any) -> None:
+        """Answers queries in the order of their arrival."""
+        sender_of = self._server.senders.of_query
+        for query in received(channel):
+            key = str(query.key_expr)
+            _serve(Arrival(query, key, sender_of(query, key)), self._server)
+
+    def fair_work(self, channel: Any) -> None:
+        """Answers queries in the order of their senders' turns."""
+        with contextlib.suppress(zenoh.ZError):
+            for arrival in self._arrivals_of(channel):
+                _serve(arrival, self._server)
+
+    def _arrivals_of(self, channel: Any) -> Arrivals:
+        """Arrivals of the current session's channel, which all threads share."""
+        with self._lock:
+            if self._arrivals is None or self._channel is not channel:
+                self._channel = channel
+                self._arrivals = Arrivals(
+                    channel, self._server.senders.of_query, self._refuse, depth=self._depth
                 )
-        else:
-            with (
-                contextlib.suppress(zenoh.ZError, CongraspError),
-                sent_by(peer),
-                query,
-                server.outbox.turn(peer.account) as mine,
-            ):
-                if mine and server.admission(key) is None:
-                    query.reply(key, server.outbox.piece(wanted), attachment=wanted)
+            return self._arrivals
+
+    def _refuse(self, query: Any) -> None:
+        """Answers a query that has no place."""
+        error = OverloadedError(f"Overloaded: {self._depth} queries wait.", "Try again later.")
+        _reply_error(query, str(error), error.code)
+
+
+def _serve(arrival: Arrival, server: _Server) -> None:
+    """Answers one query."""
+    query, key, peer = arrival
+    attachment = query.attachment.to_bytes() if query.attachment else b""
+    if not is_request(attachment):
+        answer = functools.partial(_answer, query, key, server)
+        with sent_by(peer):
+            _reply(query, key, answer, server.outbox, attachment, peer.account)
+        return
+    with (
+        contextlib.suppress(zenoh.ZError, CongraspError),
+        sent_by(peer),
+        query,
+        server.outbox.turn(peer.account) as has_turn,
+    ):
+        if has_turn and server.admission(key) is None:
+            query.reply(key, server.outbox.piece(attachment), attachment=attachment)
 
 
 def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
@@ -560,10 +600,19 @@ def _reply(
     except Exception as error:
         _log.exception("The reply to %s failed.", key)
         message = f"The peer failed on {key}: {type(error).__name__}."
+    if message:
+        _reply_error(query, message, code)
+        return
+    with (
+        contextlib.suppress(zenoh.ZError),
+        query,
+        outbox.first(payload, attachment, account) as (piece, head),
+    ):
+        query.reply(key, piece, attachment=head)
+
+
+def _reply_error(query: Any, message: str, code: str) -> None:
+    """Replies with message and code of an error."""
+    encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
     with contextlib.suppress(zenoh.ZError), query:
-        if message:
-            encoding = zenoh.Encoding.TEXT_PLAIN.with_schema(code)
-            query.reply_err(message.encode(errors="replace"), encoding=encoding)
-        else:
-            with outbox.first(payload, attachment, account) as (piece, head):
-                query.reply(key, piece, attachment=head)
+        query.reply_err(message.encode(errors="replace"), encoding=encoding)

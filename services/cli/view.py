@@ -73,7 +73,7 @@ class View:
                 starting.close()
                 print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
                 stop.wait()
-        print(f"The studio ends: {stop.reason}.")
+        print(f"The studio ends: {stop.reason}.", flush=True)
         return stop.exit_code
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":

@@ -1,35 +1,33 @@
 """Guard between a policy and a robot: a command every tick, even if the policy fails.
 
-A separate thread queries the policy, so that the network does not block the control loop. Needs
-only NumPy.
+A separate thread queries the policy (`query_thread`), so that the network does not block the
+control loop. Needs only NumPy.
 """
 
-import collections
 import dataclasses
 import math
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
-from congrasp.common.runtime import forks
 from congrasp.common.transport.base import Closing
-from congrasp.services.client.limits import Floor, JointLimits, Limiter, Speeds, as_numbers
+from congrasp.services.client.arrays import as_numbers
+from congrasp.services.client.floor import Floor
+from congrasp.services.client.limiter import Limiter
+from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer, Policy, State
+from congrasp.services.client.query_thread import Outcome, QueryThread
+from congrasp.services.client.speeds import Speeds
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
-_END = 2.0  # deadline for the end of the querying thread, s
-_LIFTED = 0.02  # m above its first height at which an object counts as held
-# Measurements by a tracker and their sizes
-_OBJECT = {
-    "object_position": 3,
-    "object_quaternion": 4,
-}
+_LIFTED_M = 0.02  # height above its first one at which an object counts as held
+_TRACKED_SIZES = {"object_position": 3, "object_quaternion": 4}
+"""Measurements by a tracker and their sizes."""
 
 
 @dataclasses.dataclass
@@ -145,7 +143,7 @@ class Guard(Closing):
           TransportError: the policy's metadata is needed, and there is no response.
         """
         if limits is None or open_pose is None:
-            limits, open_pose = _described(policy, limits, open_pose)
+            limits, open_pose = _completed(policy, limits, open_pose)
         fingers = len(limits.lower) - 6
         if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
             raise CongraspError(
@@ -157,19 +155,28 @@ class Guard(Closing):
             raise CongraspError("The times must be: 0 <= wait < period, and 0 < stale <= hold.")
         if fallback not in ("freeze", "open"):
             raise CongraspError(f"The fallback is {ascii(fallback)[:40]}.", "It is freeze or open.")
-        self.counters, self.trouble = Counters(), ""
-        self._limits, self._open = limits, as_numbers(open_pose, fingers)
-        self._period, self._wait, self._stale, self._hold = period, wait, stale, hold
-        self._fallback, self._clock, self._fingers = fallback, clock, fingers
+        self.counters = Counters()
+        self.trouble = ""
+        self._limits = limits
+        self._open = as_numbers(open_pose, fingers)
+        self._period = period
+        self._wait = wait
+        self._stale = stale
+        self._hold = hold
+        self._fallback = fallback
+        self._clock = clock
+        self._fingers = fingers
         self._table = np.array(table, float)
-        self._needed: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}  # of the measurements that the policy needs
         self._limiter: Limiter | None = None
         self._speeds = Speeds(limits.speed, stale)
-        self._wanted, self._fresh = np.zeros(fingers + 6), clock()
+        self._target = np.zeros(fingers + 6)  # requested, before the limits
+        self._fresh_time = clock()  # of the state of the last accepted answer
         self._answer: Answer | None = None
         self._latched: Fallback | None = None
-        self._height, self._held = math.nan, False
-        self._asker = _Asker(policy)
+        self._first_height = math.nan
+        self._holds_object = False
+        self._queries = QueryThread(policy)
 
     def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
         """Begins an episode; a pending query of the previous one is dropped.
@@ -186,22 +193,26 @@ class Guard(Closing):
             pose.
           ForkError: the guard was opened before this process was forked.
         """
-        self._asker.require_same_process()
+        self._queries.require_same_process()
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
             start[: self._fingers] = self._limiter.target[: self._fingers]
-        floor = (
-            Floor(self._table, request.wrist, self._limits.palm)
-            if request.wrist is not None
-            else None
-        )
+        floor = None
+        if request.wrist is not None:
+            floor = Floor(self._table, request.wrist, self._limits.palm)
         self._limiter = Limiter(self._limits, start, period=self._period, floor=floor)
         self._speeds = Speeds(self._limits.speed, self._stale)
-        self._wanted, self._fresh = self._limiter.target, self._clock()
-        self._answer, self._latched, self._held = None, None, False
-        self._height = as_numbers(request.object_pose and request.object_pose[0], 3)[2]
-        self._needed = {"q": self._fingers, "u": 6, **(_OBJECT if request.cloud is None else {})}
-        self._asker.begin(request)
+        self._target = self._limiter.target
+        self._fresh_time = self._clock()
+        self._answer = None
+        self._latched = None
+        self._holds_object = False
+        object_position = request.object_pose and request.object_pose[0]
+        self._first_height = as_numbers(object_position, 3)[2]
+        self._sizes = {"q": self._fingers, "u": 6}
+        if request.cloud is None:
+            self._sizes |= _TRACKED_SIZES
+        self._queries.begin(request)
 
     def open(self) -> None:
         """Opens the fingers from the next step on, until `reset` or `freeze`, even if they hold an
@@ -224,250 +235,128 @@ class Guard(Closing):
           RefusedError: there is no episode yet.
           ForkError: the guard was opened before this process was forked.
         """
-        self._asker.require_same_process()
+        self._queries.require_same_process()
         if self._limiter is None:
             raise RefusedError("There is no episode yet.", "Begin one with reset.")
         now = self._clock()
-        targets = dict(
-            zip(
-                ("q_target", "u_target"),
-                np.split(self._limiter.target, [self._fingers]),
-                strict=True,
-            )
-        )
-        lacking = {
-            name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state
-        }
         position, velocity = self._measured(state, now)
-        speeds = dict(
-            zip(("q_velocity", "u_velocity"), np.split(velocity, [self._fingers]), strict=True)
-        )
-        self._take(self._asker.exchange({**speeds, **state, **lacking, **targets}, now, self._wait))
+        query = self._query(state, velocity, self._limiter.target)
+        self._take(self._queries.exchange(query, now, self._wait))
         mode = self._mode(state, np.append(position, velocity))
         if mode == "open":
-            self._wanted = np.append(self._open, self._limiter.target[self._fingers :])
+            self._target = np.append(self._open, self._limiter.target[self._fingers :])
         elif mode != "follow":
-            self._wanted = self._limiter.target
-        limited = self._limiter.limit(self._wanted, position, velocity, now)
-        for name in ("steps", mode if mode in ("follow", "hold") else "fallback", *limited.by):
-            setattr(self.counters, name, getattr(self.counters, name) + 1)
-        (q_target, u_target), (q_torque, u_torque) = (
-            np.split(x, [self._fingers]) for x in limited[:2]
+            self._target = self._limiter.target
+        limited = self._limiter.limit(self._target, position, velocity, now)
+        self._count(mode, limited.by)
+        q_target, u_target = np.split(limited.target, [self._fingers])
+        q_torque, u_torque = np.split(limited.torque, [self._fingers])
+        return Command(
+            q_target=q_target,
+            u_target=u_target,
+            q_torque=q_torque,
+            u_torque=u_torque,
+            mode=mode,
+            answer=self._answer if mode == "follow" else None,
         )
-        answer = self._answer if mode == "follow" else None
-        return Command(q_target, u_target, q_torque, u_torque, mode, answer)
 
     def close(self) -> None:
         """Ends the querying thread, and closes the policy."""
-        self._asker.close()
+        self._queries.close()
 
-    def _take(self, outcome: "_Outcome | None") -> None:
+    def _query(self, state: State, velocity: np.ndarray, target: np.ndarray) -> State:
+        """State of a query: with all measurements that the policy needs, NaN where one is missing,
+        with velocities, and with the commanded targets.
+        """
+        q_velocity, u_velocity = np.split(velocity, [self._fingers])
+        q_target, u_target = np.split(target, [self._fingers])
+        missing = {
+            name: np.full(size, np.nan) for name, size in self._sizes.items() if name not in state
+        }
+        return {
+            "q_velocity": q_velocity,
+            "u_velocity": u_velocity,
+            **state,
+            **missing,
+            "q_target": q_target,
+            "u_target": u_target,
+        }
+
+    def _count(self, mode: Mode, limits: Sequence[str]) -> None:
+        """Counts a command, and the limits that changed it."""
+        kind = mode if mode in ("follow", "hold") else "fallback"
+        for name in ("steps", kind, *limits):
+            setattr(self.counters, name, getattr(self.counters, name) + 1)
+
+    def _take(self, outcome: Outcome | None) -> None:
         """Accepts an answer if it is fresh and finite, and counts the outcome."""
         if outcome is None:
             self.counters.late += 1
             return
-        answer, asked = outcome
+        answer = outcome.answer
         if isinstance(answer, TransportError):
             self.trouble = str(answer)
-            self.counters.refused += isinstance(answer, RefusedError)
-            self.counters.lost += not isinstance(answer, RefusedError)
+            if isinstance(answer, RefusedError):
+                self.counters.refused += 1
+            else:
+                self.counters.lost += 1
             return
-        wanted = np.append(
-            as_numbers(answer.q_target, self._fingers), as_numbers(answer.u_target, 6)
-        )
-        if not np.isfinite(wanted).all():
+        q_target = as_numbers(answer.q_target, self._fingers)
+        u_target = as_numbers(answer.u_target, 6)
+        target = np.append(q_target, u_target)
+        if not np.isfinite(target).all():
             self.counters.invalid += 1
-        elif not 0.0 <= self._clock() - asked <= self._stale:
+            return
+        age = self._clock() - outcome.state_time
+        if not 0.0 <= age <= self._stale:
             self.counters.stale += 1
-        else:
-            self._wanted, self._answer, self._fresh, self.trouble = wanted, answer, asked, ""
-            self.counters.answers += 1
+            return
+        self._target = target
+        self._answer = answer
+        self._fresh_time = outcome.state_time
+        self.trouble = ""
+        self.counters.answers += 1
 
     def _mode(self, state: State, measured: np.ndarray) -> Mode:
         """Returns the mode of the next command; `measured` are positions and velocities."""
         height = as_numbers(state.get("object_position"), 3)[2]
-        self._held |= not np.all(state.get("table", True)) or bool(height > self._height + _LIFTED)
-        age = self._clock() - self._fresh
+        is_off_table = not np.all(state.get("table", True))
+        is_lifted = bool(height > self._first_height + _LIFTED_M)
+        self._holds_object = self._holds_object or is_off_table or is_lifted
+        age = self._clock() - self._fresh_time
         if self._latched is None and not 0.0 <= age <= self._hold:
-            heights = (self._height, height) if "object_position" in self._needed else ()
-            complete = np.isfinite(np.append(heights, measured)).all()
-            self._latched = self._fallback if complete and not self._held else "freeze"
+            heights = (self._first_height, height) if "object_position" in self._sizes else ()
+            is_complete = np.isfinite(np.append(heights, measured)).all()
+            is_safe = is_complete and not self._holds_object
+            self._latched = self._fallback if is_safe else "freeze"
         if self._latched is not None:
             return self._latched
-        return "follow" if self._answer is not None and age <= self._stale else "hold"
+        is_fresh = self._answer is not None and age <= self._stale
+        return "follow" if is_fresh else "hold"
 
     def _measured(self, state: State, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (F + 6,) of a state; velocities that it lacks are estimated."""
-        sizes = {"q": self._fingers, "u": 6}
-        position = np.concatenate(
-            [as_numbers(state.get(name), size) for name, size in sizes.items()]
-        )
-        estimated = dict(
-            zip(sizes, np.split(self._speeds.of(position, now), [self._fingers]), strict=True)
-        )
-        velocity = [
-            as_numbers(state.get(f"{name}_velocity", estimated[name]), size)
-            for name, size in sizes.items()
-        ]
-        return position, np.concatenate(velocity)
+        q = as_numbers(state.get("q"), self._fingers)
+        u = as_numbers(state.get("u"), 6)
+        position = np.append(q, u)
+        q_estimate, u_estimate = np.split(self._speeds.of(position, now), [self._fingers])
+        q_velocity = as_numbers(state.get("q_velocity", q_estimate), self._fingers)
+        u_velocity = as_numbers(state.get("u_velocity", u_estimate), 6)
+        return position, np.append(q_velocity, u_velocity)
 
 
-def _described(
+def _completed(
     policy: Policy, limits: JointLimits | None, open_pose: np.ndarray | None
 ) -> tuple[JointLimits, np.ndarray]:
     """Limits and open pose, by default those of the policy's metadata."""
-    described = policy.metadata()
-    if limits is None and described["limits"] is None:
-        raise CongraspError(
-            f"Joints of the hand '{described['hand']}' share motors.",
-            "Make limits of its joints by hand (JointLimits).",
-        )
-    pose = described["open_pose"] if open_pose is None else open_pose
-    return limits or JointLimits(**described["limits"]), np.asarray(pose, float)
-
-
-_Outcome = tuple[Answer | TransportError, float]
-"""An answer or its error, and the time of its state."""
-
-
-class _Asker:
-    """Queries a policy in a thread: one query at a time, without outcomes of earlier episodes."""
-
-    def __init__(self, policy: Policy):
-        self._policy = policy
-        self._opened = forks.generation()
-        self._changed = threading.Condition()
-        self._request: GraspRequest | None = None
-        self._question: tuple[State, float] | None = None
-        self._outcome: _Outcome | None = None
-        self._episode, self._busy, self._closed = 0, False, False
-        self._thread = threading.Thread(target=self._work, daemon=True, name="guard")
-        self._thread.start()
-
-    def require_same_process(self) -> None:
-        """Raises a ForkError in a fork of this process, where the thread does not run."""
-        forks.require_same_process(self._opened, "guard")
-
-    def begin(self, request: GraspRequest) -> None:
-        """Begins an episode."""
-        with self._changed:
-            self._episode += 1
-            self._busy = self._busy and self._question is None
-            self._request, self._question, self._outcome = request, None, None
-
-    def exchange(self, state: State, now: float, timeout: float) -> _Outcome | None:
-        """Queries with a state, unless a query is pending, and returns the newest outcome within
-        the timeout.
-
-        Args:
-          state: the state.
-          now: time of the state.
-          timeout: seconds to wait.
-
-        Returns:
-          An outcome that was not returned before, of this state or of an earlier one; None without
-          one.
-        """
-        with self._changed:
-            earlier, self._outcome = self._outcome, None
-            if not self._busy:
-                self._question, self._busy = (state, now), True
-                self._changed.notify_all()
-            self._changed.wait_for(lambda: self._outcome is not None, timeout)
-            outcome, self._outcome = self._outcome or earlier, None
-            return outcome
-
-    def close(self) -> None:
-        """Ends the thread, unless a query blocks it, and closes the policy; a fork leaves both to
-        the process that opened them.
-        """
-        if self._opened != forks.generation():
-            return
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(_END)
-        self._policy.close()
-
-    def _work(self) -> None:
-        """Answers queries until closed; runs in the thread."""
-        begun = 0  # the last episode with an answer
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._question is not None or self._closed)
-                if self._closed or self._question is None:
-                    return
-                (state, asked), episode, request = self._question, self._episode, self._request
-                self._question = None
-            answer = self._answer(request if episode != begun else None, state)
-            begun = begun if isinstance(answer, TransportError) else episode
-            with self._changed:
-                self._busy = False
-                if episode == self._episode:
-                    self._outcome = answer, asked
-                self._changed.notify_all()
-
-    def _answer(self, request: GraspRequest | None, state: State) -> Answer | TransportError:
-        """The policy's answer, or a TransportError for any failure."""
-        try:
-            if request is not None:
-                self._policy.reset(request)
-            answer = self._policy.act(state)
-            return (
-                answer
-                if isinstance(answer, Answer)
-                else TransportError("The policy's answer is none.")
+    metadata = policy.metadata()
+    if limits is None:
+        if metadata["limits"] is None:
+            raise CongraspError(
+                f"Joints of the hand '{metadata['hand']}' share motors.",
+                "Make limits of its joints by hand (JointLimits).",
             )
-        except TransportError as error:
-            return error
-        except Exception as error:
-            return TransportError(f"The policy failed: {type(error).__name__}: {error}")
-
-
-_KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
-
-
-class Ticker:
-    """Ticks at multiples of a period.
-
-    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to
-    avoid a burst.
-
-    Attributes:
-      period: s.
-      ticks: number of ticks.
-      missed: number of skipped ticks.
-      longest_ms: greatest delay of a tick.
-    """
-
-    def __init__(self, rate: float):
-        """Begins with a tick that is due at once.
-
-        Args:
-          rate: Hz, at most 100: the policies act every 10 ms.
-        """
-        if not 0.0 < rate <= 100.0:
-            raise CongraspError(f"The rate is {rate:g} Hz.", "The policies act at up to 100 Hz.")
-        self.period = 1.0 / rate
-        self.ticks = self.missed = 0
-        self.longest_ms = 0.0
-        self._due = time.monotonic()
-        self._late: collections.deque[float] = collections.deque(maxlen=_KEPT)
-
-    def wait(self) -> float:
-        """Waits until the next tick; returns its time, of `time.monotonic`."""
-        while (rest := self._due - time.monotonic()) > 0:
-            time.sleep(rest)
-        now = time.monotonic()
-        late = now - self._due
-        skipped = int(late / self.period)
-        self.ticks += 1
-        self.missed += skipped
-        self._due += (1 + skipped) * self.period
-        self._late.append(1e3 * late)
-        self.longest_ms = max(self.longest_ms, 1e3 * late)
-        return now
-
-    def jitter_ms(self, percentile: float) -> float:
-        """A percentile of the delays of the last `_KEPT` ticks, ms."""
-        return float(np.percentile(self._late, percentile)) if self._late else 0.0
+        limits = JointLimits(**metadata["limits"])
+    if open_pose is None:
+        open_pose = metadata["open_pose"]
+    return limits, np.asarray(open_pose, float)

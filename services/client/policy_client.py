@@ -11,7 +11,7 @@ from congrasp.common.runtime import forks
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.policy import EpisodePolicy
+from congrasp.services.client.episode_policy import EpisodePolicy
 
 _AGAIN = 0.2  # seconds between two queries of a server that does not respond
 

@@ -33,7 +33,7 @@ from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.client.policy import mirrored_request
+from congrasp.services.client.left_policy import mirrored_request
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.motion import Grasp, costs

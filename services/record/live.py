@@ -17,6 +17,7 @@ from typing import Any
 
 from congrasp.common.errors import PORT_ERRORS, need_package, os_errors_as
 from congrasp.common.transport.base import Closing
+from congrasp.common.transport.places import Places
 from congrasp.services.record.writer import Channel, Entry
 
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
@@ -32,7 +33,7 @@ _BACKLOG, _BYTES = (
     20000,
     256 << 20,
 )
-_SOCKETS = 32  # connections at a time
+_SOCKETS = 32  # connections at a time, shared by addresses
 # Bytes that wait for a client that does not read, and the time after which it is dropped
 _UNREAD, _UNREAD_SECONDS = (
     4 << 20,
@@ -185,7 +186,7 @@ class _Gate:
     def __init__(self, outside: socket.socket, inside: tuple[str, int]):
         """Accepts connections of a listening socket, for the server at an address."""
         self._outside, self._inside = outside, inside
-        self._connections = 0
+        self._places = Places(_SOCKETS)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True, name="live gate")
         self._thread.start()
@@ -209,15 +210,16 @@ class _Gate:
 
     async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Passes on a connection while there is room."""
-        if self._connections >= _SOCKETS:
+        address = writer.get_extra_info("peername")[0]
+        place = self._places.take(address, writer.transport.abort)
+        if place is None:
             with contextlib.closing(writer), contextlib.suppress(OSError):
                 _answer(writer, "503 Service Unavailable", f"{_SOCKETS} viewers are connected.")
             return
-        self._connections += 1
         try:
             await self._serve(reader, writer)
         finally:
-            self._connections -= 1
+            self._places.leave(place)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Passes on the connection of an allowed client, and answers others with the reason."""

@@ -16,8 +16,8 @@ from concurrent.futures import Future, InvalidStateError
 from typing import Generic, NamedTuple, TypeVar
 
 from congrasp.common.errors import CongraspError, LateError, OverloadedError
+from congrasp.common.transport.fair_queue import FairQueue
 from congrasp.common.transport.senders import Peer
-from congrasp.services.serve.fair_queue import FairQueue
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -185,39 +185,45 @@ class Batcher(Generic[T, R]):
     def _answer(self, batch: list[_Part[T, R]]) -> None:
         """Runs a batch without late items, and resolves every item once all its parts have run."""
         now = time.monotonic()
-        for waiting, _ in batch:
-            if waiting.deadline < now:
-                late = (
-                    f"Too late: the query was queued for {1e3 * (now - waiting.arrival):.0f} ms, "
-                    f"beyond its deadline."
-                )
-                self._fail(waiting, LateError(late))
-        batch = [part for part in batch if part.whole.deadline >= now]
-        results: Sequence[R | Exception]
-        try:
-            queued = [now - part.whole.arrival for part in batch]
-            results = self._run([part.item for part in batch], queued) if batch else []
-        except Exception as error:
-            results = [error] * len(batch)
+        in_time = []
+        for part in batch:
+            if part.whole.deadline >= now:
+                in_time.append(part)
+            else:
+                self._fail(part.whole, _late(now - part.whole.arrival))
+        results = self._results(in_time, now)
         with self._changed:
             self._running = False
             self._changed.notify()
-        for (waiting, item), result in zip(batch, results, strict=True):
-            if waiting.future.done():  # a part was running when the item lost its place
-                continue
-            if (
-                self._parts is not None
-                and item is not waiting.item
-                and not isinstance(result, Exception)
-            ):
-                waiting.results.append(result)
-                if waiting.taken < waiting.weight:
-                    continue
-                result = self._parts.join(waiting.item, waiting.results)
-            if isinstance(result, Exception):
-                self._fail(waiting, result)
-            else:
-                _resolve(waiting.future, result)
+        for part, result in zip(in_time, results, strict=True):
+            self._finish(part, result)
+
+    def _results(self, batch: list[_Part[T, R]], now: float) -> Sequence[R | Exception]:
+        """Results of a batch that begins now, or the error of all its items."""
+        if not batch:
+            return []
+        items = [part.item for part in batch]
+        queued = [now - part.whole.arrival for part in batch]
+        try:
+            return self._run(items, queued)
+        except Exception as error:
+            return [error] * len(batch)
+
+    def _finish(self, part: _Part[T, R], result: R | Exception) -> None:
+        """Resolves an item with the result of a part, unless further parts have to run."""
+        waiting = part.whole
+        if waiting.future.done():  # a part was running when the item lost its place
+            return
+        is_whole = part.item is waiting.item
+        if self._parts is not None and not is_whole and not isinstance(result, Exception):
+            waiting.results.append(result)
+            if waiting.taken < waiting.weight:
+                return
+            result = self._parts.join(waiting.item, waiting.results)
+        if isinstance(result, Exception):
+            self._fail(waiting, result)
+        else:
+            _resolve(waiting.future, result)
 
     def _collect(self) -> list[_Part[T, R]]:
         """Returns the next batch; empty once closed."""
@@ -225,19 +231,24 @@ class Batcher(Generic[T, R]):
             while (self._running or not len(self._queue)) and not self._closed:
                 if not self._changed.wait(self._window if self._expected > 1 else None):
                     self._expected = 1
+            self._wait_for_expected()
             if self._closed:
                 return []
-            until = min(waiting.arrival for waiting in self._queue) + self._window
-            while (
-                len(self) < self._expected
-                and (rest := until - time.monotonic()) > 0
-                and not self._closed
-            ):
-                self._changed.wait(rest)
             batch = self._take()
             self._running = True
             self._expected = len(batch)
             return batch
+
+    def _wait_for_expected(self) -> None:
+        """Waits until there are as many items as in the last batch, or the oldest one has waited
+        for the window; the caller holds the lock.
+        """
+        while len(self._queue) < self._expected and not self._closed:
+            oldest = min(waiting.arrival for waiting in self._queue)
+            rest = oldest + self._window - time.monotonic()
+            if rest <= 0.0:
+                return
+            self._changed.wait(rest)
 
     def _is_shared(self) -> bool:
         """True if several peers share batches; the caller holds the lock."""
@@ -247,15 +258,18 @@ class Batcher(Generic[T, R]):
         """Limit of a batch's weight; the caller holds the lock."""
         if self._parts is None or not self._is_shared():
             return self._size
-        peers = self._queue.peers
+        peers = self._queue.peers_ahead
         return next((size for size in self._parts.sizes if size >= peers), self._size)
 
-    def _share_of_batch(self, peer: Peer) -> int:
-        """Limit of a peer's weight in a batch: accounts share it, and the peers of an account."""
+    def _shares(self, room: int) -> dict[Peer, int]:
+        """Limits of the peers' weights in a batch, in the order of their turns: accounts share it,
+        and the peers of an account. The caller holds the lock.
+        """
+        peers = self._queue.in_turn()
         if not self._is_shared():
-            return self._size
-        of_account = max(1, self._room() // self._queue.accounts)
-        return max(1, of_account // self._queue.peers_of(peer.account))
+            return dict.fromkeys(peers, self._size)
+        of_account = max(1, room // max(1, self._queue.accounts))
+        return {peer: max(1, of_account // self._queue.peers_of(peer.account)) for peer in peers}
 
     def _take(self) -> list[_Part[T, R]]:
         """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the
@@ -264,39 +278,47 @@ class Batcher(Generic[T, R]):
         batch: list[_Part[T, R]] = []
         is_shared = self._is_shared()
         room = self._room()
-        shares = {peer: self._share_of_batch(peer) for peer in self._queue.in_turn()}
-        while room and (peer := self._next_peer(shares)):
-            first = self._queue.first(peer)
-            weight = first.weight - first.taken
-            if is_shared:
-                weight = min(weight, shares[peer], room)
-            if weight > room:
-                break
-            batch.append(self._part(first, weight))
-            shares[peer] -= weight
-            room -= weight
-            self._queue.end_turn(peer)
-            if first.taken == first.weight:
-                self._queue.pop(peer)
+        shares = self._shares(room)
+        while turns := self._turns(shares):
+            for peer in turns:
+                waiting = self._queue.first(peer)
+                weight = waiting.weight - waiting.taken
+                if is_shared:
+                    weight = min(weight, shares[peer], room)
+                if weight > room or not room:
+                    return batch
+                batch.append(self._part(waiting, weight))
+                shares[peer] -= weight
+                room -= weight
+                self._queue.end_turn(peer)
+                if waiting.taken == waiting.weight:
+                    self._queue.pop(peer)
         return batch
 
-    def _next_peer(self, shares: Mapping[Peer, int]) -> Peer | None:
-        """Peer whose turn it is among those that have items and a rest of their share."""
-        return next((peer for peer in self._queue.in_turn() if shares[peer] > 0), None)
+    def _turns(self, shares: Mapping[Peer, int]) -> list[Peer]:
+        """Peers that have items and a rest of their share, in the order of their turns."""
+        return [peer for peer in self._queue.in_turn() if shares[peer] > 0]
 
     def _part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
         """Takes a part of this weight from an item."""
-        item, first = waiting.item, waiting.taken
+        first = waiting.taken
         waiting.taken += weight
         if weight < waiting.weight and self._parts is not None:
-            item = self._parts.cut(item, first, waiting.taken)
-        return _Part(waiting, item)
+            return _Part(waiting, self._parts.cut(waiting.item, first, waiting.taken))
+        return _Part(waiting, waiting.item)
 
     def _fail(self, waiting: _Waiting[T, R], error: Exception) -> None:
         """Resolves an item with an error, and drops its further parts."""
         with self._changed:
             self._queue.discard(waiting)
         _resolve(waiting.future, error)
+
+
+def _late(queued: float) -> LateError:
+    """Error of an item that was queued for some seconds, beyond its deadline."""
+    return LateError(
+        f"Too late: the query was queued for {1e3 * queued:.0f} ms, beyond its deadline."
+    )
 
 
 def _resolve(future: "Future[R]", outcome: R | Exception) -> None:

@@ -27,8 +27,11 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensors import get_sensor
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.episode_policy import EpisodePolicy
+from congrasp.services.client.left_policy import LeftPolicy
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.client.policy import PACKED, EpisodePolicy, LeftPolicy, Policy
+from congrasp.services.client.packer import PACKED
+from congrasp.services.client.policy import Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 4, 16, STATES_LIMIT)
@@ -48,6 +51,19 @@ class Inference(NamedTuple):
     def reply(self, meta: Mapping[str, Any]) -> Message:
         """Returns it as a message with further metadata, at least `version` and `total_ms`."""
         return Message({PACKED: self.vectors}, {**meta, "active": self.active})
+
+
+class _Outputs(NamedTuple):
+    """Result of the compiled function for n states."""
+
+    vectors: np.ndarray
+    """(n, A + F + 6), see `Inference`."""
+    redirected: np.ndarray
+    """(n,): 1 where the constraints were redirected, else 0."""
+    aligned: np.ndarray
+    """(n,): 0 where the constraints contradict each other, else 1."""
+    checks: np.ndarray
+    """(n, C): see `Layout.complete`."""
 
 
 class PolicyFunction:
@@ -82,17 +98,56 @@ class PolicyFunction:
     ) -> list[Inference | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; an invalid query gets an error."""
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
-        batch = np.zeros(
-            (next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32
+        states = ends[-1]
+        padded = next(size for size in BATCH_SIZES if size >= states)
+        batch = np.zeros((padded, self.layout.size), np.float32)
+        np.concatenate([query.vectors for query in queries], out=batch[:states])
+        self.layout.estimate_normals(batch[:states])
+        outputs = self._outputs(np.asarray(self._compiled(weights, batch))[:states])
+        is_faultless = self._are_faultless(outputs)
+        answers: list[Inference | Exception] = []
+        for query, end in zip(queries, ends, strict=True):
+            rows = slice(end - len(query.vectors), end)
+            own = _Outputs(*(values[rows] for values in outputs))
+            error = None if is_faultless else self._find_error(query, own)
+            answers.append(error or _inference(query, own))
+        return answers
+
+    def _outputs(self, values: np.ndarray) -> _Outputs:
+        """Splits the rows (n, ...) that the compiled function returns."""
+        hand = self.layout.hand
+        size = len(hand.motors) + len(hand.joints) + 12
+        return _Outputs(
+            vectors=values[:, :size],
+            redirected=values[:, size],
+            aligned=values[:, size + 1],
+            checks=values[:, size + 2 :],
         )
-        np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
-        self.layout.estimate_normals(batch[: ends[-1]])
-        found = np.asarray(self._compiled(weights, batch))
-        starts = [0, *ends[:-1]]
-        return [
-            self._answer(query, found[a:b])
-            for query, a, b in zip(queries, starts, ends, strict=True)
-        ]
+
+    def _are_faultless(self, outputs: _Outputs) -> bool:
+        """True if no query of a batch gets an error."""
+        return bool(
+            self.layout.pass_all(outputs.checks)
+            and np.isfinite(outputs.vectors).all()
+            and outputs.aligned.all()
+        )
+
+    def _find_error(self, query: Query, outputs: _Outputs) -> CongraspError | None:
+        """Error of one query; None without one."""
+        if error := self.layout.find_error(query, outputs.checks):
+            return error
+        if not np.isfinite(outputs.vectors).all():
+            return CongraspError(
+                "The policy's action for this query is not finite.", "Check the state's magnitudes."
+            )
+        if not outputs.aligned.all():
+            return ContradictionError(
+                "The constraints contradict each other: the trajectory ends nearer to the avoid "
+                "region than to the "
+                "graspable region of the affordance.",
+                "Change the trajectory or the affordance.",
+            )
+        return None
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`, as JSON."""
@@ -112,31 +167,17 @@ class PolicyFunction:
             "query": {**self.layout.description(), "digest": self.layout.digest},
         }
 
-    def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
-        """Returns the answer to one query, or its error."""
-        size = len(self.layout.hand.motors) + len(self.layout.hand.joints) + 12
-        vectors, redirected, aligned, checks = (
-            found[:, :size],
-            found[:, size],
-            found[:, size + 1],
-            found[:, size + 2 :],
-        )
-        if error := self.layout.find_error(query, checks):
-            return error
-        if not np.isfinite(vectors).all():
-            return CongraspError(
-                "The policy's action for this query is not finite.", "Check the state's magnitudes."
-            )
-        if not aligned.all():
-            return ContradictionError(
-                "The constraints contradict each other: the trajectory ends nearer to the avoid "
-                "region than to the "
-                "graspable region of the affordance.",
-                "Change the trajectory or the affordance.",
-            )
-        flags = redirected.tolist()
-        active = {flag: explain(query.asked, redirected=flag > 0) for flag in set(flags)}
-        return Inference(vectors, [active[flag] for flag in flags])
+
+def _inference(query: Query, outputs: _Outputs) -> Inference:
+    """Answer to one query without an error."""
+    flags = outputs.redirected.tolist()
+    return Inference(outputs.vectors, [list(_reasons(query.asked, flag > 0)) for flag in flags])
+
+
+@functools.lru_cache(maxsize=1024)
+def _reasons(asked: tuple[str, ...], redirected: bool) -> tuple[str, ...]:
+    """Active constraints of a state and the reasons, in sentences."""
+    return tuple(explain(asked, redirected=redirected))
 
 
 @functools.lru_cache(maxsize=8)

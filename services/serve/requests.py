@@ -4,7 +4,7 @@ A query is one array `packed` (n, S) of float32: a row for each of n states unde
 constraints. Its metadata have the names of the `constraints`, the digest of the `layout`, and the
 `timeout` in seconds. One vector is transferred to the device at once, since the overhead of a
 transfer equals that of thirty times its size. The layout is part of `Policy.metadata`.
-`services.client.policy.Packer` writes and checks the fields; absent ones are zero.
+`services.client.packer.Packer` writes and checks the fields; absent ones are zero.
 
 The fields, without batch axis, are those of `common.task.types.SceneState`, the object's
 `surface_points` with `surface_avoid`, and the goal arrays of the constraints.
@@ -47,7 +47,8 @@ from congrasp.common.task.sensors import get_sensor
 from congrasp.common.task.sensors.base import world_pose
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.policy import CAMERA, NORMALS, PACKED
+from congrasp.services.client.fields import CAMERA, NORMALS
+from congrasp.services.client.packer import PACKED
 
 STATES_LIMIT = 64
 """Most states in one query."""
@@ -298,6 +299,10 @@ class Layout:
                 for name in Readings._fields
             )
         )
+
+    def pass_all(self, checks: np.ndarray) -> bool:
+        """True if no state of a batch fails a check (n, C) of `complete`."""
+        return bool((np.abs(checks - 1.0) <= _UNIT_TOLERANCE).all())
 
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
         """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`;

@@ -110,7 +110,14 @@ class PolicyServer:
         )
         transport.serve(keys.health, self._describe)
         # One may infer while the other receives
-        transport.serve(below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject)
+        transport.serve(
+            below(keys.act),
+            self._act,
+            workers=2,
+            depth=DEPTH,
+            admission=self._reject,
+            fair=True,
+        )
         self._seconds = self._function.warm_up(self._held.inference_parameters)
         self._ready.set()
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")

@@ -4,6 +4,7 @@ messages of arrays.
 
 import collections
 import contextlib
+import functools
 import http.cookies
 import http.server
 import json
@@ -18,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from congrasp.common.errors import PORT_ERRORS, CongraspError, os_errors_as
+from congrasp.common.transport.places import Place, Places
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 
@@ -45,7 +47,7 @@ _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a connection may be silent, and a request's head may take
-_CONNECTIONS = 256  # at a time; a browser opens six
+_CONNECTIONS = 256  # at a time, shared by addresses; a browser opens six
 # Bytes read of a refused body, so that the answer arrives before the close
 _DRAINED, _DRAIN_SECONDS = (
     64 << 10,
@@ -218,6 +220,12 @@ class PageServer:
         return ""
 
 
+def _disconnect(connection: socket.socket) -> None:
+    """Ends a connection, which a thread is reading."""
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+
+
 class _Server(http.server.ThreadingHTTPServer):
     page: PageServer
     daemon_threads = True
@@ -227,21 +235,24 @@ class _Server(http.server.ThreadingHTTPServer):
         """Listens at (interface, port)."""
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
-        self._places = threading.BoundedSemaphore(_CONNECTIONS)
+        self._places = Places(_CONNECTIONS)
+        self._place_of: dict[Any, Place] = {}
         super().__init__(address, handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serves a connection in a thread, or answers that there is no room for it."""
-        if not self._places.acquire(blocking=False):
+        place = self._places.take(client_address[0], functools.partial(_disconnect, request))
+        if place is None:
             with contextlib.suppress(OSError):
                 request.setblocking(False)
                 request.send(_FULL)
             self.shutdown_request(request)
             return
+        self._place_of[request] = place
         try:
             super().process_request(request, client_address)
         except RuntimeError:  # no thread can be started
-            self._places.release()
+            self._places.leave(self._place_of.pop(request))
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -249,7 +260,7 @@ class _Server(http.server.ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._places.release()
+            self._places.leave(self._place_of.pop(request))
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignores browsers that disconnect during an answer."""
@@ -280,8 +291,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _give_up(self) -> None:
         """Ends the connection, which a thread is reading."""
-        with contextlib.suppress(OSError):
-            self.connection.shutdown(socket.SHUT_RDWR)
+        _disconnect(self.connection)
 
     def do_GET(self) -> None:
         """Answers by a route, or with a file."""

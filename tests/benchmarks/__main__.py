@@ -10,7 +10,7 @@ from congrasp.services.cli.parser import of_group
 
 NAMES = (
     *("pieces", "shapes", "gallery", "screens", "speeds", "measures", "dexgraspbench"),
-    *("robot", "sensors", "attacks", "crowding", "transport", "faults", "ceiling"),
+    *("robot", "sensors", "attacks", "crowding", "transport", "faults", "replacements", "ceiling"),
 )
 """Each is a module of this folder with a function of its name."""
 

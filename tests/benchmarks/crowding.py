@@ -4,6 +4,7 @@ ratio to the same clients alone.
 
 import concurrent.futures
 import contextlib
+import os
 import pathlib
 import tempfile
 import time
@@ -27,6 +28,19 @@ from tests.benchmarks.crowds import CONNECTIONS, crowded
 _HONEST = 8
 _RATES = np.linspace(50.0, 100.0, _HONEST)  # queries a second
 _START = 180.0  # seconds that a server may take to start
+_COLUMNS = (
+    "attack",
+    "turn",
+    "queries",
+    "refused",
+    "lost",
+    "p99 alone, ms",
+    "elsewhere",
+    "attacked",
+    "/ alone",
+    "/ elsewhere",
+    "load",
+)
 _SETTLE = 1.0  # seconds of an attack that are not measured
 
 
@@ -69,48 +83,90 @@ def crowding(seconds: float = 8.0, turns: int = 3, rate: float = 200.0) -> int:
       python -m tests.benchmarks crowding --seconds 3 --turns 1
     """
     table = Table(title=f"{turns} x {seconds:g} s, attacker {CONNECTIONS} x {rate:g} Hz")
-    columns = (
-        "attack|turn|queries|refused|lost|p99 alone, ms|elsewhere|attacked|/ alone|/ elsewhere"
-    )
-    for column in columns.split("|"):
+    for column in _COLUMNS:
         table.add_column(column)
-    refused = 0
+    measurements: list[_Measurement] = []
     with tempfile.TemporaryDirectory() as name:
         for has_certificates in (False, True):
             folder = pathlib.Path(name) / str(has_certificates)
             folder.mkdir()
             with _setting(folder, has_certificates) as setting:
                 for reads in (True, False):
-                    for turn in range(turns):
-                        row = _row(setting, reads, turn, seconds, rate)
-                        refused += int(row[3])
-                        table.add_row(*row)
+                    repeats = [_measurement(setting, reads, seconds, rate) for _ in range(turns)]
+                    measurements += repeats
+                    for turn, measurement in enumerate(repeats):
+                        table.add_row(*_row(setting, reads, str(turn + 1), measurement))
+                    table.add_row(*_row(setting, reads, "median", _median(repeats)))
+                    table.add_section()
     Console(width=120).print(table)
+    refused = sum(measurement.refused for measurement in measurements)
     return int(refused > 0)
 
 
-def _row(setting: _Setting, reads: bool, turn: int, seconds: float, rate: float) -> list[str]:
-    """Measures alone, beside an attack on the other server, and beside one on this server."""
+class _Measurement(NamedTuple):
+    """Honest clients alone, beside an attack on the other server, and beside one on theirs."""
+
+    queries: float
+    """Queries beside the attack on their server, of which some were refused or not answered."""
+    refused: float
+    lost: float
+    alone: float
+    """99th percentile of the latency, ms; likewise the next two."""
+    elsewhere: float
+    attacked: float
+    over_alone: float
+    """Ratio of `attacked` to `alone`."""
+    over_elsewhere: float
+    """Ratio of `attacked` to `elsewhere`."""
+    load: float
+    """Load average of the machine over the last minute."""
+
+
+def _measurement(setting: _Setting, reads: bool, seconds: float, rate: float) -> _Measurement:
+    """Measures the three conditions one after another."""
 
     def beside(endpoint: str) -> _Outcome:
         with crowded(endpoint, setting.query, reads=reads, rate=rate, certs=setting.attacker):
             time.sleep(_SETTLE)
             return _measured(setting, seconds)
 
-    alone = _measured(setting, seconds)
-    elsewhere = beside(setting.elsewhere)
-    attacked = beside(setting.endpoint)
-    p99 = [1e3 * float(np.percentile(one.times, 99)) for one in (alone, elsewhere, attacked)]
-    answers = "answers read" if reads else "answers not read"
+    alone = _p99(_measured(setting, seconds))
+    elsewhere = _p99(beside(setting.elsewhere))
+    outcome = beside(setting.endpoint)
+    attacked = _p99(outcome)
+    return _Measurement(
+        queries=len(outcome.times) + outcome.refused + outcome.lost,
+        refused=outcome.refused,
+        lost=outcome.lost,
+        alone=alone,
+        elsewhere=elsewhere,
+        attacked=attacked,
+        over_alone=attacked / alone,
+        over_elsewhere=attacked / elsewhere,
+        load=os.getloadavg()[0],
+    )
+
+
+def _p99(outcome: _Outcome) -> float:
+    """99th percentile of the latency, ms."""
+    return 1e3 * float(np.percentile(outcome.times, 99))
+
+
+def _median(measurements: Sequence[_Measurement]) -> _Measurement:
+    """Median of each figure."""
+    return _Measurement(*np.median(np.array(measurements), axis=0))
+
+
+def _row(setting: _Setting, reads: bool, turn: str, measurement: _Measurement) -> list[str]:
+    """Row of the table."""
+    answers = "read" if reads else "unread"
+    counts = measurement[:3]
+    figures = measurement[3:]
     return [
         f"{setting.name}, {answers}",
-        str(turn + 1),
-        str(len(attacked.times) + attacked.refused + attacked.lost),
-        str(attacked.refused),
-        str(attacked.lost),
-        *(f"{value:.2f}" for value in p99),
-        f"{p99[2] / p99[0]:.2f}",
-        f"{p99[2] / p99[1]:.2f}",
+        turn,
+        *(f"{count:.0f}" for count in counts),
+        *(f"{figure:.2f}" for figure in figures),
     ]
 
 
@@ -126,7 +182,7 @@ def _setting(folder: pathlib.Path, has_certificates: bool) -> Iterator[_Setting]
         create_authority(authority)
         server = issue(authority, "server")
         certs = [issue(authority, "client") for _ in range(_HONEST + CONNECTIONS)]
-    honest = certs[:_HONEST] or [None] * _HONEST
+    honest: list[pathlib.Path | None] = [*certs[:_HONEST]] or [None] * _HONEST
     episode = example_episode(1_000_000)
     with contextlib.ExitStack() as stack:
         ends = [
@@ -144,8 +200,16 @@ def _setting(folder: pathlib.Path, has_certificates: bool) -> Iterator[_Setting]
             client.act(episode.state)
         query = folder / "query"
         query.write_bytes(single_query(clients[0], episode))
-        name = "certificates" if has_certificates else "names"
-        yield _Setting(name, *ends, clients, certs[_HONEST:], query, episode)
+        name = "certs" if has_certificates else "names"
+        yield _Setting(
+            name=name,
+            endpoint=ends[0],
+            elsewhere=ends[1],
+            clients=clients,
+            attacker=certs[_HONEST:],
+            query=query,
+            episode=episode,
+        )
 
 
 def _measured(setting: _Setting, seconds: float) -> _Outcome:

@@ -14,7 +14,8 @@ from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.procedural import generate
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.policy import Answer, LeftPolicy, mirrored_request
+from congrasp.services.client.left_policy import LeftPolicy, mirrored_request
+from congrasp.services.client.policy import Answer
 
 SIDES = np.diag([-1.0, 1.0, 1.0])
 

@@ -10,12 +10,17 @@ import time
 
 import pytest
 
+from congrasp.common.errors import TransportError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import local_url
+from congrasp.common.wire.codec import Message
 from tests.cluster import assert_books_balance
 from tests.partition import cuttable
 
 pytestmark = pytest.mark.timeout(600)
 KILLS = 6
+PARTITION_SECONDS = 65.0
 
 
 def rollouts(status):
@@ -57,21 +62,65 @@ def test_an_actor_behind_a_cut_link_is_replaced_under_its_name(cluster):
 
 
 @pytest.mark.slow
+def test_twenty_half_open_actors_are_replaced_under_their_name(cluster):
+    learner = cluster.start_learner()
+    for _ in range(20):
+        with cuttable(cluster.endpoint) as link:
+            cluster.start_actor("a", endpoint=link.endpoint)
+            cluster.wait(lambda status: any(rollouts(status).values()))
+            replace_a_silent_actor(cluster, link.cut)
+            for process in cluster.processes[-2:]:
+                process.kill()
+                process.wait()
+        cluster.wait(lambda status: not rollouts(status))
+    assert_books_balance(cluster.stop(learner)[0])
+
+
+@pytest.mark.slow
 def test_an_actor_cut_off_for_over_a_minute_comes_back(cluster):
     learner = cluster.start_learner()
     with cuttable(cluster.endpoint) as link:
         cluster.start_actor("a", endpoint=link.endpoint)
         cluster.start_actor("b")
-        cluster.wait(lambda status: len(rollouts(status)) == 2)
+        before = cluster.wait(
+            lambda status: len(rollouts(status)) == 2 and all(rollouts(status).values())
+        )
         link.cut()
         cluster.wait(lambda status: len(rollouts(status)) == 1)
-        time.sleep(65)
+        time.sleep(PARTITION_SECONDS)
         link.heal()
         back = cluster.wait(lambda status: len(rollouts(status)) == 2)
-        (owner,) = (owner for owner in rollouts(back) if owner[0] == "a")
-        count = rollouts(back)[owner]
-        cluster.wait(lambda status: rollouts(status).get(owner, 0) > count)
+        assert rollouts(back).keys() == rollouts(before).keys()
+        for owner, count in rollouts(back).items():
+            cluster.wait(
+                lambda status, owner=owner, count=count: rollouts(status).get(owner, 0) > count
+            )
         assert_books_balance(cluster.stop(learner)[0])
+
+
+@pytest.mark.slow
+def test_a_client_cut_off_for_over_a_minute_is_answered_again():
+    endpoint = local_url()
+    key = Keys("policy").health
+    with urls.listen(endpoint, "server") as server, cuttable(endpoint) as link:
+        server.serve(key, lambda key, request: Message({}, {"ready": True}))
+        with urls.connect(link.endpoint, "client") as client:
+            assert client.query(key, Message(), timeout=10.0).meta["ready"]
+            link.cut()
+            with pytest.raises(TransportError):
+                client.query(key, Message(), timeout=1.0)
+            time.sleep(PARTITION_SECONDS)
+            link.heal()
+            while not is_answered(client, key):
+                pass
+
+
+def is_answered(client, key):
+    try:
+        return bool(client.query(key, Message(), timeout=1.0).meta["ready"])
+    except TransportError:
+        time.sleep(0.1)
+        return False
 
 
 @pytest.mark.slow

@@ -28,7 +28,8 @@ from congrasp.common.task.constraints import blocks, goal_of
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.readings import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
-from congrasp.services.client.limits import JointLimits, Limiter
+from congrasp.services.client.limiter import Limiter
+from congrasp.services.client.limits import JointLimits
 from congrasp.services.export import policy as exports
 from congrasp.services.train.command import untrained
 from tests.children import python

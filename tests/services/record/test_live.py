@@ -10,6 +10,7 @@ import struct
 import time
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from congrasp.common.errors import CongraspError
@@ -60,14 +61,22 @@ class Viewer:
         wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
+    def latest(self, topic: str) -> int:
+        """Value of the field `number` of the last message."""
+        return int(json.loads(self.frames[topic][-1][1])["number"])
+
     def wait_for(self, topic: str, count: int) -> None:
         while len(self.frames[topic]) < count:
             self.listen(0.1)
 
 
-def viewer(server: LiveServer) -> ClientConnection:
+def viewer(server: LiveServer, max_queue: int = 16) -> ClientConnection:
+    """A connection that stops reading while `max_queue` frames wait for `recv`."""
     return connect(
-        f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], max_size=1 << 24
+        f"ws://127.0.0.1:{server.port}",
+        subprotocols=["foxglove.sdk.v1"],
+        max_size=1 << 24,
+        max_queue=max_queue,
     )
 
 
@@ -180,3 +189,56 @@ def test_the_33rd_connection_is_refused() -> None:
             stack.enter_context(socket.create_connection(address, timeout=10.0))
         newest = stack.enter_context(socket.create_connection(address, timeout=10.0))
         assert newest.recv(1 << 12).startswith(b"HTTP/1.1 503 ")
+
+
+def handshake(server: LiveServer) -> bytes:
+    """Head of a viewer's request."""
+    lines = {
+        "Host": f"127.0.0.1:{server.port}",
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "x3JJHMbDL1EzLkh9GBhXDw==",
+        "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
+    }
+    text = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    return f"GET / HTTP/1.1\r\n{text}\r\n".encode()
+
+
+def test_viewer_of_another_address_is_admitted_when_full() -> None:
+    with LiveServer(0) as server, contextlib.ExitStack() as stack:
+        address = ("127.0.0.1", server.port)
+        crowd = [
+            stack.enter_context(socket.create_connection(address, timeout=10.0)) for _ in range(32)
+        ]
+        other = socket.create_connection(address, 10.0, source_address=("127.0.0.2", 0))
+        stack.enter_context(other)
+        other.sendall(handshake(server))
+        assert other.recv(1 << 12).startswith(b"HTTP/1.1 101 ")
+        with contextlib.suppress(ConnectionResetError):
+            assert crowd[-1].recv(1) == b""
+        crowd[0].sendall(handshake(server))
+        assert crowd[0].recv(1 << 12).startswith(b"HTTP/1.1 101 ")
+
+
+def test_viewer_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waits for it is limited, and another viewer misses nothing."""
+    monkeypatch.setattr("congrasp.services.record.live._UNREAD_SECONDS", 1.0)
+    entries = 48
+    text = "x" * (1 << 20)
+    channels = JsonChannels()
+    with LiveServer(0) as server, viewer(server) as reading, viewer(server, 1) as stuck:
+        seen = Viewer(reading)
+        unread = Viewer(stuck)
+        while not (seen.frames["/m"] and unread.frames["/m"]):  # until both have subscribed
+            server.write(channels.entry("/m", time.time_ns(), {"number": -1, "text": ""}))
+            seen.listen(0.05)
+            unread.listen(0.05)
+        for number in range(entries):
+            server.write(channels.entry("/m", time.time_ns(), {"number": number, "text": text}))
+            while seen.latest("/m") < number:
+                seen.listen(0.05)
+        with pytest.raises(ConnectionClosed):
+            while unread.latest("/m") < entries - 1:
+                time.sleep(2.0)
+                unread.listen(0.1)

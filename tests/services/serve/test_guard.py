@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.guard import Guard, Ticker
+from congrasp.services.client.guard import Guard
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer
+from congrasp.services.client.ticker import Ticker
 from tests.waits import Clock
 
 FINGERS = 2
@@ -326,7 +327,7 @@ def test_after_an_answer_that_came_late_the_next_is_waited_for():
         guard._wait = 0.0
         assert guard.step(STATE).mode == "hold"
         done.set()
-        while guard._asker._outcome is None:
+        while guard._queries._outcome is None:
             time.sleep(0.001)
         guard._wait = 0.4
         clock.now += 0.1

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.task.config import ControlConfig
-from congrasp.services.client.limits import Floor, JointLimits, Limited, Limiter
+from congrasp.services.client.floor import Floor
+from congrasp.services.client.limiter import Limited, Limiter
+from congrasp.services.client.limits import JointLimits
 
 JOINTS, PERIOD = 9, 0.01
 

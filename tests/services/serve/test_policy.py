@@ -20,7 +20,8 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port
-from congrasp.services.client.policy import EpisodePolicy, Policy
+from congrasp.services.client.episode_policy import EpisodePolicy
+from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.inference import Inference, LocalPolicy, PolicyFunction, load_policy
 from congrasp.services.serve.server import PolicyServer, follow_file

@@ -175,6 +175,26 @@ def test_a_hundred_simultaneous_connections_are_accepted() -> None:
             stack.enter_context(socket.create_connection(server.server_address[:2], 10.0))
 
 
+def test_browser_of_another_address_is_served_when_full() -> None:
+    with (
+        contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
+        contextlib.ExitStack() as stack,
+    ):
+        address = ("127.0.0.1", server.port)
+        crowd = [
+            stack.enter_context(socket.create_connection(address, timeout=10.0)) for _ in range(256)
+        ]
+        refused = stack.enter_context(socket.create_connection(address, timeout=10.0))
+        assert refused.recv(1 << 12).startswith(b"HTTP/1.1 503 ")
+        other = socket.create_connection(address, 10.0, source_address=("127.0.0.2", 0))
+        stack.enter_context(other)
+        other.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert other.recv(1 << 12).startswith(b"HTTP/1.1 200 ")
+        assert crowd[-1].recv(1) == b""
+        crowd[0].sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert crowd[0].recv(1 << 12).startswith(b"HTTP/1.1 200 ")
+
+
 def test_other_sites_are_rejected(page: Page) -> None:
     own = {
         "Host": f"localhost:{page.port}",

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from congrasp.common.transport.fair_queue import FairQueue
 from congrasp.common.transport.senders import Peer
-from congrasp.services.serve.fair_queue import FairQueue
 
 PEERS = st.builds(Peer, st.sampled_from("abc"), st.sampled_from("123"))
 
@@ -68,10 +68,45 @@ def test_turns_alternate_between_accounts():
     queue = filled(20, 20, "a1 a2 a3 a3 b1 b1 c1")
     order = []
     while len(queue):
-        turn = next(queue.in_turn())
+        turn = queue.in_turn()[0]
         queue.end_turn(turn)
         order.append(queue.pop(turn))
     assert order == ["a1", "b1", "c1", "a2", "b1", "a3", "a3"]
+
+
+def take(queue):
+    """Takes the item whose turn it is."""
+    turn = queue.in_turn()[0]
+    queue.end_turn(turn)
+    return queue.pop(turn)
+
+
+@pytest.mark.parametrize(
+    ("queued", "newcomer"),
+    [("a1 a1 a1 b1 b1 b1", "c1"), ("a1 a1 a1 a2 a2 a2", "a3")],
+)
+def test_newcomer_precedes_backlogs(queued, newcomer):
+    queue = filled(20, 20, queued)
+    taken = [take(queue) for _ in range(2)]
+    queue.add(newcomer, peer(newcomer))
+    assert queue.peers_ahead == 1
+    taken += [take(queue) for _ in range(2)]
+    assert taken == [queued[:2], queued[9:11], newcomer, queued[:2]]
+
+
+@pytest.mark.parametrize(
+    ("queued", "returning"),
+    [("a1 a1 a1 b1 b1 b1", "c1"), ("a1 a1 a1 a2 a2 a2", "a3")],
+)
+def test_peer_that_returns_before_its_turn_is_last(queued, returning):
+    queue = filled(20, 20, f"{queued} {returning}")
+    first_round = [take(queue) for _ in range(3)]
+    queue.add(returning, peer(returning))
+    assert first_round + [take(queue) for _ in range(3)] == 2 * [
+        queued[:2],
+        queued[9:11],
+        returning,
+    ]
 
 
 @given(st.lists(PEERS, max_size=60), st.integers(1, 8), st.integers(1, 8))

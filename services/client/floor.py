@@ -1,0 +1,65 @@
+"""Clearance of the palm above the table; needs only NumPy."""
+
+import math
+
+import numpy as np
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.request import Pose
+from congrasp.services.client.arrays import as_numbers
+
+
+class Floor:
+    """Clearance of the palm above a plane, as a function of the wrist joints."""
+
+    def __init__(self, plane: np.ndarray, wrist: Pose, palm: np.ndarray):
+        """Takes the poses of an episode.
+
+        Args:
+          plane: (4,) a, b, c, d, world frame: points with a x + b y + c z >= d are above; (a, b, c)
+            of length 1.
+          wrist: the base of the wrist joints, world frame.
+          palm: see `JointLimits`.
+
+        Raises:
+          CongraspError: the normal is not of length 1, or a number is not finite.
+        """
+        plane = as_numbers(plane, 4)
+        position = as_numbers(wrist[0], 3)
+        quaternion = as_numbers(wrist[1], 4)
+        is_normal = abs(np.linalg.norm(plane[:3]) - 1.0) < 1e-3
+        is_rotation = abs(np.linalg.norm(quaternion) - 1.0) < 0.02
+        if not is_normal or not is_rotation:
+            raise CongraspError(
+                "The table's normal and the wrist's quaternion must have the length 1."
+            )
+        self.normal = _matrix(quaternion).T @ plane[:3]
+        """(3,) normal of the plane in the frame of the base."""
+        self._offset = plane[3] - plane[:3] @ position
+        self._palm = palm
+        if not math.isfinite(self._offset):
+            raise CongraspError("The table's height and the wrist's position must be finite.")
+
+    def clearance(self, u: np.ndarray) -> float:
+        """Least distance, m, of the palm from the plane at wrist joints (6,); negative below it."""
+        places = u[:3] + self._palm[:, :3] @ _turned(u[3:]).T
+        return float((places @ self.normal - self._palm[:, 3]).min() - self._offset)
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of a quaternion (4,), (w, x, y, z)."""
+    w, x, y, z = quaternion
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+
+
+def _turned(angles: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation by intrinsic x-y-z angles (3,)."""
+    x, y, z = (_axis_rotation(axis, angle) for axis, angle in enumerate(angles))
+    return x @ y @ z
+
+
+def _axis_rotation(axis: int, angle: float) -> np.ndarray:
+    """(3, 3) rotation about a coordinate axis."""
+    half = angle / 2
+    return _matrix(np.append(np.cos(half), np.sin(half) * np.eye(3)[axis]))
