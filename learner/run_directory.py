@@ -1,7 +1,7 @@
 """The directory of a run.
 
-It holds `config.json`, its checksum `config.sha256`, `initial.safetensors` (unless training starts
-from random weights),
+It holds `config.json`, its checksum `config.sha256`, `launch.json` (`services.train.launch`),
+`initial.safetensors` (unless training starts from random weights),
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its

@@ -39,9 +39,10 @@ from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch
 from congrasp.services.serve.load import example_episode, one_answer, serving
+from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import Launch, Plan, ProcessDied, train
+from congrasp.services.train.processes import ProcessDied, train
 from congrasp.services.train.start import (
     Folder,
     can_resume,
@@ -116,7 +117,7 @@ def _train(
             wire=None,
             inside=plan.physics,
             stop=stop,
-            writers=plan.launch.metric_writers,
+            writers=plan.launch.learner.metric_writers,
             watch=Watch(metrics_port=plan.launch.metrics_port),
             on_update=progress.update,
             on_event=lambda level, text: _warn(text) if level == "error" else None,

@@ -31,7 +31,7 @@ from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.status import ask
 from congrasp.services.record.recorder import recorded
-from congrasp.services.train.processes import engine_of
+from congrasp.services.train.accelerators import engine_of
 
 _START_SECONDS = 0.5
 """Head start of the learner, which must listen first, over the actor, s."""

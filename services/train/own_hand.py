@@ -21,8 +21,12 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
 from congrasp.services.assets.hands.findings import Finding, read_findings
 from congrasp.services.ops.lifetime import Child, command, run_child
+from congrasp.services.train.background import (
+    finished_policy,
+    train_in_background,
+    training_seconds,
+)
 from congrasp.services.train.presets import FULL, get_preset
-from congrasp.services.train.processes import train_in_background, trained, training_seconds
 
 HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
 _ROWS = "report.json"
@@ -80,7 +84,7 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     _check(request, note)
     if not request.full:
         note(_what_a_gpu_would_take(request))
-    policy = trained(request.run_dir)
+    policy = finished_policy(request.run_dir)
     if policy is None:
         policy = _train(request, note)
     _install(request, policy, note)
