@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -442,9 +442,16 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
             time.sleep(0.5)
 
 
-def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
-    """Returns the first rank whose entry ends training, and its reason."""
-    return next(
-        ((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")),
-        None,
-    )
+class Ending(NamedTuple):
+    """End of training that one rank has requested."""
+
+    rank: int
+    reason: str
+
+
+def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
+    """Returns the end that the first rank requests; None if none does."""
+    for rank, entry in enumerate(entries):
+        if entry and entry.get("end"):
+            return Ending(rank, entry["end"])
+    return None

@@ -1,4 +1,4 @@
-"""Option values that are needed before a command line is parsed, for defaults that depend on them."""
+"""Values of options before a command line is parsed, for defaults that depend on them."""
 
 from collections.abc import Sequence
 

@@ -123,7 +123,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     from congrasp.common.runtime.stages import imported
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
-    from congrasp.services.train.learn import learn, longest_rollout
+    from congrasp.services.train.learn import InnerActor, Monitoring, learn, longest_rollout
     from congrasp.services.train.start import Folder, removed_without_checkpoint
 
     run_dir = options.run_dir
@@ -159,18 +159,21 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             config = run_config_from_json(entries[0]["config"])
             if rank:
                 check_inputs(config.inputs, OF_LEARNERS, COPY)
+            inside = InnerActor(config.physics) if options.inside else None
             learn(
                 run_dir,
                 config,
                 wire=transport,
-                inside=config.physics if options.inside else None,
+                inside=inside,
                 stop=stop,
                 ranks=ranks,
-                writers=options.shared.metric_writers,
-                watch=watch,
-                audit=options.shared.audit,
-                on_update=_log_update,
-                on_event=log,
+                monitoring=Monitoring(
+                    on_update=_log_update,
+                    on_event=log,
+                    writers=options.shared.metric_writers,
+                    watch=watch,
+                    audit=options.shared.audit,
+                ),
             )
             log("info", _end(run_dir, stop))
             return stop.exit_code

@@ -40,7 +40,7 @@ from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch
 from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.launch import Launch, Plan
-from congrasp.services.train.learn import learn
+from congrasp.services.train.learn import InnerActor, Monitoring, learn
 from congrasp.services.train.presets import FULL, easier
 from congrasp.services.train.processes import ProcessDied, train
 from congrasp.services.train.start import (
@@ -115,12 +115,14 @@ def _train(
             run_dir,
             config,
             wire=None,
-            inside=plan.physics,
+            inside=InnerActor(plan.physics),
             stop=stop,
-            writers=plan.launch.learner.metric_writers,
-            watch=Watch(metrics_port=plan.launch.metrics_port),
-            on_update=progress.update,
-            on_event=lambda level, text: _warn(text) if level == "error" else None,
+            monitoring=Monitoring(
+                on_update=progress.update,
+                on_event=_warn_of_error,
+                writers=plan.launch.learner.metric_writers,
+                watch=Watch(metrics_port=plan.launch.metrics_port),
+            ),
         )
         return
     with _full_disk_named(run_dir):
@@ -158,6 +160,12 @@ def _folders_to_resume() -> str:
 def _warn(text: str) -> None:
     """Prints a line about the run's processes."""
     console.print(f"  {text}", style="yellow", markup=False)
+
+
+def _warn_of_error(level: str, text: str) -> None:
+    """Prints an event of the learner that is an error."""
+    if level == "error":
+        _warn(text)
 
 
 def _prepare(
