@@ -113,11 +113,9 @@ class _Link:
     def __init__(self, connection: socket.socket):
         connection.settimeout(_SILENCE_SECONDS)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self._file, self._lock = (
-            connection,
-            connection.makefile("rb"),
-            threading.Lock(),
-        )
+        self._socket = connection
+        self._file = connection.makefile("rb")
+        self._lock = threading.Lock()
 
     def send(self, message: Message) -> None:
         # Meta data as an array: a header's length is limited.
@@ -166,7 +164,8 @@ class Ranks:
         on_lost: Callable[[str], object] = end_process,
     ):
         """Monitors the links: rank 0 to every other rank, any other to rank 0."""
-        self.rank, self.count = rank, count
+        self.rank = rank
+        self.count = count
         self.mesh: Mesh | None = None
         self._links = dict(links or {})
         self._on_lost = on_lost

@@ -64,7 +64,8 @@ class TicketBudget:
           seconds: initial duration of a ticket.
           clock: seconds, monotonic.
         """
-        self._slots, self._least = slots, max(1, slots - batch, slots // 2)
+        self._slots = slots
+        self._least = max(1, slots - batch, slots // 2)
         self._seconds = seconds
         self._delivered: collections.deque[tuple[str, float]] = collections.deque(maxlen=_RECENT)
         self._needed: collections.OrderedDict[str, collections.deque[float]] = (
@@ -77,20 +78,24 @@ class TicketBudget:
         """True if an actor may have another ticket when its certificate holds `held`."""
         if self._late.seconds(actor):
             return False
-        mine = sum(name == certificate(actor) for name, _ in self._delivered)
-        return held < max(self._least, math.ceil(self._slots * mine / max(1, len(self._delivered))))
+        of_certificate = sum(name == certificate(actor) for name, _ in self._delivered)
+        delivered = max(1, len(self._delivered))
+        share = math.ceil(self._slots * of_certificate / delivered)
+        return held < max(self._least, share)
 
     def holds_place(self, actor: str, seconds: float) -> bool:
         """True if a ticket granted to an actor `seconds` ago holds a place."""
-        own = self._needed.get(actor)
-        return seconds <= _LATE * self._usual and (
-            not own or statistics.median(own) <= _SLOW * self._usual
-        )
+        if seconds > _LATE * self._usual:
+            return False
+        needed = self._needed.get(actor)
+        return not needed or statistics.median(needed) <= _SLOW * self._usual
 
     def lasts(self, actor: str) -> float:
         """Seconds until a ticket granted to the actor now expires."""
-        known = self._needed.get(actor) or [seconds for _, seconds in self._delivered]
-        return min(self._seconds, max(_LEAST, _TIMES * max(known))) if known else self._seconds
+        durations = self._needed.get(actor) or [seconds for _, seconds in self._delivered]
+        if not durations:
+            return self._seconds
+        return min(self._seconds, max(_LEAST, _TIMES * max(durations)))
 
     def deliver(self, actor: str, seconds: float) -> None:
         """Records a rollout that arrived `seconds` after its ticket was granted, in time or not."""
@@ -228,13 +233,13 @@ class StalenessManager:
             self._expire()
             if held := self._tickets.get((owner, ticket_id)):
                 return held
-            mine = sum(ticket.owner == owner for ticket in self._tickets.values())
+            of_owner = sum(ticket.owner == owner for ticket in self._tickets.values())
             shared = sum(
                 certificate(ticket.owner[0]) == certificate(owner[0])
                 for ticket in self._tickets.values()
             )
             if (
-                mine >= self._per_owner
+                of_owner >= self._per_owner
                 or not self._budget.admits(owner[0], shared)
                 or self.capacity <= 0
             ):
@@ -260,11 +265,11 @@ class StalenessManager:
     def forget(self, owner: Owner) -> int:
         """Ends all tickets of an owner that died; returns their number."""
         with self._lock:
-            mine = [key for key in self._tickets if key[0] == owner]
-            for key in mine:
+            keys = [key for key in self._tickets if key[0] == owner]
+            for key in keys:
                 del self._tickets[key]
-            self._counters.returned += len(mine)
-            return len(mine)
+            self._counters.returned += len(keys)
+            return len(keys)
 
     def arrive(
         self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False
@@ -391,7 +396,8 @@ class StalenessManager:
         with self._lock:
             self._counters = Counters(**durable)
             self._tickets.clear()
-            self.version, self._in_update = version, 0
+            self.version = version
+            self._in_update = 0
             self._resumed = version, None
 
     def note_undone(self, count: int) -> None:

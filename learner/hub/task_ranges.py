@@ -33,13 +33,13 @@ from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surf
 _STATES = 128
 _SLACK = 2.0
 _BEYOND = 1.0  # rad by which a finger joint is pressed beyond its limits
-_TURN = 2 * np.pi  # rad of a wrist hinge
-_FORCE = 1e3  # N; terms and observations clip or squash forces far below this
-_FLAGS = ("success", "held", DIVERGED)
-_LARGEST = 1e6  # limit of an error or a force, in its unit
-_ACTION = 1e3
-_MASS = 1e3  # kg
-_FEATHER = 1e-3  # N
+_MAX_TURN = 2 * np.pi  # rad of a wrist hinge
+_MAX_FORCE = 1e3  # N; terms and observations clip or squash forces far below this
+_FLAGS = ("episode/success", "episode/held", f"episode/{DIVERGED}")
+_MAX_METRIC = 1e6  # limit of an error or a force, in its unit
+_MAX_ACTION = 1e3
+_MAX_MASS = 1e3  # kg
+_LEAST_WEIGHT = 1e-3  # N
 
 
 class Ranges(NamedTuple):
@@ -68,34 +68,37 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         evaluate = jax.jit(functools.partial(_evaluate, hand, task))
         *observed, terms = jax.device_get(evaluate(*_extremes(hand, task)))
-    weights = (
-        [task.reward, curriculum.reward]
-        if curriculum.ramp[1] > curriculum.ramp[0]
-        else [task.reward]
-    )
-    most = {
-        name: _SLACK
-        * float(np.abs(values).max())
-        * max(abs(getattr(each, name)) for each in weights)
-        for name, values in terms.items()
-    }
+    weights = [task.reward]
+    if curriculum.ramp[1] > curriculum.ramp[0]:
+        weights.append(curriculum.reward)
+    most: dict[str, float] = {}
+    for name, values in terms.items():
+        largest_weight = max(abs(getattr(each, name)) for each in weights)
+        most[name] = _SLACK * float(np.abs(values).max()) * largest_weight
     reward = sum(most.values())
     steps = task.approach_steps + max(task.hold_steps, task.hold_steps_max)
-    episodes = dict.fromkeys(episode_fields(task), (-_LARGEST, _LARGEST))
+    episodes = dict.fromkeys(episode_fields(task), (-_MAX_METRIC, _MAX_METRIC))
     episodes |= {f"term/{name}": (-bound * steps, bound * steps) for name, bound in most.items()}
-    episodes |= {f"episode/{name}": (0.0, _LARGEST) for name in FORCES}
+    episodes |= {f"episode/{name}": (0.0, _MAX_METRIC) for name in FORCES}
     episodes |= {
         "episode/return": (-reward * steps, reward * steps),
         "episode/length": (0.0, float(steps)),
     }
-    episodes |= {
-        name: (0.0, 1.0)
-        for name in episodes
-        if name.startswith("episode/mask_") or name in {f"episode/{flag}" for flag in _FLAGS}
-    }
+    for name in episodes:
+        if name.startswith("episode/mask_") or name in _FLAGS:
+            episodes[name] = (0.0, 1.0)
     # Some observations are zero in every state here, and rounding errors must not be refused.
-    own, teacher, critic = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
-    return Ranges(own, reward, _ACTION, episodes, teacher, critic)
+    observation, of_teacher, privileged_inputs = (
+        _SLACK * np.abs(values).max(0) + 1.0 for values in observed
+    )
+    return Ranges(
+        observation=observation,
+        reward=reward,
+        action=_MAX_ACTION,
+        episodes=episodes,
+        teacher_observation=of_teacher,
+        privileged=privileged_inputs,
+    )
 
 
 def _evaluate(
@@ -114,16 +117,16 @@ def _evaluate(
     scene = scene_of(hand, full, state, surface, goal)
     # An object that every contact carries, for the terms that depend on its weight.
     load = ObjectLoad(
-        weight=jnp.full(scene.state.time.shape, _FEATHER), friction=parameters.friction
+        weight=jnp.full(scene.state.time.shape, _LEAST_WEIGHT), friction=parameters.friction
     )
     scene = scene._replace(load=load)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
-    own = scene._replace(task=task, readings=readings, cloud=surface)
+    of_policy = scene._replace(task=task, readings=readings, cloud=surface)
     return (
-        observe(own),
-        observe_for_teacher(scene, own, task.control),
-        privileged.observe(own, parameters),
+        observe(of_policy),
+        observe_for_teacher(scene, of_policy, task.control),
+        privileged.observe(of_policy, parameters),
         terms,
     )
 
@@ -137,18 +140,19 @@ def _extremes(
     The readings before a state belong to other states.
     """
     rng = np.random.default_rng(0)
-    fingers, contacts = len(hand.joints), (_STATES, len(hand.links), CONTACTS_PER_LINK)
-
-    within, unit = functools.partial(_inside, rng), functools.partial(_unit, rng)
+    fingers = len(hand.joints)
+    contacts = (_STATES, len(hand.links), CONTACTS_PER_LINK)
+    within = functools.partial(_inside, rng)
+    unit = functools.partial(_unit, rng)
 
     def joints() -> np.ndarray:
-        return rng.uniform(hand.lower - _BEYOND, hand.upper + _BEYOND, (_STATES, fingers)).astype(
-            np.float32
-        )
+        lower = hand.lower - _BEYOND
+        upper = hand.upper + _BEYOND
+        return rng.uniform(lower, upper, (_STATES, fingers)).astype(np.float32)
 
     reach = rng.choice([0.1, MAX_DISTANCE], (_STATES, 1))  # hand and object touch, or are far apart
     start = within(3)
-    u = within(6, most=np.concatenate([reach, reach, reach, np.full((_STATES, 3), _TURN)], 1))
+    u = within(6, most=np.concatenate([reach, reach, reach, np.full((_STATES, 3), _MAX_TURN)], 1))
     state = SceneState(
         q=joints(),
         u=u,
@@ -160,7 +164,7 @@ def _extremes(
         object_quaternion=unit(4),
         object_velocity=within(3, most=MAX_SPEED),
         object_angular_velocity=within(3, most=MAX_SPEED),
-        contact_force=within(*contacts[1:], 3, most=_FORCE),
+        contact_force=within(*contacts[1:], 3, most=_MAX_FORCE),
         contact_position=start[:, None, None] + within(*contacts[1:], 3, most=0.2),
         contact_found=rng.random(contacts) < 0.5,
         base_position=start + within(3, most=0.1),
@@ -183,7 +187,7 @@ def _extremes(
     others[:, 0] = np.arange(_STATES)
     readings = Readings(*(getattr(state, name)[others] for name in Readings._fields))
     parameters = Parameters(
-        mass=rng.uniform(0.0, _MASS, _STATES),
+        mass=rng.uniform(0.0, _MAX_MASS, _STATES),
         friction=rng.uniform(*task.friction_range, _STATES),
         gain_scale=rng.uniform(*task.gain_range, _STATES),
         stationary=rng.random(_STATES) < 0.5,
@@ -197,26 +201,23 @@ def _extremes(
 
 def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
     """Random goals in which every constraint is active."""
-    symbols, values = symbol_sizes(hand, task), {}
+    symbols = symbol_sizes(hand, task)
+    values = {}
+    masks: dict[str, np.ndarray] = {}
     for constraint in known(task):
-        made = {}
+        arrays = {}
         for name, array in constraint.arrays.items():
             shape = tuple(symbols[size] if isinstance(size, str) else size for size in array.shape)
             if array.kind == "flag":
-                made[name] = rng.random((_STATES, *shape)) < 0.5
+                arrays[name] = rng.random((_STATES, *shape)) < 0.5
             elif array.kind in ("real", "position"):
-                made[name] = _inside(rng, *shape, most=0.3)
+                arrays[name] = _inside(rng, *shape, most=0.3)
             else:
-                made[name] = _unit(rng, *shape)
-        values[constraint.name] = constraint.goal(**made)
-    return Goal(
-        values,
-        {
-            block: np.ones(_STATES, bool)
-            for constraint in known(task)
-            for block in constraint.blocks
-        },
-    )
+                arrays[name] = _unit(rng, *shape)
+        values[constraint.name] = constraint.goal(**arrays)
+        for block in constraint.blocks:
+            masks[block] = np.ones(_STATES, bool)
+    return Goal(values, masks)
 
 
 def _inside(rng: np.random.Generator, *shape: int, most: Any = 1.0) -> np.ndarray:
