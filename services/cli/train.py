@@ -14,7 +14,8 @@ from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.cli.arguments import option_value
 from congrasp.services.train.launch import Launch
-from congrasp.services.train.presets import get_preset, student_of, with_hand
+from congrasp.services.train.presets import get_preset, with_hand
+from congrasp.services.train.students import student_of
 
 
 def train(  # noqa: PLR0913
