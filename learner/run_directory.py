@@ -143,7 +143,8 @@ def check_config(run_dir: pathlib.Path, kept: str) -> None:
       kept: checksum in the checkpoint from which it resumes; empty in one of an older version.
     """
     try:
-        stored = read_file(run_dir / CHECKSUM_FILE, _MAX_LINE_BYTES).decode(errors="replace").strip()
+        line = read_file(run_dir / CHECKSUM_FILE, _MAX_LINE_BYTES)
+        stored = line.decode(errors="replace").strip()
     except CongraspError:
         stored = ""
     expected = {kept, stored} - {""}
