@@ -44,7 +44,7 @@ class InnerActor(NamedTuple):
     """An actor in the learner's process."""
 
     physics: PhysicsName
-    """Its engine, except `auto`."""
+    """Its engine."""
     end_timeout: float = GRACE
     """Deadline for its end, s."""
 
