@@ -30,7 +30,7 @@ from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record.episode import ARM_ARRAYS
-from congrasp.services.train.presets import CAMERAS, TRACKERS
+from congrasp.services.train.students import CAMERAS, TRACKERS
 from congrasp.services.viz.metric_titles import TITLES
 
 _CASES = pathlib.Path(__file__).parents[1] / "tests" / "cases"

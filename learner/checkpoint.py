@@ -85,9 +85,8 @@ class Checkpoints:
 
     def files(self) -> list[pathlib.Path]:
         """Files of the checkpoints, intact or not, the newest first."""
-        return sorted(
-            (path for path in self._directory.glob(_PATTERN) if _update(path) >= 0), key=_update
-        )[::-1]
+        files = [path for path in self._directory.glob(_PATTERN) if _update(path) >= 0]
+        return sorted(files, key=_update)[::-1]
 
     def newest(self) -> int:
         """Update of the newest checkpoint, intact or not; -1 if there is none."""
@@ -127,11 +126,11 @@ class Checkpoints:
                 damaged.append((path, str(error)))
                 continue
             for other, why in damaged:
-                kept = set_aside(other)
+                renamed = set_aside(other)
                 on_event(
                     "warning",
                     f"The checkpoint {other} is damaged: {why} It is ignored, and kept as "
-                    f"{kept.name}.",
+                    f"{renamed.name}.",
                 )
             on_event("info", f"Resuming from the checkpoint {path}.")
             return path, arrays, meta
@@ -161,8 +160,10 @@ def set_aside(path: pathlib.Path) -> pathlib.Path:
 
 def _update(path: pathlib.Path) -> int:
     """Update in a checkpoint's file name; -1 if there is none."""
-    found = _NUMBER.fullmatch(path.name)
-    return int(found[1]) if found else -1
+    match = _NUMBER.fullmatch(path.name)
+    if match is None:
+        return -1
+    return int(match[1])
 
 
 def read_checkpoint(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
@@ -215,7 +216,8 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
     restored: list[Any] = []
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
-        array, expected = arrays.get(name), np.asarray(leaf)
+        array = arrays.get(name)
+        expected = np.asarray(leaf)
         if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
             raise CongraspError(
                 f"{source} does not match this run: '{name}' is missing or has another shape.",
@@ -224,6 +226,8 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
         if isinstance(leaf, jax.Array):
             # Not committed to a device, as after `init`, to avoid recompilation
             restored.append(jnp.array(array))
+        elif isinstance(leaf, int):
+            restored.append(int(array))
         else:
-            restored.append(int(array) if isinstance(leaf, int) else np.array(array))
+            restored.append(np.array(array))
     return jax.tree_util.tree_unflatten(structure, restored)

@@ -1,7 +1,7 @@
 """The directory of a run.
 
-It holds `config.json`, its checksum `config.sha256`, `initial.safetensors` (unless training starts
-from random weights),
+It holds `config.json`, its checksum `config.sha256`, `launch.json` (`services.train.launch`),
+`initial.safetensors` (unless training starts from random weights),
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its
@@ -46,8 +46,9 @@ _ENDPOINT_FILE = "endpoint"
 _LOCK_FILE = "lock"
 _CLAIM_FILE = "claim"
 _MAX_VERSION = 1 << 53
-_MAX_CONFIG = 1 << 20
-_MAX_ENDPOINT = 1 << 10
+_MAX_CONFIG_BYTES = 1 << 20
+_MAX_LINE_BYTES = 1 << 10
+"""Limit of files with one line: checksum, endpoint, version."""
 CHANGEABLE = (
     "updates",
     "checkpoint_every",
@@ -142,11 +143,12 @@ def check_config_unchanged(run_dir: pathlib.Path, kept: str) -> None:
       kept: checksum in the checkpoint from which it resumes; empty in one of an older version.
     """
     try:
-        stored = read_file(run_dir / CHECKSUM_FILE, _MAX_ENDPOINT).decode(errors="replace").strip()
+        line = read_file(run_dir / CHECKSUM_FILE, _MAX_LINE_BYTES)
+        stored = line.decode(errors="replace").strip()
     except CongraspError:
         stored = ""
     expected = {kept, stored} - {""}
-    actual = config_checksum(read_file(run_dir / CONFIG_FILE, _MAX_CONFIG))
+    actual = config_checksum(read_file(run_dir / CONFIG_FILE, _MAX_CONFIG_BYTES))
     if expected and actual not in expected:
         policy = shlex.quote(str(run_dir / POLICY_FILE))
         raise CongraspError(
@@ -167,7 +169,7 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
             f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.",
             "Pass one created by 'congrasp train'.",
         )
-    text = read_file(path, _MAX_CONFIG)
+    text = read_file(path, _MAX_CONFIG_BYTES)
     try:
         return run_config_from_json(text)
     except CongraspError as error:
@@ -255,7 +257,7 @@ def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
 def learner_url(run_dir: pathlib.Path) -> str:
     """Address stored by `listening`; empty if there is none. It may be that of a killed learner."""
     try:
-        return read_file(run_dir / _ENDPOINT_FILE, _MAX_ENDPOINT).decode(errors="replace")
+        return read_file(run_dir / _ENDPOINT_FILE, _MAX_LINE_BYTES).decode(errors="replace")
     except CongraspError:
         return ""
 
@@ -282,8 +284,12 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
 
 def _remains(run_dir: pathlib.Path) -> list[pathlib.Path]:
     """Files that only a run with a checkpoint leaves behind."""
-    found = [path for path in (run_dir / CHECKPOINTS).glob("*") if not path.name.startswith(".")]
-    return sorted(found) + [path for path in [run_dir / POLICY_FILE] if path.exists()]
+    entries = (run_dir / CHECKPOINTS).glob("*")
+    remains = sorted(path for path in entries if not path.name.startswith("."))
+    policy = run_dir / POLICY_FILE
+    if policy.exists():
+        remains.append(policy)
+    return remains
 
 
 def continue_run(
@@ -386,14 +392,14 @@ def version_of_files(run_dir: pathlib.Path) -> int:
     or the newest checkpoint; -1 if there is none.
     """
     try:
-        noted = int(read_file(run_dir / _VERSION_FILE, _MAX_ENDPOINT))
+        noted = int(read_file(run_dir / _VERSION_FILE, _MAX_LINE_BYTES))
     except (CongraspError, ValueError):
         noted = -1
-    policy = _policy_version(run_dir)
-    if policy is None:
-        policy = -1
-    checkpoint = Checkpoints(run_dir / CHECKPOINTS).newest()
-    return max(_possible(noted), _possible(policy), _possible(checkpoint))
+    of_policy = _policy_version(run_dir)
+    if of_policy is None:
+        of_policy = -1
+    of_checkpoint = Checkpoints(run_dir / CHECKPOINTS).newest()
+    return max(_possible(noted), _possible(of_policy), _possible(of_checkpoint))
 
 
 def _possible(version: int) -> int:
@@ -415,12 +421,16 @@ def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, st
       CongraspError: it cannot be renamed.
     """
     path = run_dir / POLICY_FILE
-    found = _policy_version(run_dir)
-    if os.path.lexists(path) and (found is None or found > version):
-        what = (
-            "cannot be read" if found is None else f"has version {found}, newer than the checkpoint"
-        )
-        on_event("warning", f"{path} {what}; it is kept as {set_aside(path)}.")
+    if not os.path.lexists(path):
+        return
+    policy_version = _policy_version(run_dir)
+    if policy_version is None:
+        problem = "cannot be read"
+    elif policy_version > version:
+        problem = f"has version {policy_version}, newer than the checkpoint"
+    else:
+        return
+    on_event("warning", f"{path} {problem}; it is kept as {set_aside(path)}.")
 
 
 def _policy_version(run_dir: pathlib.Path) -> int | None:

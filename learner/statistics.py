@@ -13,6 +13,12 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
 
 _EPISODE = ("episode/", "term/")
+_WINDOW = 10
+"""Updates over which success is averaged."""
+_LEARNT_SUCCESS = 0.3
+"""Success from which on a collapse can be detected."""
+_FEW_LINKS = 0.1
+"""Links in contact below which the hand avoids the object."""
 _OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
 
 
@@ -77,23 +83,23 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
 def _figures(columns: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
     """Figures (E,) of one rollout, NaN for episodes to which they do not apply."""
     none = np.zeros(count)
-    blocks = {
-        block: columns.get(f"episode/mask_{block}", none) > 0
-        for c in _OPTIONAL
-        for block in c.blocks
-    }
+    blocks: dict[str, np.ndarray] = {}
+    for constraint in _OPTIONAL:
+        for block in constraint.blocks:
+            blocks[block] = columns.get(f"episode/mask_{block}", none) > 0
     active = {constraint.name: constraint.among(blocks) for constraint in _OPTIONAL}
     active["heading"] = ~np.any(list(active.values()), 0)
     success = columns.get("episode/success", np.full(count, np.nan))
-    figures = {
-        **columns,
-        **{f"success/{name}": np.where(rows, success, np.nan) for name, rows in active.items()},
-    }
+    figures = dict(columns)
+    for name, rows in active.items():
+        figures[f"success/{name}"] = np.where(rows, success, np.nan)
     for constraint in CONSTRAINTS:
         for spec in constraint.errors:
-            if (name := f"episode/{spec.name}") in columns:
-                rows = blocks[spec.block] if spec.block else active[constraint.name]
-                figures[name] = np.where(rows, columns[name], np.nan)
+            name = f"episode/{spec.name}"
+            if name not in columns:
+                continue
+            rows = blocks[spec.block] if spec.block else active[constraint.name]
+            figures[name] = np.where(rows, columns[name], np.nan)
     return figures
 
 
@@ -107,15 +113,12 @@ class Pace:
 
     def steps_per_second(self, steps: int) -> float:
         """Pace after `steps` more environment steps."""
-        now, total = self._clock(), self._marks[-1][1] + steps
+        now = self._clock()
+        _, total_before = self._marks[-1]
+        total = total_before + steps
         self._marks.append((now, total))
-        first, before = self._marks[0]
-        return (total - before) / max(now - first, 1e-9)
-
-
-_WINDOW = 10  # updates over which metrics are averaged
-_LEARNT = 0.3  # success from which on a collapse can be detected
-_UNTOUCHED = 0.1  # links in contact below which the hand avoids the object
+        start, total_at_start = self._marks[0]
+        return (total - total_at_start) / max(now - start, 1e-9)
 
 
 class CollapseWatch:
@@ -131,21 +134,24 @@ class CollapseWatch:
         self._patience = patience
         self._success: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._best = 0.0
-        self._fallen = self._untouched = 0
+        self._fallen = 0
+        self._untouched = 0
 
     def add(self, values: dict[str, float]) -> str | None:
         """Adds an update's metrics; returns a description of the collapse once it has lasted long
         enough.
         """
-        success, links = (values.get(f"episode/{name}") for name in ("success", "links_at_removal"))
+        success = values.get("episode/success")
+        links = values.get("episode/links_at_removal")
         if success is None or links is None or not self._patience:
             return None
         self._success.append(success)
         mean = sum(self._success) / len(self._success)
         if len(self._success) == _WINDOW:
             self._best = max(self._best, mean)
-        self._fallen = self._fallen + 1 if self._best >= _LEARNT and mean < self._best / 2 else 0
-        self._untouched = self._untouched + 1 if links < _UNTOUCHED else 0
+        has_fallen = self._best >= _LEARNT_SUCCESS and mean < self._best / 2
+        self._fallen = self._fallen + 1 if has_fallen else 0
+        self._untouched = self._untouched + 1 if links < _FEW_LINKS else 0
         if self._fallen >= self._patience:
             return (
                 f"success fell from {self._best:.0%} to {mean:.0%} and stayed there for "

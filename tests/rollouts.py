@@ -11,7 +11,7 @@ from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.limits import Events
-from congrasp.learner.hub.queue import RolloutQueue
+from congrasp.learner.hub.queue import RolloutContract, RolloutQueue
 from congrasp.learner.hub.staleness import StalenessManager
 
 FORM = RolloutForm(steps=20, worlds=16, observation=32, action=4, half=True)
@@ -75,7 +75,6 @@ def learner_hub(  # noqa: PLR0913
 ) -> Learner:
     """The learner's end of a run; options are those of `RolloutQueue`."""
     events = Events(transport, run, name, on_event)
-    rollouts = RolloutQueue(
-        run_id, form, schema, staleness or StalenessManager(1, 2), events, **options
-    )
+    contract = RolloutContract(run_id, form, schema)
+    rollouts = RolloutQueue(contract, staleness or StalenessManager(1, 2), events, **options)
     return Learner(LearnerHub(transport, rollouts, events, config_json, admission), rollouts)

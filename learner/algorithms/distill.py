@@ -62,7 +62,7 @@ Learnt = tuple[Params, Any, Array]
 """The actor's parameters, the optimiser's state and the random key."""
 
 
-class _Given(NamedTuple):
+class _Inputs(NamedTuple):
     """Inputs of an update in addition to state and batch."""
 
     observations: Affine
@@ -90,7 +90,9 @@ class Distillation:
         """
         teacher = read_teacher(config.distill.teacher)
         _check(teacher, spec, config.task)
-        self._spec, self._config, self._updates = spec, config.distill, config.updates
+        self._spec = spec
+        self._config = config.distill
+        self._updates = config.updates
         self._layouts = (spec.layout, teacher.spec.layout)
         self._body = get_hand(config.task.hand), config.task.control
         self._teacher = teacher.inference_parameters
@@ -129,29 +131,30 @@ class Distillation:
                 "Use fewer --distill.minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in _SCHEMA}, mesh, _SPECS)
-        moments = of_ranks(
-            jax.device_get(unreplicate(gathered_moments(arrays["observation"], mesh=mesh), mesh))
+        gathered = unreplicate(gathered_moments(arrays["observation"], mesh=mesh), mesh)
+        moments = of_ranks(jax.device_get(gathered))
+        frozen = state.observation
+        if not frozen.count:
+            frozen = normalizer.merge(*moments)
+        share = max(1.0 - state.version / max(self._updates, 1), _LAST_RATE)
+        rate = config.learning_rate * share
+        inputs = _Inputs(
+            observations=normalizer.observation_affine(frozen, self._spec.layout),
+            teacher=self._teacher,
+            rate=jnp.float32(rate),
         )
-        frozen = state.observation if state.observation.count else normalizer.merge(*moments)
-        rate = config.learning_rate * max(1.0 - state.version / max(self._updates, 1), _LAST_RATE)
-        given = _Given(
-            normalizer.observation_affine(frozen, self._spec.layout),
-            self._teacher,
-            jnp.float32(rate),
+        learnt = (state.params["actor"], state.optimizer, state.key)
+        learnt, inputs = shard((learnt, inputs), mesh)
+        optimised = _optimise(
+            learnt,
+            arrays,
+            inputs,
+            layouts=self._layouts,
+            body=self._body,
+            config=config,
+            mesh=mesh,
         )
-        learnt, given = shard(((state.params["actor"], state.optimizer, state.key), given), mesh)
-        learnt, metrics = unreplicate(
-            _optimise(
-                learnt,
-                arrays,
-                given,
-                layouts=self._layouts,
-                body=self._body,
-                config=config,
-                mesh=mesh,
-            ),
-            mesh,
-        )
+        learnt, metrics = unreplicate(optimised, mesh)
         metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
         for name, source in _CHECKED.items():
             if not math.isfinite(metrics[name]):
@@ -197,11 +200,8 @@ def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
             "Take the task from the teacher: 'congrasp train --teacher', without other --task.… "
             "settings of its own.",
         )
-    for name in (
-        "control",
-        "control_dt",
-        "dynamic_center",
-    ):  # the time is observed as a share of the episode
+    # The time is observed as a share of the episode
+    for name in ("control", "control_dt", "dynamic_center"):
         if getattr(teacher.task, name) != getattr(task, name):
             raise CongraspError(
                 f"{what} learnt with another '{name}' than this task's.",
@@ -218,7 +218,7 @@ def _transform(max_grad_norm: float) -> optax.GradientTransformation:
 def _optimise(
     learnt: Learnt,
     batch: dict[str, Array],
-    given: _Given,
+    inputs: _Inputs,
     *,
     layouts: tuple[Layout, Layout],
     body: Body,
@@ -231,13 +231,13 @@ def _optimise(
     program = functools.partial(
         _program, collectives=Collectives(mesh), layouts=layouts, body=body, config=config
     )
-    return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, given)
+    return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, inputs)
 
 
 def _program(
     learnt: Learnt,
     batch: dict[str, Array],
-    given: _Given,
+    inputs: _Inputs,
     *,
     collectives: Collectives,
     layouts: tuple[Layout, Layout],
@@ -248,26 +248,26 @@ def _program(
     actor, optimizer, key = learnt
     transform = _transform(config.max_grad_norm)
     rows = batch["teacher_observation"]
-    labels = bundles.mean_action(layouts[1], given.teacher, rows[..., : -extra(body[0])])
+    labels = bundles.mean_action(layouts[1], inputs.teacher, rows[..., : -extra(body[0])])
     labels = student_action(*body, rows, labels)
     labels = labels.reshape(-1, labels.shape[-1])
     observation = batch["observation"].reshape(len(labels), -1)
     size = len(labels) // config.minibatches
 
     def loss(actor: Params, rows: Array) -> Array:
-        seen = normalizer.apply(given.observations, observation[rows])
-        mean, log_std = network.policy({"actor": actor}, layouts[0], seen, exact=False)
+        normalised = normalizer.apply(inputs.observations, observation[rows])
+        mean, log_std = network.policy({"actor": actor}, layouts[0], normalised, exact=False)
         return jnp.mean(network.kl_divergence(mean, log_std, labels[rows], log_std))
 
     def step(
         carry: tuple[Params, Any], rows: Array
     ) -> tuple[tuple[Params, Any], tuple[Array, Array]]:
         actor, optimizer = carry
-        found, gradient = collectives.mean(jax.value_and_grad(loss)(actor, rows))
+        divergence, gradient = collectives.mean(jax.value_and_grad(loss)(actor, rows))
         gradient = {**gradient, "log_std": jnp.zeros_like(actor["log_std"])}
         steps, optimizer = transform.update(gradient, optimizer)
-        actor = optax.apply_updates(actor, jax.tree.map(lambda x: -given.rate * x, steps))
-        return (actor, optimizer), (found, optax.tree.norm(gradient))
+        actor = optax.apply_updates(actor, jax.tree.map(lambda x: -inputs.rate * x, steps))
+        return (actor, optimizer), (divergence, optax.tree.norm(gradient))
 
     def epoch(
         carry: tuple[Params, Any], key: Array
@@ -277,10 +277,10 @@ def _program(
 
     key, epochs_key = jax.random.split(key)
     keys = jax.random.split(collectives.own_key(epochs_key), config.epochs)
-    (actor, optimizer), (found, norms) = jax.lax.scan(epoch, (actor, optimizer), keys)
+    (actor, optimizer), (divergences, norms) = jax.lax.scan(epoch, (actor, optimizer), keys)
     metrics = {
         # Of the first pass: later ones have trained on these states
-        "imitation_kl": jnp.mean(found[0]),
+        "imitation_kl": jnp.mean(divergences[0]),
         "actor_grad_norm": jnp.mean(norms),
         "action_std": jnp.mean(jnp.exp(actor["log_std"])),
     }

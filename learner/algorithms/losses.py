@@ -22,7 +22,7 @@ from congrasp.common.task.types import Array
 from congrasp.learner.algorithms import gae
 from congrasp.learner.distributed.collectives import Collectives
 
-_TOGETHER = 1 << 15
+_MAX_TOGETHER = 1 << 15
 """Transitions that the networks evaluate together, if a step of all environments has no more."""
 
 
@@ -111,7 +111,8 @@ def objective(
     """
     mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
-    ratio, clip = jnp.exp(log_ratio), coefficients.clip
+    ratio = jnp.exp(log_ratio)
+    clip = coefficients.clip
     outside = jnp.abs(ratio - 1.0) > clip
     error = network.value(params, layout, sample.observation, sample.privileged) - sample.target
     terms = Terms(
@@ -171,34 +172,37 @@ class Evaluation(NamedTuple):
 
 def normalised_inputs(affine: Affine | None, privileged: Array | None) -> Array | None:
     """Normalised privileged inputs of the critic; None if there are none."""
-    return None if affine is None or privileged is None else normalizer.apply(affine, privileged)
+    if affine is None or privileged is None:
+        return None
+    return normalizer.apply(affine, privileged)
 
 
-def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: Layout) -> Evaluation:
+def evaluate(
+    params: Params, inputs: Inputs, collectives: Collectives, layout: Layout
+) -> Evaluation:
     """Computes advantages, targets and importance weights, which stay fixed during the update."""
-    batch, hyper = given.batch, given.hyper
-    action, behaviour = batch["action"], batch["log_probability"]
+    batch = inputs.batch
+    hyper = inputs.hyper
+    action = batch["action"]
+    behaviour = batch["log_probability"]
     log_std = params["actor"]["log_std"]
 
     def values(normalised: Array, privileged: Array | None) -> Array:
-        inputs = normalised_inputs(given.privileged, privileged)
-        return (
-            network.value(params, layout, normalised, inputs) / given.returns.scale
-            + given.returns.shift
-        )
+        normalised_privileged = normalised_inputs(inputs.privileged, privileged)
+        value = network.value(params, layout, normalised, normalised_privileged)
+        return value / inputs.returns.scale + inputs.returns.shift
 
     def evaluated(observation: Array, privileged: Array | None) -> tuple[Array, Array, Array]:
-        seen = normalizer.apply(given.observations, observation)
-        exact, fast = (
-            network.policy(params, layout, seen, exact=exact)[0] for exact in (True, False)
-        )
-        return exact, fast, values(seen, privileged)
+        normalised = normalizer.apply(inputs.observations, observation)
+        exact, _ = network.policy(params, layout, normalised, exact=True)
+        fast, _ = network.policy(params, layout, normalised, exact=False)
+        return exact, fast, values(normalised, privileged)
 
     # Not all steps at once: the features of the points of 327,680 clouds are 40 GiB.
-    inputs = batch["observation"], batch.get("privileged")
-    together = max(_TOGETHER // action.shape[1], 1)
-    exact, mean, value = jax.lax.map(lambda step: evaluated(*step), inputs, batch_size=together)
-    last_observation = normalizer.apply(given.observations, batch["last_observation"])
+    steps = batch["observation"], batch.get("privileged")
+    together = max(_MAX_TOGETHER // action.shape[1], 1)
+    exact, mean, value = jax.lax.map(lambda step: evaluated(*step), steps, batch_size=together)
+    last_observation = normalizer.apply(inputs.observations, batch["last_observation"])
     last_value = values(last_observation, batch.get("last_privileged"))
     log_exact = network.log_probability(exact, log_std, action)
     weight = importance_weight(log_exact, behaviour, hyper["importance_max"])
@@ -216,7 +220,7 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
         mean_proximal=mean,
         weight=jnp.where(hyper["decoupled"], weight, 1.0),
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
-        target=(returns - given.returns.shift) * given.returns.scale,
+        target=(returns - inputs.returns.shift) * inputs.returns.scale,
         stale=jnp.broadcast_to(batch["lag"] > 0, reward.shape),
         privileged=batch.get("privileged"),
     )
@@ -233,12 +237,12 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
 
 
 def batch_metrics(
-    given: Inputs, evaluation: Evaluation, collectives: Collectives
+    inputs: Inputs, evaluation: Evaluation, collectives: Collectives
 ) -> dict[str, Array]:
     """Scalars about a batch and the age of its policy, over all ranks."""
     variance = collectives.variance(evaluation.returns)
     residual = collectives.variance(evaluation.returns - evaluation.value)
-    truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
+    truncated = evaluation.log_weight > jnp.log(inputs.hyper["importance_max"])
     fresh = ~evaluation.samples.stale
     gap, share = collectives.mean(
         (jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh))
@@ -251,13 +255,13 @@ def batch_metrics(
         "explained_variance": 1.0 - residual / (variance + 1e-8),
         "advantage_std": evaluation.advantage_std,
         "td_error_std": jnp.sqrt(collectives.variance(evaluation.td_error)),
-        **_truncation_metrics(given, evaluation, collectives),
+        **_truncation_metrics(inputs, evaluation, collectives),
         **collectives.mean(
             {
                 "importance_mean": jnp.mean(evaluation.weight),
                 "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
                 "behaviour_kl": -jnp.mean(evaluation.log_weight),
-                "reward_mean": jnp.mean(given.batch["reward"]),
+                "reward_mean": jnp.mean(inputs.batch["reward"]),
                 "return_mean": jnp.mean(evaluation.returns),
                 "value_mean": jnp.mean(evaluation.value),
             }
@@ -266,14 +270,14 @@ def batch_metrics(
 
 
 def _truncation_metrics(
-    given: Inputs, evaluation: Evaluation, collectives: Collectives
+    inputs: Inputs, evaluation: Evaluation, collectives: Collectives
 ) -> dict[str, Array]:
     """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch
     without any.
     """
-    truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
+    truncated = (inputs.batch["truncated"] & inputs.batch["terminal"]).astype(jnp.float32)
     cut = evaluation.truncated_error
-    bootstrapped = cut + given.hyper["gamma"] * evaluation.value
+    bootstrapped = cut + inputs.hyper["gamma"] * evaluation.value
     sums = {"td_error_truncated": bootstrapped, "td_error_truncated_as_terminal": cut}
     share, means = collectives.mean(
         (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})

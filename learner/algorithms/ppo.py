@@ -16,7 +16,7 @@ ranks.
 
 import functools
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,18 +67,44 @@ _CHECKED = (
 )
 _NORMALISED = ("observation", "privileged")
 """Arrays of a batch with running statistics, which have the same names in a `TrainState`."""
-_FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
-# Nats between the policies before and after an update; the target is about a hundredth of one
-_UNREASONABLE_KL = 10.0
+_FINE = -1
+"""Value of a failure if every term was finite; otherwise it is an index into _CHECKED."""
+_MAX_KL = 10.0
+"""Largest divergence of the policies before and after an update, nats; the target is about a
+hundredth of one.
+"""
 _RATE_FACTOR = 1.5
-_TRAINED_RATE = (
-    0.1  # at the whole initial rate, a trained policy moved by 120 KL targets in its first update
-)
-_TRUSTED_KL = 4.0  # KL targets; a minibatch with a larger divergence does not update the policy
+_TRAINED_RATE = 0.1
+"""Share of the learning rate with which an initial policy begins: at the whole rate, a trained
+policy moved by 120 KL targets in its first update.
+"""
+_TRUSTED_KL = 4.0
+"""KL targets; a minibatch with a larger divergence does not update the policy."""
 
 Learnt = tuple[Params, Any, Array]
 """Parameters, the optimiser's state and the random key: the device entries of a `TrainState`."""
-_ON_DEVICE = 3  # entries of a TrainState
+_ON_DEVICE = 3
+"""Number of the entries of a `TrainState` on the device, which are its first ones."""
+
+
+class Passes(NamedTuple):
+    """Sizes and networks of an update, which are static in its compiled program."""
+
+    layout: Layout
+    epochs: int
+    minibatches: int
+
+
+class Proximal(NamedTuple):
+    """Parameters, samples and generators with which the epochs of an update begin."""
+
+    params: Params
+    optimizer: Any
+    failure: Array
+    keys: Array
+    """Generator of each epoch."""
+    samples: losses.Sample
+    """Samples (T, ...), whose observations are not normalised yet."""
 
 
 class PPO:
@@ -88,16 +114,23 @@ class PPO:
         """Creates the algorithm for a policy's networks, in a run of `updates` updates
         (`PPOConfig.settling`).
         """
-        self._spec, self._config, self._updates = spec, config, updates
-        self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
+        self._spec = spec
+        self._config = config
+        self._updates = updates
+        self.batch_schema: Schema = RECORDED
+        if spec.privileged:
+            self.batch_schema = {**RECORDED, **PRIVILEGED}
 
     def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
         """Returns the state before the first update.
 
         With an `initial` policy, the learning rate begins at `_TRAINED_RATE` of the configured one.
         """
-        rate = self._config.learning_rate * (1.0 if initial is None else _TRAINED_RATE)
-        initial = initial or random_policy(seed, self._spec)
+        rate = self._config.learning_rate
+        if initial is None:
+            initial = random_policy(seed, self._spec)
+        else:
+            rate *= _TRAINED_RATE
         params = jax.tree.map(jnp.asarray, initial.params)
         if initial.privileged is None and self._spec.privileged:
             initial = initial._replace(privileged=normalizer.empty((self._spec.privileged_size,)))
@@ -135,32 +168,29 @@ class PPO:
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
         lag = batch.get("lag", np.zeros(batch["reward"].shape[1], np.int32))
-        arrays = {**{name: batch[name] for name in self.batch_schema}, "lag": lag}
+        recorded = {name: batch[name] for name in self.batch_schema}
+        arrays = {**recorded, "lag": lag}
         arrays = shard(arrays, mesh, _specs(arrays))
-        moments = {
-            name: gathered_moments(arrays[name], mesh=mesh)
-            for name in _NORMALISED
-            if name in arrays
-        }
-        frozen = {
-            name: _first(getattr(state, name), found, mesh) for name, found in moments.items()
-        }
-        given = losses.Inputs(
+        moments = {}
+        frozen = {}
+        for name in _NORMALISED:
+            if name in arrays:
+                moments[name] = gathered_moments(arrays[name], mesh=mesh)
+                frozen[name] = _first(getattr(state, name), moments[name], mesh)
+        privileged = None
+        if "privileged" in frozen:
+            privileged = normalizer.privileged_affine(frozen["privileged"])
+        inputs = losses.Inputs(
             batch=arrays,
             observations=normalizer.observation_affine(frozen["observation"], self._spec.layout),
-            privileged=normalizer.privileged_affine(frozen["privileged"])
-            if "privileged" in frozen
-            else None,
+            privileged=privileged,
             returns=normalizer.value_affine(state.value),
             hyper=self._hyperparameters(state.version),
         )
+        params, optimizer, key = shard(state[:_ON_DEVICE], mesh)
+        passes = Passes(self._spec.layout, config.epochs, config.minibatches)
         learnt, returns, failure, scalars = _optimise(
-            *shard(state[:_ON_DEVICE], mesh),
-            given,
-            layout=self._spec.layout,
-            epochs=config.epochs,
-            minibatches=config.minibatches,
-            mesh=mesh,
+            params, optimizer, key, inputs, passes=passes, mesh=mesh
         )
         learnt, moments, returns, failure, scalars = unreplicate(
             (learnt, moments, returns, failure, scalars), mesh
@@ -171,17 +201,18 @@ class PPO:
             source = "rollouts" if _CHECKED[failure] in _CHECKED_INPUTS else "optimisation"
             raise NonFiniteUpdate(_CHECKED[failure], source, state)
         value = normalizer.merge(state.value, *of_ranks(returns))
+        before = normalizer.value_affine(state.value)
+        after = normalizer.value_affine(value)
+        statistics = {
+            name: normalizer.merge(getattr(state, name), *of_ranks(of_batch))
+            for name, of_batch in moments.items()
+        }
         state = state._replace(
-            params=_preserve_values(
-                state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)
-            ),
+            params=_preserve_values(state.params, before, after),
             value=value,
             version=state.version + 1,
             transitions=state.transitions + arrays["reward"].size,
-            **{
-                name: normalizer.merge(getattr(state, name), *of_ranks(found))
-                for name, found in moments.items()
-            },
+            **statistics,
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
 
@@ -224,72 +255,59 @@ def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
 
 def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> Statistics:
     """Returns the statistics, or those of the batch while there are no samples yet."""
-    return (
-        statistics if statistics.count else normalizer.merge(*of_ranks(unreplicate(moments, mesh)))
-    )
+    if statistics.count:
+        return statistics
+    return normalizer.merge(*of_ranks(unreplicate(moments, mesh)))
 
 
 @functools.partial(
     jax.jit,
-    static_argnames=("layout", "epochs", "minibatches", "mesh"),
+    static_argnames=("passes", "mesh"),
     donate_argnames="optimizer",
 )
-def _optimise(  # noqa: PLR0913
+def _optimise(
     params: Params,
     optimizer: Any,
     key: Array,
-    given: losses.Inputs,
+    inputs: losses.Inputs,
     *,
-    layout: Layout,
-    epochs: int,
-    minibatches: int,
+    passes: Passes,
     mesh: Mesh | None,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """Runs epochs over the batch; returns the learnt state, moments of the returns, the failed
     term, and metrics.
     """
-    program = functools.partial(
-        _program,
-        collectives=Collectives(mesh),
-        layout=layout,
-        epochs=epochs,
-        minibatches=minibatches,
-    )
-    specs = REPLICATED, losses.Inputs._make([_specs(given.batch), *[REPLICATED] * 4])
-    return shard_map(mesh, program, specs)((params, optimizer, key), given)
+    program = functools.partial(_program, collectives=Collectives(mesh), passes=passes)
+    specs = REPLICATED, losses.Inputs._make([_specs(inputs.batch), *[REPLICATED] * 4])
+    return shard_map(mesh, program, specs)((params, optimizer, key), inputs)
 
 
 def _program(
     learnt: Learnt,
-    given: losses.Inputs,
+    inputs: losses.Inputs,
     *,
     collectives: Collectives,
-    layout: Layout,
-    epochs: int,
-    minibatches: int,
+    passes: Passes,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """Body of `_optimise` for one rank."""
-    (params, optimizer, key), hyper = learnt, given.hyper
-    evaluation = losses.evaluate(params, given, collectives, layout)
-    inputs = [given.batch.get(name, jnp.zeros(())) for name in _CHECKED_INPUTS]
-    failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
+    params, optimizer, key = learnt
+    hyper = inputs.hyper
+    evaluation = losses.evaluate(params, inputs, collectives, passes.layout)
+    checked = [inputs.batch.get(name, jnp.zeros(())) for name in _CHECKED_INPUTS]
+    failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *checked, evaluation.value))
     key, epochs_key = jax.random.split(key)
     learning_rate = optimizer.hyperparams["learning_rate"]
-    moved, moved_optimizer, failure, (terms, norms) = _epochs(
-        params,
-        _with(optimizer, max_grad_norm=jnp.float32(hyper["max_grad_norm"])),
-        failure,
-        jax.random.split(collectives.own_key(epochs_key), epochs),
-        jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), evaluation.samples),
-        params["actor"]["log_std"],
-        given,
-        collectives,
-        layout,
-        minibatches,
+    proximal = Proximal(
+        params=params,
+        optimizer=_with(optimizer, max_grad_norm=jnp.float32(hyper["max_grad_norm"])),
+        failure=failure,
+        keys=jax.random.split(collectives.own_key(epochs_key), passes.epochs),
+        samples=jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), evaluation.samples),
     )
+    moved, moved_optimizer, failure, (terms, norms) = _epochs(proximal, inputs, collectives, passes)
     moved = _settle(moved, params["actor"]["log_std"], hyper)
     kl = jnp.mean(terms.kl[-1])
-    failure = jnp.where((failure == _FINE) & (kl > _UNREASONABLE_KL), len(_CHECKED) - 1, failure)
+    failure = jnp.where((failure == _FINE) & (kl > _MAX_KL), len(_CHECKED) - 1, failure)
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
     metrics |= {
@@ -297,7 +315,7 @@ def _program(
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
     }
-    metrics |= losses.batch_metrics(given, evaluation, collectives)
+    metrics |= losses.batch_metrics(inputs, evaluation, collectives)
     moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
     params, optimizer = jax.tree.map(
         lambda new, old: jnp.where(failure == _FINE, new, old),
@@ -312,25 +330,18 @@ def _program(
     )
 
 
-def _epochs(  # noqa: PLR0913
-    params: Params,
-    optimizer: Any,
-    failure: Array,
-    keys: Array,
-    samples: losses.Sample,
-    log_std_proximal: Array,
-    given: losses.Inputs,
-    collectives: Collectives,
-    layout: Layout,
-    minibatches: int,
+def _epochs(
+    proximal: Proximal, inputs: losses.Inputs, collectives: Collectives, passes: Passes
 ) -> tuple[Params, Any, Array, tuple[losses.Terms, dict[str, Array]]]:
     """Runs shuffled minibatches, each sample at most once an epoch; the remainder of the division
     is skipped.
-
-    The observations of `samples` are not normalised yet.
     """
+    samples = proximal.samples
+    log_std_proximal = proximal.params["actor"]["log_std"]
+    minibatches = passes.minibatches
     count = samples.advantage.shape[0]
-    size, hyper = count // minibatches, given.hyper
+    size = count // minibatches
+    hyper = inputs.hyper
     coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
     gradient = jax.value_and_grad(losses.objective, has_aux=True)
     transform = _optimizer(0.0, 0.0)  # hyperparameters are in its state
@@ -339,10 +350,12 @@ def _epochs(  # noqa: PLR0913
         params, optimizer, failure = carry
         minibatch = jax.tree.map(lambda x: x[rows], samples)
         minibatch = minibatch._replace(
-            observation=normalizer.apply(given.observations, minibatch.observation),
-            privileged=losses.normalised_inputs(given.privileged, minibatch.privileged),
+            observation=normalizer.apply(inputs.observations, minibatch.observation),
+            privileged=losses.normalised_inputs(inputs.privileged, minibatch.privileged),
         )
-        (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
+        (_, terms), gradients = gradient(
+            params, passes.layout, log_std_proximal, minibatch, coefficients
+        )
         terms, gradients = collectives.mean((terms, gradients))
         norms = {name: optax.tree.norm(tree) for name, tree in gradients.items()}
         failure = _first_failure(
@@ -356,17 +369,16 @@ def _epochs(  # noqa: PLR0913
         )
         steps, optimizer = transform.update(gradients, optimizer, params)
         trusted = terms.kl <= _TRUSTED_KL * hyper["kl_target"]
-        steps = {
-            **steps,
-            "actor": jax.tree.map(lambda leaf: jnp.where(trusted, leaf, 0.0), steps["actor"]),
-        }
+        actor_steps = jax.tree.map(lambda leaf: jnp.where(trusted, leaf, 0.0), steps["actor"])
+        steps = {**steps, "actor": actor_steps}
         return (optax.apply_updates(params, steps), optimizer, failure), (terms, norms)
 
     def epoch(carry: tuple[Params, Any, Array], key: Array):
         order = jax.random.permutation(key, count)[: size * minibatches]
         return jax.lax.scan(step, carry, order.reshape(minibatches, size))
 
-    (params, optimizer, failure), metrics = jax.lax.scan(epoch, (params, optimizer, failure), keys)
+    start = (proximal.params, proximal.optimizer, proximal.failure)
+    (params, optimizer, failure), metrics = jax.lax.scan(epoch, start, proximal.keys)
     return params, optimizer, failure, metrics
 
 
@@ -374,9 +386,9 @@ def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
     """Returns `failure` if it names a term, else `offset` plus the index of the first term that is
     not finite.
     """
-    bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
-    found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
-    return jnp.where(failure == _FINE, found, failure)
+    failed = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
+    first = jnp.where(jnp.any(failed), offset + jnp.argmax(failed).astype(jnp.int32), _FINE)
+    return jnp.where(failure == _FINE, first, failure)
 
 
 def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Params:
@@ -386,13 +398,11 @@ def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Par
     l is `PPOConfig.least_std_at`, f `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0
     the deviation before the update. Only one of the two bounds is set at a time.
     """
-    final, kept, log_std = (
-        jnp.log(hyper["final_std"]),
-        hyper["noise_kept"],
-        params["actor"]["log_std"],
-    )
-    ceiling = final + kept * jnp.maximum(log_std_before - final, 0.0)
-    log_std = jnp.where(kept <= 1.0, jnp.minimum(log_std, ceiling), log_std)
+    final = jnp.log(hyper["final_std"])
+    share = hyper["noise_kept"]
+    log_std = params["actor"]["log_std"]
+    ceiling = final + share * jnp.maximum(log_std_before - final, 0.0)
+    log_std = jnp.where(share <= 1.0, jnp.minimum(log_std, ceiling), log_std)
     log_std = jnp.maximum(log_std, jnp.log(hyper["least_std"]))  # log 0 is no floor
     return {**params, "actor": {**params["actor"], "log_std": log_std}}
 
@@ -402,10 +412,10 @@ def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
     epoch.
     """
     target = hyper["kl_target"]
-    factor = jnp.where(
-        kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0)
-    )
-    return jnp.clip(rate * factor, *hyper["learning_rate_range"])
+    factor_upward = jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0)
+    factor = jnp.where(kl > 2.0 * target, 1.0 / _RATE_FACTOR, factor_upward)
+    least, most = hyper["learning_rate_range"]
+    return jnp.clip(rate * factor, least, most)
 
 
 @jax.jit

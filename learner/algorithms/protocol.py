@@ -161,10 +161,11 @@ def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str
 
 def partition_specs(schema: Schema) -> dict[str, PartitionSpec]:
     """Partition specs of a batch on a mesh of ranks: every rank has different worlds."""
-    return {
-        name: PartitionSpec(*(AXIS if size == WORLDS else None for size in spec.shape or ()))
-        for name, spec in schema.items()
-    }
+    specs: dict[str, PartitionSpec] = {}
+    for name, spec in schema.items():
+        axes = [AXIS if size == WORLDS else None for size in spec.shape or ()]
+        specs[name] = PartitionSpec(*axes)
+    return specs
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
@@ -179,4 +180,8 @@ def gathered_moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
 
 def of_ranks(gathered: Statistics) -> list[Statistics]:
     """Splits statistics stacked by `Collectives.gather` into those of each rank."""
-    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
+    ranks: list[Statistics] = []
+    for rank in range(len(gathered.count)):
+        entries = [stacked[rank] for stacked in gathered]
+        ranks.append(Statistics(*entries))
+    return ranks

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -28,70 +28,19 @@ from congrasp.common.errors import CongraspError, TransportError, os_errors_as
 from congrasp.common.runtime.stages import stage
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.learner.distributed.collectives import AXIS
-
-_PAUSE = 0.1  # s, between two attempts to reach the coordinator
-
-
-def relay(host: str, port: int) -> int:
-    """Forwards connections to a free port of the loopback interface, for as long as the process
-    lives.
-
-    JAX aborts a process (SIGABRT, pages of text) as soon as its connection to the coordinator ends.
-    Through the relay, in the process itself, that connection outlives rank 0: the links of `Ranks`
-    notice its end at once, and end the process in order.
-
-    Args:
-      host: host of the coordinator.
-      port: port of the coordinator, which need not listen yet.
-
-    Returns:
-      The free port.
-    """
-    server = socket.create_server(("127.0.0.1", 0))
-    threading.Thread(target=_accept, args=(server, (host, port)), daemon=True, name="relay").start()
-    return int(server.getsockname()[1])
-
-
-def _accept(server: socket.socket, address: tuple[str, int]) -> None:
-    """Accepts connections."""
-    while True:
-        near, _ = server.accept()
-        threading.Thread(
-            target=_forward, args=(near, address), daemon=True, name="relay-out"
-        ).start()
-
-
-def _forward(near: socket.socket, address: tuple[str, int]) -> None:
-    """Forwards one connection until this end closes it; the other end's closing is not passed
-    on.
-    """
-    while True:
-        with contextlib.suppress(OSError):
-            far = socket.create_connection(address)
-            break
-        time.sleep(_PAUSE)
-    with near, far, contextlib.suppress(OSError):
-        threading.Thread(target=_backward, args=(far, near), daemon=True, name="relay-in").start()
-        while data := near.recv(1 << 16):
-            with contextlib.suppress(OSError):
-                far.sendall(data)
-
-
-def _backward(far: socket.socket, near: socket.socket) -> None:
-    """Forwards the data of the coordinator."""
-    with contextlib.suppress(OSError):
-        while data := far.recv(1 << 16):
-            near.sendall(data)
-
+from congrasp.learner.distributed.relay import relay
 
 JOIN_SECONDS = 300.0
-"""Deadline for all ranks to join, in seconds."""
+"""Deadline for all ranks to join."""
 ROUND_SECONDS = 300.0
-"""Deadline of an update, or of an exchange between live ranks, in seconds."""
+"""Deadline of an update, or of an exchange between live ranks."""
 _SILENCE_SECONDS = 20.0
+"""Time without a message after which a rank counts as dead."""
 _HEARTBEAT_SECONDS = 2.0
-# Time that rank 0 stays alive, so that JAX does not abort the others before they print the reason
 _RELAY_SECONDS = 2.0
+"""Time that rank 0 stays alive, so that JAX does not abort the others before they print the
+reason.
+"""
 _LENGTH = struct.Struct("!Q")
 _META = "meta"
 
@@ -113,11 +62,9 @@ class _Link:
     def __init__(self, connection: socket.socket):
         connection.settimeout(_SILENCE_SECONDS)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self._file, self._lock = (
-            connection,
-            connection.makefile("rb"),
-            threading.Lock(),
-        )
+        self._socket = connection
+        self._file = connection.makefile("rb")
+        self._lock = threading.Lock()
 
     def send(self, message: Message) -> None:
         # Meta data as an array: a header's length is limited.
@@ -166,7 +113,8 @@ class Ranks:
         on_lost: Callable[[str], object] = end_process,
     ):
         """Monitors the links: rank 0 to every other rank, any other to rank 0."""
-        self.rank, self.count = rank, count
+        self.rank = rank
+        self.count = count
         self.mesh: Mesh | None = None
         self._links = dict(links or {})
         self._on_lost = on_lost
@@ -442,9 +390,16 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
             time.sleep(0.5)
 
 
-def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
-    """Returns the first rank whose entry ends training, and its reason."""
-    return next(
-        ((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")),
-        None,
-    )
+class Ending(NamedTuple):
+    """End of training that one rank has requested."""
+
+    rank: int
+    reason: str
+
+
+def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
+    """Returns the end that the first rank requests; None if none does."""
+    for rank, entry in enumerate(entries):
+        if entry and entry.get("end"):
+            return Ending(rank, entry["end"])
+    return None

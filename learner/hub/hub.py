@@ -50,18 +50,20 @@ class LearnerHub:
           admission: checks the values of rollouts; by default only their form is checked.
         """
         self.keys = events.keys
-        self._transport, self._rollouts, self._events = transport, rollouts, events
-        self._staleness, self._config = rollouts.staleness, config_json
+        self._transport = transport
+        self._rollouts = rollouts
+        self._events = events
+        self._staleness = rollouts.staleness
+        self._config = config_json
         self._bundle: SharedMessage | None = None
-        self._members, self._admission = Members(), admission or Admission()
+        self._members = Members()
+        self._admission = admission or Admission()
         self._lock = threading.Lock()  # of members and arrivals
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self.trouble = ""
         """Reason why the run cannot be saved, and what its end would cost; part of the status."""
-        self._rate_limit, self._pull_limit = (
-            RateLimit(),
-            RateLimit(per_second=_PIECES, most=4 * _PIECES),
-        )
+        self._rate_limit = RateLimit()
+        self._pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
         self._serve()
 
     def publish_weights(self, bundle: Message, version: int) -> None:
@@ -93,12 +95,13 @@ class LearnerHub:
         with self._lock:
             now = time.monotonic()
             self._forget_arrivals(now)
-            arrivals, members, unlisted = (
-                list(self._arrivals),
-                self._members.listed(),
-                self._members.unlisted,
-            )
-        span = min(_RATE_SECONDS, max(1.0, now - arrivals[0][0])) if arrivals else _RATE_SECONDS
+            arrivals = list(self._arrivals)
+            members = self._members.listed()
+            unlisted = self._members.unlisted
+        span = _RATE_SECONDS
+        if arrivals:
+            first, _, _ = arrivals[0]
+            span = min(span, max(1.0, now - first))
         roles: list[dict[str, Any]] = []
         arrived = collections.defaultdict[Owner, list[int]](list)
         for _, owner, steps in arrivals:
@@ -107,11 +110,11 @@ class LearnerHub:
             entry: dict[str, Any] = alive._asdict()
             if alive.role == "actor":
                 owner = alive.id, alive.incarnation
-                known = self._rollouts.decided(owner)
-                entry |= {"rollouts": known.rollouts, "version": known.version} if known else {}
-                entry |= (
-                    {"lag": self._staleness.lag(known.version)} if known and known.rollouts else {}
-                )
+                decided = self._rollouts.decided(owner)
+                if decided is not None:
+                    entry |= {"rollouts": decided.rollouts, "version": decided.version}
+                    if decided.rollouts:
+                        entry["lag"] = self._staleness.lag(decided.version)
                 entry |= {**self._admission.counts(alive.id), **_rates(arrived[owner], span)}
             roles.append(entry)
         rollouts = self._rollouts.status()
@@ -195,9 +198,14 @@ class LearnerHub:
         return Message(meta={**self._state(), "granted": granted, "retry_after": _RETRY_SECONDS})
 
     def _on_weights(self, key: str, request: Message) -> Message:
-        bundle, state, session = self._bundle, self._state(), self._rollouts.session_id
-        known = request.meta.get("newer_than"), request.meta.get("session_id", session)
-        if bundle is None or known == (bundle.meta["version"], session):
+        bundle = self._bundle
+        state = self._state()
+        session = self._rollouts.session_id
+        version_of_actor = request.meta.get("newer_than")
+        session_of_actor = request.meta.get("session_id", session)
+        if bundle is None:
+            return Message(meta=state)
+        if version_of_actor == bundle.meta["version"] and session_of_actor == session:
             return Message(meta=state)
         return bundle
 

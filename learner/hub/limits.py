@@ -154,8 +154,10 @@ class Events:
         """Publishes as the learner `name` of a run; `on_event` is called with level and text, and
         must not block.
         """
-        self.keys, self.name = Keys(run), name
-        self._transport, self._on_event = transport, on_event
+        self.keys = Keys(run)
+        self.name = name
+        self._transport = transport
+        self._on_event = on_event
         self._last: dict[str, float] = {}
 
     def add(self, level: str, text: str, *, kind: str = "") -> None:
@@ -180,12 +182,12 @@ class Members:
     def note(self, who: Alive, alive: bool) -> bool:
         """Records a token that appeared or disappeared; returns True if it is a listed one."""
         account = who.role, certificate(who.id)
-        known = self._known[account]
-        if alive and (who in known or len(known) < _EACH):
-            known.add(who)
+        members = self._known[account]
+        if alive and (who in members or len(members) < _EACH):
+            members.add(who)
             return True
-        if who in known:
-            known.discard(who)
+        if who in members:
+            members.discard(who)
             return True
         self._beyond[account] += 1 if alive else -1
         if self._beyond[account] <= 0:
@@ -203,5 +205,5 @@ class Members:
     @property
     def unlisted(self) -> int:
         """Number of live tokens that are not listed."""
-        known = sum(map(len, self._known.values()))
-        return sum(self._beyond.values()) + max(0, known - _LISTED)
+        members = sum(map(len, self._known.values()))
+        return sum(self._beyond.values()) + max(0, members - _LISTED)

@@ -26,11 +26,14 @@ from congrasp.learner.hub.staleness import Owner, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
 
-_INCARNATIONS = 1024  # incarnations whose sequences are kept
-_WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
-# Most sequence numbers below `next` that a checkpoint lists one by one, from the first queued one
-# on
-_FAR = 1 << 10
+_MAX_INCARNATIONS = 1024
+"""Incarnations whose sequences are kept."""
+_WINDOW = 64
+"""Sequence numbers by which an actor's rollouts may overtake one another."""
+_MAX_LISTED = 1 << 10
+"""Most sequence numbers below `next` that a checkpoint lists one by one, from the first queued one
+on.
+"""
 
 
 @dataclasses.dataclass
@@ -64,7 +67,7 @@ class Sequences:
             self.refused.add(header.sequence)
         self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
-            self.skipped += self._made(min(self.ahead) - self.next)
+            self.skipped += self._limited(min(self.ahead) - self.next)
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
@@ -76,9 +79,9 @@ class Sequences:
     def missing(self) -> int:
         """Number of undecided sequence numbers below the highest."""
         ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
-        return self.skipped + self._made(ahead)
+        return self.skipped + self._limited(ahead)
 
-    def _made(self, gap: int) -> int:
+    def _limited(self, gap: int) -> int:
         """Size of a gap in the sequence numbers, limited by tickets, since an actor may invent
         numbers.
         """
@@ -90,55 +93,62 @@ class SequenceTable:
 
     def __init__(self) -> None:
         """Starts empty."""
-        self._known: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
+        self._sequences: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
         self._forgotten_missing = 0
 
     def of(self, owner: Owner) -> Sequences:
         """Returns an incarnation's sequences; older ones are dropped if there are too many."""
-        sequences = self._known.setdefault(owner, Sequences())
-        self._known.move_to_end(owner)
-        if len(self._known) > _INCARNATIONS:
+        sequences = self._sequences.setdefault(owner, Sequences())
+        self._sequences.move_to_end(owner)
+        if len(self._sequences) > _MAX_INCARNATIONS:
             # A certificate with many incarnations displaces only its own, so that it cannot
             # displace those of others.
-            mine = (
-                of
-                for of in self._known
-                if of != owner and certificate(of[0]) == certificate(owner[0])
-            )
-            self._forgotten_missing += self._known.pop(next(mine, next(iter(self._known)))).missing
+            oldest = next(iter(self._sequences))
+            for other in self._sequences:
+                if other != owner and certificate(other[0]) == certificate(owner[0]):
+                    oldest = other
+                    break
+            self._forgotten_missing += self._sequences.pop(oldest).missing
         return sequences
 
     def get(self, owner: Owner) -> Sequences | None:
         """Returns an incarnation's sequences; None if it has not been seen."""
-        return self._known.get(owner)
+        return self._sequences.get(owner)
 
     @property
     def missing(self) -> int:
         """Number of undecided sequence numbers below the highest of each incarnation."""
-        return self._forgotten_missing + sum(each.missing for each in self._known.values())
+        return self._forgotten_missing + sum(each.missing for each in self._sequences.values())
 
     def durable(self, waiting: Collection[tuple[Owner, int]]) -> dict[str, Any]:
         """Returns the part to be stored in a checkpoint, as JSON; rollouts queued for an update
         count as undecided.
         """
         rows = []
-        for owner, known in self._known.items():
-            queued = {sequence for of, sequence in waiting if of == owner}
+        for owner, sequences in self._sequences.items():
+            queued = {sequence for other, sequence in waiting if other == owner}
             # An actor may make its numbers up
-            start = max(min(queued | {known.next}), known.next - _FAR)
-            decided = set(range(start, known.next)) | known.ahead
-            rows.append(
-                [*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped]
-            )
+            start = max(min(queued | {sequences.next}), sequences.next - _MAX_LISTED)
+            decided = set(range(start, sequences.next)) | sequences.ahead
+            refused = sorted(sequences.refused)
+            rows.append([*owner, start, sorted(decided - queued), refused, sequences.skipped])
         return {"forgotten_missing": self._forgotten_missing, "sequences": rows}
 
     def restore(self, durable: Mapping[str, Any]) -> None:
         """Restores the result of `durable`."""
         self._forgotten_missing = durable["forgotten_missing"]
         for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
-            self._known[actor, incarnation] = Sequences(
+            self._sequences[actor, incarnation] = Sequences(
                 start, set(ahead), set(refused), skipped, skipped
             )
+
+
+class RolloutContract(NamedTuple):
+    """Run and form of the rollouts that a learner accepts."""
+
+    run_id: str
+    form: RolloutForm
+    schema: str
 
 
 class Verdict(NamedTuple):
@@ -161,11 +171,9 @@ class RolloutQueue:
       finished: True once the run is over; all further rollouts are stale.
     """
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
-        run_id: str,
-        form: RolloutForm,
-        schema: str,
+        contract: RolloutContract,
         staleness: StalenessManager,
         events: Events,
         *,
@@ -177,7 +185,7 @@ class RolloutQueue:
         """Accepts rollouts from the first `publish` on.
 
         Args:
-          run_id, form, schema: see the class.
+          contract: run id, form and schema of the class.
           staleness: staleness manager in its initial state.
           events: receives events.
           limit: most rollouts queued for an update.
@@ -188,31 +196,45 @@ class RolloutQueue:
         Raises:
           CongraspError: the durable state belongs to another run.
         """
-        self.run_id, self.form, self.schema, self.session_id = (
-            run_id,
-            form,
-            schema,
-            secrets.token_hex(4),
-        )
-        self.staleness, self.finished = staleness, False
-        self._events, self._limit, self._audit, self._log = events, limit, audit, log
+        self.run_id = contract.run_id
+        self.form = contract.form
+        self.schema = contract.schema
+        self.session_id = secrets.token_hex(4)
+        self.staleness = staleness
+        self.finished = False
+        self._events = events
+        self._limit = limit
+        self._audit = audit
+        self._log = log
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._sequences = SequenceTable()
         self._being_written: set[tuple[Owner, int]] = set()  # accepted, but not acknowledged yet
-        self._started = self._closed = False
+        self._started = False
+        self._closed = False
         if durable is not None:
-            if durable["run_id"] != run_id:
-                raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {run_id}.")
-            staleness.restore(durable["counters"], durable["version"])
-            self._sequences.restore(durable)
-        version = staleness.version
-        self._recovered = (
-            Recovered([], []) if log is None else log.recover(version, run_id, form, schema)
-        )
+            self._restore(durable)
+        self._recovered = Recovered([], [])
+        if log is not None:
+            self._recovered = log.recover(staleness.version, self.run_id, self.form, self.schema)
         if audit is not None:
-            session = self.session_id, run_id, version, staleness.max_staleness
-            staleness.note_undone(audit.begin(*session, kept=log is not None and log.write))
+            undone = audit.begin(
+                self.session_id,
+                self.run_id,
+                staleness.version,
+                staleness.max_staleness,
+                kept=log is not None and log.write,
+            )
+            staleness.note_undone(undone)
+
+    def _restore(self, durable: Mapping[str, Any]) -> None:
+        """Restores counters and sequences of a checkpoint."""
+        if durable["run_id"] != self.run_id:
+            raise CongraspError(
+                f"The checkpoint has run id {durable['run_id']}, not {self.run_id}."
+            )
+        self.staleness.restore(durable["counters"], durable["version"])
+        self._sequences.restore(durable)
 
     def publish(self, version: int) -> None:
         """Makes `version` the current one; the first time, it queues the rollouts of earlier
@@ -222,7 +244,8 @@ class RolloutQueue:
             self.staleness.publish(version)
             if not self._started:
                 self._take_up(self._recovered)
-                self._started, self._recovered = True, Recovered([], [])
+                self._started = True
+                self._recovered = Recovered([], [])
 
     def grant(self, owner: Owner, ticket: str) -> bool:
         """Grants a ticket, or confirms a granted one, if another rollout is needed."""
@@ -250,9 +273,9 @@ class RolloutQueue:
         written = self._write_ahead(header, message)
         with self._changed:
             self._being_written.remove((header.owner, header.sequence))
-        return (
-            verdict if written or not self._closed else Verdict("retry", "The learner is stopping.")
-        )
+        if self._closed and not written:
+            return Verdict("retry", "The learner is stopping.")
+        return verdict
 
     def has_batch(self, count: int, timeout: float) -> bool:
         """Waits at most `timeout` seconds; returns True if `next_batch` would return a batch. Takes
@@ -277,16 +300,14 @@ class RolloutQueue:
             if not self.has_batch(count, timeout):
                 return None
             waiting = sorted(self._queue, key=lambda entry: -self.staleness.lag(entry[0].version))
-            batch, self._queue = waiting[:count], collections.deque(waiting[count:])
+            batch = waiting[:count]
+            self._queue = collections.deque(waiting[count:])
             for header, _ in batch:
                 self.staleness.take(header.version)
         messages = [message for _, message in batch]
         if self._audit is not None:
-            self._audit.used(
-                self.staleness.version,
-                [self.staleness.lag(header.version) for header, _ in batch],
-                messages,
-            )
+            lags = [self.staleness.lag(header.version) for header, _ in batch]
+            self._audit.used(self.staleness.version, lags, messages)
         return messages
 
     def close(self) -> None:
@@ -365,14 +386,18 @@ class RolloutQueue:
         taken: list[Identity] = []
         stale: list[Identity] = []
         for header, message in recovered.rollouts:
-            sequences, identity = self._sequences.of(header.owner), (*header.owner, header.sequence)
+            sequences = self._sequences.of(header.owner)
             if header.sequence in sequences:  # the checkpoint holds its outcome
                 continue
             verdict = self.staleness.arrive(header.owner, "", header.version, beyond_capacity=True)
-            sequences.add(header, accepted=verdict == "accepted")
+            identity = (*header.owner, header.sequence)
             if verdict == "accepted":
+                sequences.add(header, accepted=True)
                 self._queue.append((header, message))
-            (taken if verdict == "accepted" else stale).append(identity)
+                taken.append(identity)
+            else:
+                sequences.add(header, accepted=False)
+                stale.append(identity)
         if self._audit is not None:
             self._audit.recovered(taken, stale, recovered.damaged)
         if taken or stale:

@@ -63,7 +63,9 @@ class WriteAheadLog:
           log_error: called with one line when the disk begins to refuse rollouts.
         """
         self.write = write
-        self._folder, self._max_staleness, self._log_error = folder, max_staleness, log_error
+        self._folder = folder
+        self._max_staleness = max_staleness
+        self._log_error = log_error
         self._lock = threading.Lock()
         self._files: dict[Identity, pathlib.Path] = {}
         self._decided: set[Identity] = set()
@@ -86,7 +88,7 @@ class WriteAheadLog:
           CongraspError: a damaged file cannot be renamed.
         """
         self._saved = self._next = version
-        found = Recovered([], [])
+        recovered = Recovered([], [])
         _remove(self._folder.glob(f"*{PART}"))  # never acknowledged
         for path in sorted(self._folder.glob("*.safetensors")):
             if (name := _NAME.fullmatch(path.name)) is None:
@@ -100,14 +102,14 @@ class WriteAheadLog:
                     raise CongraspError("The file's name belongs to another rollout.")
             except CongraspError:
                 set_aside(path)
-                found.damaged.append(identity)
+                recovered.damaged.append(identity)
                 continue
             if header.run_id != run_id:
                 _remove([path])
                 continue
             self._files[identity] = path
-            found.rollouts.append((header, message))
-        return found
+            recovered.rollouts.append((header, message))
+        return recovered
 
     def add(self, header: RolloutHeader, message: Message) -> bool:
         """Writes an accepted rollout if a resume could use it; returns False if that fails."""
@@ -124,7 +126,9 @@ class WriteAheadLog:
                     file.close()
                     part.rename(path)
             except OSError as error:
-                is_new, self._full, why = not self._full, True, error.strerror
+                is_new = not self._full
+                self._full = True
+                why = error.strerror
             else:
                 self._files[identity] = path
                 self._number += 1

@@ -31,8 +31,10 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.learner.run_directory import create_run
+from congrasp.services.train.accelerators import engine_of, leave_gpus_to
+from congrasp.services.train.launch import Launch, LearnerOptions, Plan
 from congrasp.services.train.learn import until_first_update
-from congrasp.services.train.processes import Launch, Plan, engine_of, leave_gpus_to, train
+from congrasp.services.train.processes import train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and all environments begin with new
@@ -149,7 +151,8 @@ def bench_scaling(
     stages: list[Stage] = []
     for count in ranks:
         console.print(f"{count} rank(s): at most {deadline:.0f} s …")
-        plan = Plan(Launch(ranks=count, metric_writers=()), actors, physics, gpus)
+        launch = Launch(ranks=count, learner=LearnerOptions(metric_writers=()))
+        plan = Plan(launch, actors, physics, gpus)
         stages.append(
             _measure(config, plan, seconds, deadline, stages[0] if stages else None, console)
         )

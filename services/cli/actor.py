@@ -3,18 +3,19 @@
 import dataclasses
 import math
 import pathlib
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.journal import Journal, user_journal
+from congrasp.common.io.journal import AUDIT, Journal, user_journal
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import process_name
 from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.cli.arguments import option_value
 from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch, log
 from congrasp.services.ops.metrics import ActorMetrics
@@ -34,6 +35,10 @@ class Actor:
       congrasp actor --connect tls/10.0.0.5:7447 --run human --certs actor.1
     """
 
+    launch: pathlib.Path | None = None
+    """`launch.json` of a run that `congrasp train` started; the other options of its actor --id
+    default to its values. For the processes of `congrasp train`.
+    """
     connect: str = LEARNER_URL
     """The learner's endpoint, such as tcp/10.0.0.5:7447."""
     run: str = "quickstart"
@@ -130,6 +135,33 @@ class Actor:
             return user_journal(run_id, name, warn)
 
         return opened
+
+
+def defaults(arguments: list[str]) -> dict[str, Any]:
+    """Defaults that depend on a command line: with --launch the values of that file."""
+    launch_file = option_value("--launch", arguments)
+    if not launch_file:
+        return {}
+    from congrasp.actors.harvest import references_file
+    from congrasp.services.train.launch import read_launch
+
+    path = pathlib.Path(launch_file)
+    run_dir = path.parent
+    record = read_launch(path)
+    name = option_value("--id", arguments)
+    values: dict[str, Any] = {
+        "connect": record.learner_of_actor(name),
+        "run": record.run,
+        "physics": record.physics,
+        "threads": record.actor_threads,
+        "references": references_file(run_dir, name),
+        "certs": record.launch.certs,
+    }
+    if record.launch.learner.audit:
+        values["audit"] = run_dir / AUDIT / f"{name}.jsonl"
+    else:
+        values["no_audit"] = True
+    return values
 
 
 COMMAND = Actor

@@ -250,13 +250,13 @@ class Train:
         import jax
 
         from congrasp.services.assets.hands.model_files import Choices
-        from congrasp.services.train import processes
+        from congrasp.services.train import accelerators
         from congrasp.services.train.own_hand import Request, train_hand
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
         check_output("--out", self.out or pathlib.Path("runs", "hands"), is_folder=True)
-        full = processes.accelerators()[0] != "cpu"
+        full = accelerators.detect()[0] != "cpu"
         # The stages are separate processes, each with the whole GPU memory
         jax.config.update("jax_platforms", "cpu")
         reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))

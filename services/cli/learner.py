@@ -4,15 +4,20 @@ import contextlib
 import dataclasses
 import pathlib
 import shlex
+from typing import Annotated, Any
+
+import tyro
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
-from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
+from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
-from congrasp.services.cli.train import defaults as defaults
+from congrasp.services.cli.arguments import option_value
+from congrasp.services.cli.train import defaults as defaults_of_preset
 from congrasp.services.ops.lifetime import Stop, command, on_signal
 from congrasp.services.ops.logs import Watch, log, log_error, logging_as
+from congrasp.services.train.launch import LearnerOptions, read_launch
 from congrasp.services.train.presets import with_hand
 
 
@@ -22,6 +27,10 @@ class Options:
 
     run_dir: pathlib.Path
     """Directory of the run."""
+    launch: pathlib.Path | None = None
+    """`launch.json` of a run that `congrasp train` started; the other options default to its
+    values. For the processes of `congrasp train`.
+    """
     preset: str = "quickstart"
     """Named initial configuration."""
     hand: str | None = None
@@ -34,8 +43,6 @@ class Options:
     """Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each
     role to its rights.
     """
-    insecure: bool = False
-    """Listen beyond loopback without certificates."""
     initial: pathlib.Path | None = None
     """A policy to begin with instead of random weights, of the same networks: `policy.safetensors`
     of a run, or a policy of the package, whose critic starts again.
@@ -63,12 +70,8 @@ class Options:
     """Host and port of rank 0; this port and the next must be free there."""
     inside: bool = False
     """Also run an actor in this process, so that its rollouts never leave the device."""
-    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",)
-    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files
-    there, for `wandb sync`), wandb (needs an account); without a name, none."""
-
-    audit: bool = True
-    """Journal of all rollouts in the run's folder, for 'congrasp audit'."""
+    shared: Annotated[LearnerOptions, tyro.conf.arg(name="")] = LearnerOptions()  # noqa: RUF009
+    """Options that `congrasp train` has as well."""
 
     @property
     def resumes(self) -> bool:
@@ -120,7 +123,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     from congrasp.common.runtime.stages import imported
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
-    from congrasp.services.train.learn import learn, longest_rollout
+    from congrasp.services.train.learn import InnerActor, Monitoring, learn, longest_rollout
     from congrasp.services.train.start import Folder, removed_without_checkpoint
 
     run_dir = options.run_dir
@@ -137,7 +140,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
                 url,
                 "learner",
                 certs=options.certs,
-                insecure=options.insecure,
+                insecure=options.shared.insecure,
                 run=config.name,
                 longest_rollout=longest,
             ) as transport,
@@ -156,18 +159,21 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             config = run_config_from_json(entries[0]["config"])
             if rank:
                 check_inputs(config.inputs, OF_LEARNERS, COPY)
+            inside = InnerActor(config.physics) if options.inside else None
             learn(
                 run_dir,
                 config,
                 wire=transport,
-                inside=config.physics if options.inside else None,
+                inside=inside,
                 stop=stop,
                 ranks=ranks,
-                writers=options.metric_writers,
-                watch=watch,
-                audit=options.audit,
-                on_update=_log_update,
-                on_event=log,
+                monitoring=Monitoring(
+                    on_update=_log_update,
+                    on_event=log,
+                    writers=options.shared.metric_writers,
+                    watch=watch,
+                    audit=options.shared.audit,
+                ),
             )
             log("info", _end(run_dir, stop))
             return stop.exit_code
@@ -193,6 +199,38 @@ def _end(run_dir: pathlib.Path, stop: Stop) -> str:
 def _log_update(values: dict[str, float]) -> None:
     """Logs the metrics of an update."""
     log("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
+
+
+def defaults(arguments: list[str]) -> dict[str, Any]:
+    """Defaults that depend on a command line: those of `congrasp train`, or with --launch the
+    values of that file.
+    """
+    launch_file = option_value("--launch", arguments)
+    if not launch_file:
+        return defaults_of_preset(arguments)
+    from congrasp.learner.run_directory import open_run
+
+    path = pathlib.Path(launch_file)
+    record = read_launch(path)
+    launch = record.launch
+    is_first = option_value("--rank", arguments) in ("", "0")
+    options = Options(
+        run_dir=path.parent,
+        launch=path,
+        listen=record.endpoint,
+        certs=launch.certs,
+        resume=True,
+        ranks=launch.ranks,
+        coordinator=record.coordinator,
+        inside=record.actors == 0,
+        shared=launch.learner,
+    )
+    metrics_port = launch.metrics_port if is_first else 0
+    return {
+        "options": options,
+        "config": open_run(path.parent),
+        "watch": Watch(metrics_port=metrics_port),
+    }
 
 
 COMMAND = learner

@@ -17,7 +17,7 @@ from congrasp.services.evaluate.paper.page import JSON, LATEX, PAGE, page_templa
 from congrasp.services.evaluate.paper.parts import BASELINES, RequiredPolicy, required_policies
 from congrasp.services.evaluate.paper.reproduction import Request, reproduce
 from congrasp.services.ops.lifetime import command
-from congrasp.services.train import processes
+from congrasp.services.train import accelerators
 from congrasp.services.train.reproduction import PolicyRequest, get_policies, policies_to_train
 
 _RUNS_FOLDER = "policies"
@@ -167,7 +167,7 @@ def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[Require
 
 def _check_device(names: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-    if names and processes.accelerators()[0] == "cpu":
+    if names and accelerators.detect()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(names)} must be trained first, and this machine has no GPU.",
             "Use --quick, which takes the pretrained policies, or name policies with --policy.",

@@ -12,8 +12,10 @@ from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
-from congrasp.services.train.presets import get_preset, student_of, with_hand
-from congrasp.services.train.processes import Launch
+from congrasp.services.cli.arguments import option_value
+from congrasp.services.train.launch import Launch
+from congrasp.services.train.presets import get_preset, with_hand
+from congrasp.services.train.students import student_of
 
 
 def train(  # noqa: PLR0913
@@ -99,34 +101,25 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
 
     With --resume the configuration is that of the run, and a preset for another hand is rejected.
     """
-    named, hand = _value("--preset", arguments), _value("--hand", arguments) or None
-    preset, run_dir = named or "quickstart", _value("--run-dir", arguments)
-    if (
-        {"--resume", "--or-resume"} & set(arguments)
-        and run_dir
-        and (pathlib.Path(run_dir) / CONFIG_FILE).exists()
-    ):
+    preset = option_value("--preset", arguments)
+    hand = option_value("--hand", arguments) or None
+    run_dir = option_value("--run-dir", arguments)
+    resumes = not {"--resume", "--or-resume"}.isdisjoint(arguments)
+    if resumes and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
         config = open_run(pathlib.Path(run_dir))
-        if named and get_preset(named, hand).task.hand != config.task.hand:
+        if preset and get_preset(preset, hand).task.hand != config.task.hand:
             raise CongraspError(
                 f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset "
-                f"{named} is not for.",
+                f"{preset} is not for.",
                 "Leave out --preset, or choose another --run-dir.",
             )
         return {"config": config}
-    config = get_preset(preset, hand)
-    if teacher := _value("--teacher", arguments):
-        method = _value("--method", arguments)
+    config = get_preset(preset or "quickstart", hand)
+    teacher = option_value("--teacher", arguments)
+    if teacher:
+        method = option_value("--method", arguments)
         config = student_of(config, teacher, method if method in STUDENTS else STUDENT)
     return {"config": config}
-
-
-def _value(option: str, arguments: list[str]) -> str:
-    """The value of an option on a command line; empty if it is absent."""
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        if word.partition("=")[0] == option:
-            return word.partition("=")[2] or following
-    return ""
 
 
 COMMAND = train

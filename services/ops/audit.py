@@ -46,6 +46,8 @@ FAULTS = {
 """Faults of rollouts, and their kinds."""
 EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
 """Exit codes of `congrasp audit` by kind, the most serious first; 2 to 4 are those of errors."""
+_MAX_FAULTS = 20
+"""Faults that are printed."""
 UNJUDGED = "not in the journals"
 """Outcome of accepted rollouts that cannot be judged."""
 
@@ -85,13 +87,15 @@ class Report(NamedTuple):
     @property
     def exit_code(self) -> int:
         """0 without findings, else that of the most serious kind."""
-        damaged = self.damaged or self.counts.get("damaged on disk")
-        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | (
-            {"damage"} if damaged else set()
-        )
+        kinds = {kind for name, kind in FAULTS.items() if self.counts[name]}
+        if self.damaged or self.counts.get("damaged on disk"):
+            kinds.add("damage")
         if self.missing or self.counts.get(UNJUDGED) or not self.counts["made"]:
             kinds.add("unjudged")
-        return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
+        for kind, code in EXIT_CODES.items():
+            if kind in kinds:
+                return code
+        return 0
 
 
 class _Gaps(NamedTuple):
@@ -111,28 +115,10 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     Raises:
       CongraspError: there are no journals.
     """
-    folder = run_dir / AUDIT
-    learners = sorted(folder.glob("learner-*.jsonl"))
     if not run_dir.is_dir():
         raise CongraspError(f"There is no folder {run_dir}.", "Pass the folder of a run.")
-    if not learners:
-        raise CongraspError(
-            f"There is no journal of a learner in {folder}.",
-            "A single process ('--actors 0', '--inside') and '--no-audit' keep none.",
-        )
-    books = [read_uses(path) for path in learners]
-    actors = [path for path in sorted(folder.glob("*.jsonl")) if path not in learners]
-    users = _user_journals(books)
-    for path in users:
-        actors += sorted(path.glob("*.jsonl"))
-    actors += more
-    if not actors:
-        places = " or ".join(str(each) for each in (folder, *users))
-        raise CongraspError(
-            f"There is no journal of an actor in {places}.",
-            "Actors on other machines have theirs in ~/.local/state/congrasp/audit there: copy "
-            "them here and pass them with --journals FILE.",
-        )
+    learners = _learner_journals(run_dir / AUDIT)
+    actors = _actor_journals(run_dir / AUDIT, learners, more)
     # In this order, since a running learner writes meanwhile: a rollout that an actor knows to be
     # accepted, and that the learner has not used, is in one of the two listings of files.
     notes = [read_journal(path, _is_entry) for path in actors]
@@ -141,18 +127,50 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     books = [read_uses(path) for path in learners]
     if files is not None:
         files |= stored(run_dir) or set()
-    gaps = _Gaps(
-        *(
-            any(each.lost or each.damaged or each.missing for each in group)
-            for group in (notes, books)
-        )
-    )
+    gaps = _Gaps(actors=_has_gaps(notes), learners=_has_gaps(books))
     outcomes = _outcomes(book.intact for book in books)._replace(files=files)
     report = _compare(_made(notes), outcomes, gaps, [*notes, *books])
     covered = _covered_version(books)
     if covered < reached and not gaps.learners:
         return report._replace(missing=report.missing + 1, unrecorded=(covered, reached))
     return report
+
+
+def _learner_journals(folder: pathlib.Path) -> list[pathlib.Path]:
+    """Returns the journals of a run's learners; raises a CongraspError if there are none."""
+    learners = sorted(folder.glob("learner-*.jsonl"))
+    if not learners:
+        raise CongraspError(
+            f"There is no journal of a learner in {folder}.",
+            "A single process ('--actors 0', '--inside') and '--no-audit' keep none.",
+        )
+    return learners
+
+
+def _actor_journals(
+    folder: pathlib.Path, learners: Sequence[pathlib.Path], more: Sequence[pathlib.Path]
+) -> list[pathlib.Path]:
+    """Returns the journals of a run's actors: those in its folder, this user's, and more; raises a
+    CongraspError if there are none.
+    """
+    actors = [path for path in sorted(folder.glob("*.jsonl")) if path not in learners]
+    user_folders = _user_journals([read_uses(path) for path in learners])
+    for user_folder in user_folders:
+        actors += sorted(user_folder.glob("*.jsonl"))
+    actors += more
+    if not actors:
+        places = " or ".join(str(each) for each in (folder, *user_folders))
+        raise CongraspError(
+            f"There is no journal of an actor in {places}.",
+            "Actors on other machines have theirs in ~/.local/state/congrasp/audit there: copy "
+            "them here and pass them with --journals FILE.",
+        )
+    return actors
+
+
+def _has_gaps(journals: Iterable[JournalLines]) -> bool:
+    """True if any of the journals lacks lines."""
+    return any(each.lost or each.damaged or each.missing for each in journals)
 
 
 def _covered_version(books: Iterable[JournalLines]) -> int:
@@ -203,10 +221,14 @@ def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
                 continue
             if has_fields(entry, actor=str, incarnation=str):
                 who = entry["actor"], entry["incarnation"]
-            if who is not None and "made" in entry:
+            if who is None:
+                continue
+            if "made" in entry:
                 made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
-            elif who is not None and (identity := (*who, entry.get("answer", -1))) in made:
-                made[identity].answers.append((entry["outcome"], entry["session_id"]))
+                continue
+            answered = made.get((*who, entry.get("answer", -1)))
+            if answered is not None:
+                answered.answers.append((entry["outcome"], entry["session_id"]))
     return made
 
 
@@ -253,17 +275,17 @@ class _Outcomes(NamedTuple):
 
 def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
     """Collects outcomes from the learners' journals."""
-    found = _Outcomes([], collections.defaultdict(list), set(), set(), set())
+    outcomes = _Outcomes([], collections.defaultdict(list), set(), set(), set())
     for book in books:
-        found.books.append(_sessions(book))
+        outcomes.books.append(_sessions(book))
         stands, lost = replay(book)
         for use in stands:
-            found.standing[use.actor, use.incarnation, use.sequence].append(use)
-        found.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
+            outcomes.standing[use.actor, use.incarnation, use.sequence].append(use)
+        outcomes.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
         for entry in book:
-            found.dropped.update(_rows(entry, "dropped"))
-            found.spoilt.update(_rows(entry, "spoilt"))
-    return found
+            outcomes.dropped.update(_rows(entry, "dropped"))
+            outcomes.spoilt.update(_rows(entry, "spoilt"))
+    return outcomes
 
 
 def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
@@ -272,17 +294,28 @@ def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
     saved = -1
     for entry in book:
         if "session_id" in entry:
-            begin = entry["session_id"], entry["run_id"], entry["version"], entry["max_staleness"]
-            kept = entry.get("kept") is True
-            sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
-        saved = entry.get("saved", entry["version"] if "session_id" in entry else saved)
-        if sessions:
-            sessions[-1].saved = saved
-            sessions[-1].started |= "taken" in entry
-            sessions[-1].taken.update(_rows(entry, "taken"))
-            sessions[-1].unwritten.update(_rows(entry, "unwritten"))
-            if "end" in entry:
-                sessions[-1].waiting = _rows(entry, "end")
+            writes_ahead = entry.get("kept") is True
+            session = _Session(
+                session_id=entry["session_id"],
+                run_id=entry["run_id"],
+                version=entry["version"],
+                max_staleness=entry["max_staleness"],
+                kept=writes_ahead,
+                falls_back=entry["version"] < saved,
+                started=not writes_ahead,
+            )
+            sessions.append(session)
+            saved = entry["version"]
+        saved = entry.get("saved", saved)
+        if not sessions:
+            continue
+        session = sessions[-1]
+        session.saved = saved
+        session.started |= "taken" in entry
+        session.taken.update(_rows(entry, "taken"))
+        session.unwritten.update(_rows(entry, "unwritten"))
+        if "end" in entry:
+            session.waiting = _rows(entry, "end")
     return [session for session in sessions if session.started]
 
 
@@ -291,61 +324,85 @@ def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
     return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
 
 
+class _Findings:
+    """Counts of outcomes, and faults."""
+
+    def __init__(self) -> None:
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.faults: list[str] = []
+
+    def add_fault(self, kind: str, identity: Identity, text: str) -> None:
+        """Counts a fault, and records the rollout."""
+        self.counts[kind] += 1
+        name = "/".join(map(str, identity))
+        self.faults.append(f"{name}: {text}")
+
+
 def _compare(
-    made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]
+    made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]
 ) -> Report:
     """Compares every rollout's replies with the actions of the learner's sessions."""
-    standing = found.standing
-    counts = collections.Counter({"made": len(made)})
-    faults: list[str] = []
-
-    def fault(kind: str, identity: Identity, text: str) -> None:
-        """Counts a fault, and records the rollout."""
-        counts[kind] += 1
-        faults.append(f"{'/'.join(map(str, identity))}: {text}")
-
-    known = {identity[:2] for identity in made}
-    max_staleness = _max_staleness(found.books)
-    for identity, text in _too_late(standing, max_staleness):
-        fault("above the limit on lag", identity, text)
-    for identity, uses in standing.items():
-        if identity[:2] not in known:
-            counts["of actors without a journal"] += 1
-            continue
-        if identity not in made:
-            if gaps.actors:
-                counts["used, not in the journals"] += 1
-            else:
-                fault("unmatched", identity, "used, but never sent")
-        elif any(use.checksum != made[identity].checksum for use in uses):
-            fault("corrupted", identity, "used with different content than sent")
-        if (
-            len(uses) > 1 and not gaps.learners
-        ):  # the line with which a resume undid one of them may be missing
-            fault("duplicated", identity, f"used {len(uses)} times")
-    for identity, rollout in made.items():
-        outcomes = [outcome for outcome, _ in rollout.answers]
-        if "accepted" not in outcomes and "duplicate" not in outcomes:
-            counts[_not_accepted(outcomes, used=identity in standing)] += 1
-            continue
-        counts["accepted"] += 1
-        outcome = _judged(identity, rollout, found, gaps)
-        if outcome == "lost":
-            fault("lost", identity, "accepted, but missing afterwards")
-        else:
-            counts[outcome] += 1
-    lags = _lags(standing)
+    findings = _Findings()
+    findings.counts["made"] = len(made)
+    max_staleness = _max_staleness(outcomes.books)
+    for identity, text in _too_late(outcomes.standing, max_staleness):
+        findings.add_fault("above the limit on lag", identity, text)
+    _check_uses(findings, made, outcomes, gaps)
+    _check_acceptances(findings, made, outcomes, gaps)
+    lags = _lags(outcomes.standing)
+    counts = dict(findings.counts) | {name: findings.counts[name] for name in FAULTS}
     return Report(
-        dict(counts) | {name: counts[name] for name in FAULTS},
-        faults,
-        sum(lags) / max(1, len(lags)),
-        max(lags, default=0),
-        max_staleness,
-        sum(journal.lost for journal in journals),
-        sum(journal.damaged for journal in journals),
-        sum(journal.missing for journal in journals),
-        sum(journal.unchecked for journal in journals),
+        counts=counts,
+        faults=findings.faults,
+        lag_mean=sum(lags) / max(1, len(lags)),
+        lag_max=max(lags, default=0),
+        max_staleness=max_staleness,
+        holes=sum(journal.lost for journal in journals),
+        damaged=sum(journal.damaged for journal in journals),
+        missing=sum(journal.missing for journal in journals),
+        unchecked=sum(journal.unchecked for journal in journals),
     )
+
+
+def _check_uses(
+    findings: _Findings, made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps
+) -> None:
+    """Compares the rollouts that the learners used with those that actors sent."""
+    incarnations = {identity[:2] for identity in made}
+    for identity, uses in outcomes.standing.items():
+        if identity[:2] not in incarnations:
+            findings.counts["of actors without a journal"] += 1
+            continue
+        rollout = made.get(identity)
+        if rollout is None and gaps.actors:
+            findings.counts["used, not in the journals"] += 1
+        elif rollout is None:
+            findings.add_fault("unmatched", identity, "used, but never sent")
+        elif any(use.checksum != rollout.checksum for use in uses):
+            findings.add_fault("corrupted", identity, "used with different content than sent")
+        # With gaps, the line with which a resume undid one of them may be missing.
+        if len(uses) > 1 and not gaps.learners:
+            findings.add_fault("duplicated", identity, f"used {len(uses)} times")
+
+
+def _check_acceptances(
+    findings: _Findings, made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps
+) -> None:
+    """Counts the outcomes of the rollouts that actors sent, and finds accepted ones that were
+    lost.
+    """
+    for identity, rollout in made.items():
+        answers = [outcome for outcome, _ in rollout.answers]
+        if "accepted" not in answers and "duplicate" not in answers:
+            used = identity in outcomes.standing
+            findings.counts[_not_accepted(answers, used=used)] += 1
+            continue
+        findings.counts["accepted"] += 1
+        outcome = _judged(identity, rollout, outcomes, gaps)
+        if outcome == "lost":
+            findings.add_fault("lost", identity, "accepted, but missing afterwards")
+        else:
+            findings.counts[outcome] += 1
 
 
 def _not_accepted(outcomes: Sequence[str], *, used: bool) -> str:
@@ -381,33 +438,33 @@ def _max_staleness(books: Iterable[list[_Session]]) -> int:
     return max(limits)
 
 
-def _judged(identity: Identity, rollout: Made, found: _Outcomes, gaps: _Gaps) -> str:
+def _judged(identity: Identity, rollout: Made, outcomes: _Outcomes, gaps: _Gaps) -> str:
     """Outcome of an accepted rollout; a loss cannot be judged while lines are missing."""
-    outcome = _outcome(identity, rollout, found)
+    outcome = _outcome(identity, rollout, outcomes)
     return UNJUDGED if outcome == "lost" and any(gaps) else outcome
 
 
-def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
+def _outcome(identity: Identity, rollout: Made, outcomes: _Outcomes) -> str:
     """Outcome of an accepted rollout, from the last session that had it and the next one."""
-    if identity in found.standing:
+    if identity in outcomes.standing:
         return "used"
-    if identity in found.dropped:
+    if identity in outcomes.dropped:
         return "dropped"
-    if identity in found.spoilt:
+    if identity in outcomes.spoilt:
         return "damaged on disk"
     accepted_by = {
         session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")
     }
-    for book in found.books:
+    for book in outcomes.books:
         had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
         if not had:
             continue
-        last, after = book[had[-1]], book[had[-1] + 1 : had[-1] + 2]
-        if not after:
-            return _at_the_end(identity, rollout.version, last, found.files)
-        return _without_trace(
-            identity, rollout.version, last, after[0], undone=identity in found.undone
-        )
+        newest = had[-1]
+        last = book[newest]
+        if newest + 1 == len(book):
+            return _at_the_end(identity, rollout.version, last, outcomes.files)
+        undone = identity in outcomes.undone
+        return _without_trace(identity, rollout.version, last, book[newest + 1], undone=undone)
     return UNJUDGED
 
 
@@ -463,46 +520,54 @@ def audit(
     """
     report = compare(run_dir, journals)
     console = Console(markup=False)
+    console.print(_table(run_dir, report))
+    for line in _remarks(report):
+        console.print(line)
+    for line in report.faults[:_MAX_FAULTS]:
+        console.print(line)
+    return report.exit_code
+
+
+def _table(run_dir: pathlib.Path, report: Report) -> Table:
+    """Table of the outcomes and of the journals' lines."""
     table = Table("rollouts", "number", "kind", title=f"Audit of {run_dir}")
     for name, value in report.counts.items():
         style = "bold red" if name in FAULTS and value else ""
         table.add_row(name, str(value), FAULTS.get(name, ""), style=style)
     table.add_section()
-    table.add_row(
-        "damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else ""
-    )
-    table.add_row(
-        "lines of older versions", str(report.unchecked), "unchecked" if report.unchecked else ""
-    )
-    console.print(table)
-    console.print(
+    style = "bold red" if report.damaged else ""
+    table.add_row("damaged lines", str(report.damaged), "damage", style=style)
+    kind = "unchecked" if report.unchecked else ""
+    table.add_row("lines of older versions", str(report.unchecked), kind)
+    return table
+
+
+def _remarks(report: Report) -> Iterator[str]:
+    """Yields lines about lag, and about what the journals lack."""
+    yield (
         f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} "
         f"versions."
     )
     if report.holes:
-        console.print(
+        yield (
             f"{report.holes} line(s) are missing in the journals: the disk was full, or their end "
             f"was cut."
         )
     if report.unrecorded:
         covered, reached = report.unrecorded
-        console.print(
+        yield (
             f"The run reached version {reached}, but the learner's journal ends at version "
             f"{covered}: its end is missing."
         )
     if report.missing:
-        console.print(
+        yield (
             f"Lines are missing at {report.missing} place(s) of the journals: they were emptied or "
             f"cut."
         )
     if report.exit_code == EXIT_CODES["unjudged"]:
-        count, accepted = report.counts.get(UNJUDGED, 0), report.counts.get("accepted", 0)
-        console.print(
-            f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}."
-        )
-    for line in report.faults[:20]:
-        console.print(line)
-    return report.exit_code
+        count = report.counts.get(UNJUDGED, 0)
+        accepted = report.counts.get("accepted", 0)
+        yield (f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}.")
 
 
 COMMAND = audit

@@ -39,7 +39,10 @@ from congrasp.common.transport.security import (
 )
 
 CA_KEY_FILE = "ca.key"
-CA_DAYS, DAYS = 3650, 365
+CA_DAYS = 3650
+"""Validity of an authority."""
+DAYS = 365
+"""Validity of a role's certificate."""
 RUN = "quickstart"
 """Default run of an authority."""
 _LONGEST_NAME = 64  # limit of a common name in characters (RFC 5280)
@@ -174,7 +177,8 @@ def _free_identity(
         raise CongraspError(
             f"{role}.{number} cannot be issued.", f"Numbers range from 0 to {NUMBERS - 1}."
         )
-    target, identity = folder / f"{role}.{number}", Identity(run, role, number)
+    target = folder / f"{role}.{number}"
+    identity = Identity(run, role, number)
     if target.exists() and not force:
         raise CongraspError(
             f"{target} exists already.", "Pass another --number, or --force to replace it."
@@ -223,8 +227,12 @@ def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = No
     """
     _authority(folder)
     name = str(Identity(run or read(folder / CA_FILE).run, role, number))
-    listed = "".join(f"{one}\n" for one in sorted(Credentials(folder, role).revoked() | {name}))
-    for place in (folder, *(path for one in ROLES for path in folder.glob(f"{one}.*"))):
+    names = sorted(Credentials(folder, role).revoked() | {name})
+    listed = "".join(f"{each}\n" for each in names)
+    folders = [folder]
+    for issued_role in ROLES:
+        folders += folder.glob(f"{issued_role}.*")
+    for place in folders:
         write_atomically(place / REVOKED_FILE, listed.encode())
     return name
 
@@ -236,13 +244,13 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
       CongraspError: there are none, or one is damaged.
     """
     files = [folder / CA_FILE, folder / CERTIFICATE_FILE, *folder.glob(f"*.*/{CERTIFICATE_FILE}")]
-    found = [read(path) for path in files if path.exists()]
-    if not found:
+    listed = [read(path) for path in files if path.exists()]
+    if not listed:
         raise CongraspError(
             f"{folder} holds no certificates.",
             f"Create them: {shell_command('congrasp', 'certs', 'init', folder)}",
         )
-    return sorted(found, key=lambda one: one.identity or Identity("", "", 0))
+    return sorted(listed, key=lambda one: one.identity or Identity("", "", 0))
 
 
 def _builder(

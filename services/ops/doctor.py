@@ -10,10 +10,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
@@ -27,7 +28,12 @@ _PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
 """Packages whose versions must match."""
 _PORT = int(LEARNER_URL.rpartition(":")[2])
 _LEAST_GIB = 2.0
-_LEAST_MB_S, _SAMPLE = 5.0, 16 << 20
+_LEAST_MB_S = 5.0
+_SAMPLE = 16 << 20
+"""Bytes that are written to measure a disk."""
+_LEAST_DATE = 1.7e9
+"""Seconds since 1970, in the year 2023."""
+_MAX_DRIFT_S = 0.1
 _DRIVER = 580
 _LEAST_DAYS = 14.0  # warning before a certificate expires, days
 _OFFSET = 1.0  # tolerated offset from the learner's clock, s
@@ -47,7 +53,9 @@ class Finding(NamedTuple):
     @property
     def text(self) -> str:
         """One line, with the remedy of a failure."""
-        return self.state if self.fine or not self.remedy else f"{self.state}: {self.remedy}"
+        if self.fine or not self.remedy:
+            return self.state
+        return f"{self.state}: {self.remedy}"
 
 
 def examine(
@@ -70,7 +78,10 @@ def examine(
         checks.append(lambda: _certificates(certs))
     if connect:
         checks.append(lambda: _learner(connect, run, certs))
-    return [finding for check in checks for finding in _tried(check)]
+    findings: list[Finding] = []
+    for check in checks:
+        findings += _tried(check)
+    return findings
 
 
 def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
@@ -94,39 +105,39 @@ def _python() -> Iterator[Finding]:
 
 def _packages() -> Iterator[Finding]:
     """Checks versions required by the package's metadata, and those that must match."""
-    gpu = os.path.exists(_NVIDIA)
-    wanted = {}
-    for text in importlib.metadata.requires("congrasp") or ():
-        requirement = Requirement(text)
-        extras = ("", "train", "cuda") if gpu else ("", "train")
-        if not requirement.marker or any(
-            requirement.marker.evaluate({"extra": extra}) for extra in extras
-        ):
-            wanted[requirement.name] = requirement.specifier
-    have: dict[str, str] = {}
+    extra = "cuda" if os.path.exists(_NVIDIA) else "train"
+    required = _required_versions(("", "train", extra))
+    installed: dict[str, str] = {}
     for name in _PACKAGES:
-        needed = name in wanted
         try:
-            have[name] = importlib.metadata.version(name)
+            installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            if needed:
-                extra = "cuda" if gpu else "train"
+            if name in required:
                 yield Finding(name, False, f"not installed; run: pip install 'congrasp[{extra}]'")
             continue
-        fine, version = not needed or wanted[name].contains(have[name]), wanted.get(name)
-        yield Finding(
-            name, fine, have[name], f"{version} is needed; run: pip install '{name}{version}'"
-        )
-    for one, other in _PAIRS:
-        versions = (
-            [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
-        )
-        if versions[0] != versions[1]:
-            text = (
-                f"{versions[0]} and {versions[1]} do not match; run: pip install "
-                f"'{other}=={versions[0]}'"
-            )
-            yield Finding(f"{one}, {other}", False, text)
+        version = required.get(name)
+        fine = version is None or version.contains(installed[name])
+        remedy = f"{version} is needed; run: pip install '{name}{version}'"
+        yield Finding(name, fine, installed[name], remedy)
+    for first, second in _PAIRS:
+        if first not in installed:
+            continue
+        expected = importlib.metadata.version(first)
+        actual = importlib.metadata.version(second)
+        if expected != actual:
+            text = f"{expected} and {actual} do not match; run: pip install '{second}=={expected}'"
+            yield Finding(f"{first}, {second}", False, text)
+
+
+def _required_versions(extras: Sequence[str]) -> dict[str, SpecifierSet]:
+    """Versions of packages that congrasp needs with any of these extras, by the package's name."""
+    required: dict[str, SpecifierSet] = {}
+    for text in importlib.metadata.requires("congrasp") or ():
+        requirement = Requirement(text)
+        marker = requirement.marker
+        if marker is None or any(marker.evaluate({"extra": extra}) for extra in extras):
+            required[requirement.name] = requirement.specifier
+    return required
 
 
 def _gpu() -> Iterator[Finding]:
@@ -242,25 +253,26 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
 
 def _clock() -> Iterator[Finding]:
     """Checks that the date is plausible, and that the monotonic clock runs at the same rate."""
-    began, monotonic = time.time(), time.monotonic()
+    date = time.time()
+    monotonic = time.monotonic()
     time.sleep(0.2)
-    drift = abs((time.time() - began) - (time.monotonic() - monotonic))
-    behind, remedy = began < 1.7e9, f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
-    if behind:
+    drift = abs((time.time() - date) - (time.monotonic() - monotonic))
+    is_behind = date < _LEAST_DATE
+    remedy = f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
+    if is_behind:
         remedy = "it is years behind; set it (timedatectl set-ntp true)"
-    yield Finding(
-        "clock", not behind and drift <= 0.1, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy
-    )
+    fine = not is_behind and drift <= _MAX_DRIFT_S
+    yield Finding("clock", fine, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy)
 
 
 def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
     """Reports the expiry of each certificate."""
     try:
-        found = certificates(folder)
+        listed = certificates(folder)
     except CongraspError as error:
         yield Finding("certificates", False, str(error))
         return
-    for one in found:
+    for one in listed:
         text = (
             f"{one.name}: valid until {one.expires:%Y-%m-%d}"
             if one.days > 0

@@ -27,16 +27,17 @@ GRACE_ALONE = 1.7
 """The same for a command that a signal interrupts and that has no children: it has nothing to
 drain, and its files are complete or absent."""
 CHILD_GRACE = 2.0
-"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must
-end.
+"""Longest time for a child to drain, s. It is shorter than `GRACE`, which leaves this process time
+to kill the child.
 """
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-_PARENT = (
-    "CONGRASP_PARENT"  # environment variable with which a process makes its children end with it
-)
+_PARENT = "CONGRASP_PARENT"
+"""Environment variable with the parent's process number, which makes a child end with it."""
 _POLL = 0.5
-_REAP = 0.5  # deadline for the end of all children, s
+"""Time between two looks at a child, s."""
+_KILL_TIMEOUT_S = 0.5
+"""Deadline for the end of all killed children."""
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
 
@@ -64,14 +65,13 @@ class Stop(threading.Event):
 
 @contextlib.contextmanager
 def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterator[Stop]:
-    """Context with a `Stop` that signals set; outside the main thread, which alone Python signals,
-    nothing sets it.
+    """Yields a Stop that the first signal sets. Python handles signals only in the main thread;
+    elsewhere it is never set.
 
     Python runs handlers between two bytecodes of the main thread, which may be inside a compiler
-    for a minute. The interpreter's wake-up file descriptor is written at once, so a thread that
-    reads it sets the event. It ends the process if it is still running after `grace` seconds, or at
-    once on a second signal, from the user or from the kernel because the parent has ended
-    (`follow_parent`).
+    for a minute. The interpreter writes to its wake-up file descriptor at once, so a thread that
+    reads it sets the event. That thread ends the process after `grace` seconds, or at once on a
+    second signal: from the user, or from the kernel because the parent has ended (`follow_parent`).
 
     Args:
       grace: seconds from the signal to the forced end; by default `GRACE`, or `GRACE_ALONE`.
@@ -84,31 +84,16 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
     reader, writer = socket.socketpair()
     writer.setblocking(False)
 
-    def watch() -> None:
-        number = reader.recv(1)
-        if not number:
-            return
-        stop.signal = number[0]
-        stop.set()
-        seconds = grace or _default_grace(interrupt)
-        ends = time.monotonic() + seconds
-        why = f"it did not end within {seconds:g} s"
-        reader.settimeout(seconds)
-        with contextlib.suppress(TimeoutError):
-            if reader.recv(1):
-                why = "a second signal came"
-            else:  # the block has ended; later code has the remaining time
-                time.sleep(max(0.0, ends - time.monotonic()))
-        _write_last_line(f"The process was {stop.reason} and ended at once: {why}.")
-        _end(stop.exit_code)
-
     def handle(number: int, frame: object) -> None:
         if interrupt:
             raise KeyboardInterrupt
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=watch, daemon=True, name=SIGNALS).start()
+    watch = threading.Thread(
+        target=_watch_signals, args=(reader, stop, grace, interrupt), daemon=True, name=SIGNALS
+    )
+    watch.start()
     try:
         yield stop
     finally:
@@ -124,6 +109,39 @@ def _default_grace(interrupt: bool) -> float:
     return GRACE_ALONE if interrupt and not has_children else GRACE
 
 
+def _watch_signals(
+    reader: socket.socket, stop: Stop, grace: float | None, interrupt: bool
+) -> None:
+    """Sets `stop` at the first signal, and ends the process after some seconds or at the second
+    signal.
+
+    Args:
+      reader: has a byte for each signal; its other end is closed when the context has ended.
+      stop: the event.
+      grace: seconds to the forced end; by default `GRACE`, or `GRACE_ALONE`.
+      interrupt: True if signals also raise KeyboardInterrupt in the main thread.
+    """
+    signals = reader.recv(1)
+    if not signals:
+        return
+    stop.signal = signals[0]
+    stop.set()
+    seconds = grace or _default_grace(interrupt)
+    deadline = time.monotonic() + seconds
+    cause = f"it did not end within {seconds:g} s"
+    reader.settimeout(seconds)
+    try:
+        if reader.recv(1):
+            cause = "a second signal came"
+        else:
+            # The context has ended; later code has the remaining time.
+            time.sleep(max(0.0, deadline - time.monotonic()))
+    except TimeoutError:
+        pass
+    _write_last_line(f"The process was {stop.reason} and ended at once: {cause}.")
+    _end(stop.exit_code)
+
+
 def _write_last_line(text: str) -> None:
     """Writes a line to the standard error, even while another thread holds its lock."""
     with contextlib.suppress(OSError):
@@ -135,12 +153,12 @@ def _end(code: int) -> None:
     children = list(_children)
     for child in children:
         child.kill()
-    wait_for(children, _REAP)
+    wait_for(children, _KILL_TIMEOUT_S)
     os._exit(code)
 
 
 def follow_parent() -> None:
-    """Requests SIGTERM from the kernel for the parent's death, if the parent asked for it (Linux
+    """Makes the kernel send SIGTERM when the parent dies, if the parent requested it (Linux
     only).
     """
     parent = os.environ.pop(_PARENT, None)
@@ -153,14 +171,19 @@ def follow_parent() -> None:
 
 
 def command(*words: object, **options: object) -> list[str]:
-    """Arguments of congrasp: words, then options by name; None and False leave one out, and a tuple
-    has many values.
+    """Returns the arguments of a congrasp command: words, then options by name.
+
+    An option with None or False is left out, True is a flag, and a tuple has several values.
     """
-    arguments = list(map(str, words))
+    arguments = [str(word) for word in words]
     for name, value in options.items():
-        if value is not None and value is not False:
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            arguments += [f"--{name.replace('_', '-')}", *map(str, values)]
+        if value is None or value is False:
+            continue
+        arguments.append(f"--{name.replace('_', '-')}")
+        if isinstance(value, tuple):
+            arguments += [str(each) for each in value]
+        elif value is not True:
+            arguments.append(str(value))
     return arguments
 
 
@@ -177,10 +200,11 @@ class Child:
     deaths: int = 0
     """Deaths since the run last made progress."""
     again_at: float = 0.0
-    begun: int = 0
-    """Bytes of the log when the process started."""
+    """Time of its next start (`time.monotonic`) after it died; 0 while none is planned."""
+    log_start: int = 0
+    """Size of the log when the process started, bytes."""
     memory_kills: int = 0
-    """`memory_kills` when the process started."""
+    """Processes that the kernel had killed for memory when this one started."""
 
     @property
     def program(self) -> list[str]:
@@ -193,16 +217,16 @@ class Child:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
         with its parent.
         """
+        additions = {**self.environment, _PARENT: str(os.getpid())}
+        environment = child_environment(**additions)
         # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
         # frames.
-        jax = {"JAX_TRACEBACK_FILTERING": "off"}
-        own = {**self.environment, _PARENT: str(os.getpid())}
-        environment = {**jax, **child_environment(**own)}
+        environment.setdefault("JAX_TRACEBACK_FILTERING", "off")
         self.memory_kills = _memory_kills()
         with os_errors_as(f"{self.log} cannot be opened"):
             opened = open_to_append(self.log)
         with opened as log:
-            self.begun = log.seek(0, os.SEEK_END)
+            self.log_start = log.seek(0, os.SEEK_END)
             self.process = subprocess.Popen(
                 self.program,
                 stdout=log,
@@ -225,17 +249,18 @@ class Child:
 
     def cause(self) -> str:
         """The cause of its end by its log, or else the last line, as a sentence."""
-        reason = causes.cause_in(self._output()) or self.last_line()
-        return f"{reason.rstrip('. ')}."
+        cause = causes.cause_in(self._output()) or self.last_line()
+        return f"{cause.rstrip('. ')}."
 
     def death(self) -> str:
         """Its end in a sentence: the signal that killed it or its exit code, and the cause."""
+        code = self.code or 0
         kernel_killed = _memory_kills() > self.memory_kills
-        return causes.end_of(self.name, self.code or 0, self._output(), kernel_killed=kernel_killed)
+        return causes.end_of(self.name, code, self._output(), kernel_killed=kernel_killed)
 
     def _output(self) -> str:
         """Its log since it started, or the end of it."""
-        return causes.read_end(self.log, self.begun)
+        return causes.read_end(self.log, self.log_start)
 
 
 def _memory_kills() -> int:
@@ -283,9 +308,10 @@ def run_child(
     began = time.monotonic()
     try:
         child.start()
-        while (code := child.code) is None and time.monotonic() - began < patience:
+        while child.code is None and time.monotonic() - began < patience:
             progress(child.last_line())
             time.sleep(_POLL)
+        code = child.code
     finally:
         end_all([child])
     return code

@@ -48,7 +48,8 @@ class Lines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Returns one line, followed by the trace of an error."""
         record.levelname = record.levelname.lower()
-        record.msg, record.args = printable(record.getMessage()), ()
+        record.msg = printable(record.getMessage())
+        record.args = ()
         return super().format(record)
 
 
@@ -60,12 +61,12 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     A full disk loses lines, but does not end the process. After an exception a JSON log continues
     until `log_error`, for the lines of outer contexts.
     """
-    root, handler = logging.getLogger(), logging.StreamHandler(sys.stdout)
-    handler.setFormatter(
-        JsonLines(role=role, id=id, run=run)
-        if form == "json"
-        else Lines("%(levelname)s: %(message)s")
-    )
+    root = logging.getLogger()
+    handler = logging.StreamHandler(sys.stdout)
+    formatter: logging.Formatter = Lines("%(levelname)s: %(message)s")
+    if form == "json":
+        formatter = JsonLines(role=role, id=id, run=run)
+    handler.setFormatter(formatter)
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
     _logger.setLevel(logging.INFO)
@@ -125,7 +126,8 @@ def announced(
       first: seconds until the first line.
       every: seconds between two lines.
     """
-    done, began = threading.Event(), time.monotonic()
+    done = threading.Event()
+    began = time.monotonic()
 
     def tell() -> None:
         """Prints until it is done."""

@@ -29,8 +29,10 @@ _SUMS = {
     "accepted": ("consumed", "dropped", "queued"),
 }
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
-_ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
-_SHOWN = 100  # most processes in a table
+_TEXT_COLUMNS = ("role", "name", "incarnation")
+_NUMBER_COLUMNS = ("version", "lag", "rollouts", "rollouts/s", "steps/s")
+_MAX_ROWS = 100
+"""Most processes in a table."""
 _RUN = "quickstart"
 
 
@@ -40,8 +42,9 @@ def ask(transport: Transport, run: str) -> dict[str, Any]:
     Raises:
       TransportError: no learner of this run responds.
     """
-    found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT).meta)
-    return {**found, "warnings": warnings(found)}
+    reply = transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT)
+    status = dict(reply.meta)
+    return {**status, "warnings": warnings(status)}
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
@@ -57,59 +60,90 @@ def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, A
 
 def warnings(status: Mapping[str, Any]) -> list[str]:
     """Inconsistencies of a learner's status, and checkpoints that fail, one line each."""
-    counters, queue = status["counters"], status["queue"]
-    found = []
+    counters = status["counters"]
+    queue = status["queue"]
+    texts: list[str] = []
     for total, parts in _SUMS.items():
         if counters[total] != sum(counters[part] for part in parts):
             terms = " + ".join(f"{part} {counters[part]}" for part in parts)
-            found.append(
+            texts.append(
                 f"The counters are inconsistent: {total} {counters[total]} is not {terms}."
             )
     if counters["queued"] != queue["length"]:
-        found.append(
+        texts.append(
             f"{counters['queued']} rollouts are counted as queued, but the queue holds "
             f"{queue['length']}."
         )
-    # A learner of an earlier version tells none
-    return [
-        *found,
-        *filter(None, [status.get("trouble")]),
-    ]
+    trouble = status.get("trouble")  # a learner of an earlier version has no such entry
+    if trouble:
+        texts.append(trouble)
+    return texts
 
 
 def tables(status: Mapping[str, Any]) -> Group:
     """Formats the status for a terminal."""
-    ended = ", finished" if status["finished"] else ""
-    roles = Table(
-        title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}"
-    )
-    refused = any(role.get("refused") for role in status["roles"])
-    for column in (*_ROLE, "refused") if refused else _ROLE:
-        roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
-    for role in status["roles"][:_SHOWN]:
-        version = status["version"] if role["role"] == "learner" else role.get("version", "")
-        rates = (
-            f"{role[rate]:.2f}" if rate in role else ""
-            for rate in ("rollouts_per_second", "steps_per_second")
-        )
-        counts = (version, role.get("lag", ""), role.get("rollouts", ""), *rates)
-        who = (Text(ascii(role[name])[1:70].rstrip("'")) for name in ("role", "id", "incarnation"))
-        roles.add_row(*who, *map(str, counts), *([str(role.get("refused", ""))] if refused else []))
-    counters = Table(title="Counters: tickets and rollouts")
-    counters.add_column("count")
-    counters.add_column("number", justify="right")
-    counters.add_column("which is")
-    for name, value in status["counters"].items():
-        counters.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
-    rates, queue = status["rates"], status["queue"]
+    rates = status["rates"]
+    queue = status["queue"]
     line = (
         f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
         f"{queue['length']} rollout(s) of at most {queue['limit']} waiting"
     )
-    more = len(status["roles"][_SHOWN:]) + status["unlisted"]
-    others = [Text(f"{more} more live process(es).")] if more else []
-    wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
-    return Group(roles, *others, counters, Text(line), *wrong)
+    parts: list[Table | Text] = [_roles_table(status)]
+    more = len(status["roles"][_MAX_ROWS:]) + status["unlisted"]
+    if more:
+        parts.append(Text(f"{more} more live process(es)."))
+    parts.append(_counters_table(status["counters"]))
+    parts.append(Text(line))
+    for warning in status["warnings"]:
+        parts.append(Text(f"Warning: {warning}", style="yellow"))
+    return Group(*parts)
+
+
+def _roles_table(status: Mapping[str, Any]) -> Table:
+    """Table of the processes, with a column of refused rollouts if there are any."""
+    ended = ", finished" if status["finished"] else ""
+    table = Table(
+        title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}"
+    )
+    for column in _TEXT_COLUMNS:
+        table.add_column(column)
+    for column in _NUMBER_COLUMNS:
+        table.add_column(column, justify="right")
+    some_refused = any(role.get("refused") for role in status["roles"])
+    if some_refused:
+        table.add_column("refused", justify="right")
+    for role in status["roles"][:_MAX_ROWS]:
+        names = [_cell(role[name]) for name in ("role", "id", "incarnation")]
+        numbers = _role_numbers(role, status["version"])
+        if some_refused:
+            numbers.append(str(role.get("refused", "")))
+        table.add_row(*names, *numbers)
+    return table
+
+
+def _cell(name: str) -> Text:
+    """Cell with the beginning of a name in ASCII, which strangers choose."""
+    return Text(ascii(name)[1:70].rstrip("'"))
+
+
+def _role_numbers(role: Mapping[str, Any], learner_version: int) -> list[str]:
+    """Cells of a process's version, lag, rollouts and rates; empty where it has none."""
+    version = learner_version if role["role"] == "learner" else role.get("version", "")
+    cells = [str(version), str(role.get("lag", "")), str(role.get("rollouts", ""))]
+    for rate in ("rollouts_per_second", "steps_per_second"):
+        cells.append(f"{role[rate]:.2f}" if rate in role else "")
+    return cells
+
+
+def _counters_table(counters: Mapping[str, int]) -> Table:
+    """Table of the counters, with the terms of those that are sums."""
+    table = Table(title="Counters: tickets and rollouts")
+    table.add_column("count")
+    table.add_column("number", justify="right")
+    table.add_column("which is")
+    for name, value in counters.items():
+        table.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
+    return table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,27 +178,33 @@ class Status:
 
     def __call__(self) -> int:
         """Prints the status."""
-        connect, run = (
-            (self.connect, self.run) if self.run_dir is None else self._of_folder(self.run_dir)
-        )
+        connect = self.connect
+        run = self.run
+        if self.run_dir is not None:
+            connect, run = self._of_folder(self.run_dir)
         with urls.connect(connect, "observer", certs=self.certs, run=run) as transport:
-            found = ask(transport, run)
-            if not self.watch:
-                if self.json:
-                    print(json.dumps(found))
-                else:
-                    Console(markup=False).print(tables(found))
+            status = ask(transport, run)
+            if self.watch:
+                self._watch(transport, run, status)
             elif self.json:
-                for now in follow(transport, run, self.every):
-                    print(json.dumps(now), flush=True)
+                print(json.dumps(status))
             else:
-                with Live(tables(found), console=Console(markup=False), auto_refresh=False) as live:
-                    for now in follow(transport, run, self.every):
-                        live.update(
-                            tables(now) if now else f"The learner of '{run}' is disconnected …",
-                            refresh=True,
-                        )
-            return 1 if found["warnings"] else 0
+                Console(markup=False).print(tables(status))
+            return 1 if status["warnings"] else 0
+
+    def _watch(self, transport: Transport, run: str, status: dict[str, Any]) -> None:
+        """Prints the status periodically, beginning with this one."""
+        if self.json:
+            for newest in follow(transport, run, self.every):
+                print(json.dumps(newest), flush=True)
+            return
+        console = Console(markup=False)
+        with Live(tables(status), console=console, auto_refresh=False) as live:
+            for newest in follow(transport, run, self.every):
+                content: Group | str = f"The learner of '{run}' is disconnected …"
+                if newest is not None:
+                    content = tables(newest)
+                live.update(content, refresh=True)
 
     def _of_folder(self, run_dir: pathlib.Path) -> tuple[str, str]:
         """Endpoint and name of the run of a folder."""
@@ -175,7 +215,8 @@ class Status:
                 f"The folder {run_dir} is in place of --connect and --run.",
                 "Give either the folder or these.",
             )
-        run, connect = open_run(run_dir).name, learner_url(run_dir)
+        run = open_run(run_dir).name
+        connect = learner_url(run_dir)
         if not connect:
             raise CongraspError(
                 f"No learner is running in {run_dir}.",

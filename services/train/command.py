@@ -39,9 +39,10 @@ from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch
 from congrasp.services.serve.load import example_episode, one_answer, serving
-from congrasp.services.train.learn import learn
+from congrasp.services.train.launch import Launch, Plan
+from congrasp.services.train.learn import InnerActor, Monitoring, learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import Launch, Plan, ProcessDied, train
+from congrasp.services.train.processes import ProcessDied, train
 from congrasp.services.train.start import (
     Folder,
     can_resume,
@@ -56,8 +57,10 @@ EPISODE = "episode.png"
 RUNS = "runs"
 """Folder of runs without --run-dir."""
 _EVALUATION_OBJECTS = 12
-_LINE_SECONDS = 10.0
-_SPACE = 64 << 10  # bytes below which a disk counts as full
+_LINE_INTERVAL_S = 10.0
+"""Time between two lines of progress without a terminal."""
+_LEAST_FREE_BYTES = 64 << 10
+"""Free space below which a disk counts as full."""
 console = Console(highlight=False, soft_wrap=True)
 
 
@@ -114,12 +117,14 @@ def _train(
             run_dir,
             config,
             wire=None,
-            inside=plan.physics,
+            inside=InnerActor(plan.physics),
             stop=stop,
-            writers=plan.launch.metric_writers,
-            watch=Watch(metrics_port=plan.launch.metrics_port),
-            on_update=progress.update,
-            on_event=lambda level, text: _warn(text) if level == "error" else None,
+            monitoring=Monitoring(
+                on_update=progress.update,
+                on_event=_warn_of_error,
+                writers=plan.launch.learner.metric_writers,
+                watch=Watch(metrics_port=plan.launch.metrics_port),
+            ),
         )
         return
     with _full_disk_named(run_dir):
@@ -159,6 +164,12 @@ def _warn(text: str) -> None:
     console.print(f"  {text}", style="yellow", markup=False)
 
 
+def _warn_of_error(level: str, text: str) -> None:
+    """Prints an event of the learner that is an error."""
+    if level == "error":
+        _warn(text)
+
+
 def _prepare(
     run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool
 ) -> RunConfig:
@@ -188,7 +199,7 @@ def _prepare(
 
 
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
-    """Prints a summary of the run, and in what it is easier than the full task."""
+    """Prints the run's summary and its simplifications."""
     ranks = plan.launch.ranks
     steps = ranks * config.rollout_steps * config.environments * config.rollouts_per_update
     console.print(
@@ -212,7 +223,7 @@ def _full_disk_named(run_dir: pathlib.Path) -> Iterator[None]:
     try:
         yield
     except CongraspError:
-        if shutil.disk_usage(run_dir).free >= _SPACE:
+        if shutil.disk_usage(run_dir).free >= _LEAST_FREE_BYTES:
             raise
         remedy = "Free space and start again."
         if can_resume(run_dir):
@@ -248,7 +259,8 @@ class _Progress:
         self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
-        self._line = self._printed = ""
+        self._line = ""
+        self._printed = ""
         self._live = console.status("compiling, and filling the first batch")  # of a terminal
 
     def __enter__(self) -> Self:
@@ -286,7 +298,7 @@ class _Progress:
             )
         # A text would be cropped, since the console does not wrap
         self._live.update(Padding(self._line, 0))
-        if not console.is_terminal and now - self._last >= _LINE_SECONDS:
+        if not console.is_terminal and now - self._last >= _LINE_INTERVAL_S:
             self._last = now
             self._print()
 
@@ -300,18 +312,24 @@ class _Progress:
         """Formats the metrics as one line; the time left is estimated from the first update on,
         without compilation.
         """
-        values, updates = status["values"], self._config.updates
+        values = status["values"]
+        updates = self._config.updates
         update = status["update"]
-        self._first = self._first or (now, update)
-        pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
-        left = int((updates - update) / pace) if pace > 0 else -1
+        if self._first is None:
+            self._first = (now, update)
+        time_of_first, first = self._first
+        pace = (update - first) / max(now - time_of_first, 1e-6)
+        left = "?"
+        if pace > 0:
+            minutes, seconds = divmod(int((updates - update) / pace), 60)
+            left = f"{minutes}:{seconds:02d}"
         return (
             f"update {update:4.0f}/{updates}  {values['steps_per_second']:6.0f} steps/s  "
             f"version {status['version']}  lag {values.get('staleness_mean', 0.0):.1f}  "
             f"success {100 * values.get('episode/success', float('nan')):5.1f} %  "
             f"links {values.get('episode/links_at_removal', float('nan')):4.1f}  "
             f"return {values.get('episode/return', float('nan')):6.1f}  actors {status['actors']}  "
-            f"left {f'{left // 60}:{left % 60:02d}' if left >= 0 else '?'}"
+            f"left {left}"
         )
 
 
@@ -344,10 +362,8 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
     heading = Experiment(
         policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False
     )
-    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (
-        endpoint,
-        _,
-    ):  # starts meanwhile
+    # The server starts while the episodes run.
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         (result,) = heading.run([Variation()], keep=True)
         save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
         row = result.row

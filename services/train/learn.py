@@ -9,6 +9,7 @@ import pathlib
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 from congrasp.actors.physics import prepare_physics
 from congrasp.actors.process import ActorOptions, run_actor
@@ -24,33 +25,54 @@ from congrasp.common.transport.memory import PairTransport
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
-from congrasp.learner.process import run_learner
+from congrasp.learner.process import Notify, Outputs, run_learner
 from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
 from congrasp.services.ops.lifetime import GRACE
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.status import ask
 from congrasp.services.record.recorder import recorded
-from congrasp.services.train.processes import engine_of
+from congrasp.services.train.accelerators import engine_of
 
-_START_SECONDS = 0.5
-"""Head start of the learner, which must listen first, over the actor, s."""
+_HEAD_START_S = 0.5
+"""Head start of the learner, which must listen first, over the actor."""
+_MAX_ROLLOUT_S = 60.0
+"""Longest rollout of a first update: a process that exits within one would abort."""
 
 
-def learn(  # noqa: PLR0913
+class InnerActor(NamedTuple):
+    """An actor in the learner's process."""
+
+    physics: PhysicsName
+    """Its engine."""
+    end_timeout: float = GRACE
+    """Deadline for its end, s."""
+
+
+class Monitoring(NamedTuple):
+    """Records and callbacks of a learner."""
+
+    on_update: Callable[[dict[str, float]], None] = lambda values: None
+    """See `learner.process.Outputs`."""
+    on_event: Notify = lambda level, text: None
+    """See `learner.process.Outputs`."""
+    writers: Sequence[MetricWriter] = ()
+    """Metric writers of rank 0."""
+    watch: Watch = Watch()
+    """Endpoint of the metrics."""
+    audit: bool = True
+    """Writes the journal, unless an actor inside keeps its rollouts on the device."""
+
+
+def learn(
     run_dir: pathlib.Path,
     config: RunConfig,
     *,
     wire: Transport | None,
-    inside: PhysicsName | None,
+    inside: InnerActor | None,
     stop: threading.Event,
     ranks: Ranks | None = None,
-    on_update: Callable[[dict[str, float]], None] = lambda values: None,
-    on_event: Callable[[str, str], None] = lambda level, text: None,
-    writers: Sequence[MetricWriter] = (),
-    watch: Watch = Watch(),  # noqa: B008
-    audit: bool = True,
-    grace: float = GRACE,
+    monitoring: Monitoring = Monitoring(),  # noqa: B008
 ) -> None:
     """Runs a learner from the newest checkpoint, if there is one, until it is finished or stopped.
 
@@ -58,36 +80,37 @@ def learn(  # noqa: PLR0913
     would gain nothing. Updates are then on-policy, regardless of `max_staleness`.
 
     Args:
-      run_dir: see `run_learner`, also for `config`, `ranks`, `on_update` and `on_event`.
+      run_dir: see `run_learner`, also for `config` and `ranks`.
       wire: a listening transport for rollouts and status queries of others; None only with an actor
         inside.
-      inside: engine of an actor in this process, over the in-memory transport; None for no actor.
+      inside: an actor in this process, over the in-memory transport; None for no actor.
       stop: ends training.
-      writers: metric writers of rank 0.
-      watch: endpoint of the metrics.
-      audit: writes the journal, unless an actor inside keeps its rollouts on the device.
-      grace: deadline for the end of the actor inside, s.
+      monitoring: records and callbacks.
     """
-    rank, transport = 0 if ranks is None else ranks.rank, wire
+    rank = 0 if ranks is None else ranks.rank
+    transport = wire
+    memory_url = f"memory/{run_dir}"
     with contextlib.ExitStack() as stack:
         if inside is not None:
             prepare_workers(config.objects.count)
-            prepare_physics(inside, get_hand(config.task.hand), config.task)
+            prepare_physics(inside.physics, get_hand(config.task.hand), config.task)
             config = dataclasses.replace(config, max_staleness=0)
-            memory = stack.enter_context(urls.listen(url := f"memory/{run_dir}", "learner"))
+            memory = stack.enter_context(urls.listen(memory_url, "learner"))
             transport = memory if wire is None else PairTransport(memory, wire)
         assert transport is not None, "the learner must be reachable"
         metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
-        def updated(values: dict[str, float]) -> None:
+        def on_update(values: dict[str, float]) -> None:
             metrics.update(values)
-            on_update(values)
+            monitoring.on_update(values)
 
-        stack.enter_context(watch.exposed(metrics))
+        stack.enter_context(monitoring.watch.exposed(metrics))
         if inside is not None:
-            stack.enter_context(
-                _actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace)
-            )
+            name = f"actor-{rank}"
+            stack.enter_context(_actor_thread(memory_url, config, run_dir, name, inside, stop))
+        recorder = None
+        if rank == 0:
+            recorder = recorded(transport, config, run_dir, run_dir / LOGS, monitoring.writers)
         run_learner(
             run_dir,
             config,
@@ -95,13 +118,13 @@ def learn(  # noqa: PLR0913
             stop_event=stop,
             resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
-            audit=audit,
-            on_host=inside is None,
-            recorder=recorded(transport, config, run_dir, run_dir / LOGS, writers)
-            if rank == 0
-            else None,
-            on_update=updated,
-            on_event=on_event,
+            outputs=Outputs(
+                audit=monitoring.audit,
+                on_host=inside is None,
+                recorder=recorder,
+                on_update=on_update,
+                on_event=monitoring.on_event,
+            ),
         )
 
 
@@ -118,9 +141,8 @@ def _actor_thread(
     config: RunConfig,
     run_dir: pathlib.Path,
     name: str,
-    physics: PhysicsName,
+    inside: InnerActor,
     stop: threading.Event,
-    grace: float,
 ) -> Iterator[None]:
     """Context with an actor in a separate thread; a failure sets `stop`, and its error is
     raised.
@@ -134,7 +156,7 @@ def _actor_thread(
                 options = ActorOptions(
                     run=config.name,
                     actor=name,
-                    physics=physics,
+                    physics=inside.physics,
                     threads=cores(),
                     patience=ROUND_SECONDS,
                     references=references_file(run_dir, name),
@@ -145,7 +167,7 @@ def _actor_thread(
             stop.set()
 
     thread = threading.Thread(target=act, name="actor", daemon=True)
-    start = threading.Timer(_START_SECONDS, thread.start)
+    start = threading.Timer(_HEAD_START_S, thread.start)
     start.start()
     try:
         yield
@@ -153,13 +175,9 @@ def _actor_thread(
         ended.set()
         start.cancel()
         if thread.ident is not None:
-            thread.join(grace)
+            thread.join(inside.end_timeout)
     if failures:
         raise failures[0]
-
-
-_GRACE = 60.0
-"""Seconds for an actor within a rollout: a process that exits meanwhile would abort."""
 
 
 def until_first_update(
@@ -174,7 +192,7 @@ def until_first_update(
       report: called after the first update, before shutdown.
     """
 
-    def updated(values: dict[str, float]) -> None:
+    def on_update(values: dict[str, float]) -> None:
         if not stop.is_set():
             report()
             stop.set()
@@ -187,8 +205,7 @@ def until_first_update(
             run_dir,
             config,
             wire=None,
-            inside=engine_of(physics, False),
+            inside=InnerActor(engine_of(physics, False), end_timeout=_MAX_ROLLOUT_S),
             stop=stop,
-            on_update=updated,
-            grace=_GRACE,
+            monitoring=Monitoring(on_update=on_update),
         )

@@ -8,7 +8,8 @@ are in one folder, and repeating the command runs only the missing stages.
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable, Mapping, Sequence
 
 from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.hands.files import hand_text
@@ -21,16 +22,26 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
 from congrasp.services.assets.hands.findings import Finding, read_findings
 from congrasp.services.ops.lifetime import Child, command, run_child
+from congrasp.services.train.background import (
+    finished_policy,
+    train_in_background,
+    training_seconds,
+)
 from congrasp.services.train.presets import FULL, get_preset
-from congrasp.services.train.processes import train_in_background, trained, training_seconds
 
-HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
+HAND = "hand.json"
+CHECK = "check.json"
+REPORT = "report.html"
 _ROWS = "report.json"
-_LARGEST = 1 << 24  # limit of a file of rows in bytes
-_PATIENCE = 1800.0  # deadline of a check or a report, s
-_LINE_SECONDS = 10.0
-_UPDATES = 560  # updates of the full task: with check and report, some 15 minutes of one H200
-_RATE = 350_000  # trained steps per second of one H200
+_MAX_REPORT_BYTES = 1 << 24
+_STAGE_TIMEOUT_S = 1800.0
+"""Deadline of a check or a report."""
+_LINE_INTERVAL_S = 10.0
+"""Time between two lines about the training's progress."""
+_FULL_TASK_UPDATES = 560
+"""With check and report, some 15 minutes of one H200."""
+_H200_STEPS_PER_S = 350_000
+"""Trained steps per second of one H200."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +90,8 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     _begin(request)
     _check(request, note)
     if not request.full:
-        note(_what_a_gpu_would_take(request))
-    policy = trained(request.run_dir)
+        note(_short_training_note(request))
+    policy = finished_policy(request.run_dir)
     if policy is None:
         policy = _train(request, note)
     _install(request, policy, note)
@@ -92,7 +103,8 @@ def _begin(request: Request) -> None:
     """Creates the folder for this hand; raises a CongraspError if it holds the training of
     another.
     """
-    file, text = request.out / HAND, hand_text(request.hand).encode()
+    file = request.out / HAND
+    text = hand_text(request.hand).encode()
     if file.exists() and file.read_bytes() == text:
         return
     if any(request.out.glob(f"*/{CONFIG_FILE}")):
@@ -106,114 +118,132 @@ def _begin(request: Request) -> None:
 
 
 def _check(request: Request, note: Callable[[str], None]) -> None:
-    """Runs the self-check, unless it exists."""
+    """Runs the self-check, unless its result exists; raises a CongraspError if the hand fails it.
+
+    Its command ends with 0 or, for a hand that fails, with 1.
+    """
     file = request.out / CHECK
+    picture = file.with_suffix(".png")
     if not file.exists():
-        arguments = command(
-            "hands", "check", request.reference, json=file, png=file.with_suffix(".png")
-        )
-        _run(request, "check", arguments, (0, 1), {"JAX_PLATFORMS": "cpu"})
+        arguments = command("hands", "check", request.reference, json=file, png=picture)
+        _run(request, "check", arguments, exit_codes=(0, 1), environment={"JAX_PLATFORMS": "cpu"})
     findings: list[Finding] = read_findings(file)
     for finding in findings:
         note(str(finding))
     if any(finding.verdict == "failed" for finding in findings) and not request.anyway:
         raise CongraspError(
-            f"The hand '{request.hand.name}' failed its self-check ({file.with_suffix('.png')}).",
+            f"The hand '{request.hand.name}' failed its self-check ({picture}).",
             "Repair its file as the lines say, or pass --anyway to train it regardless.",
         )
 
 
 def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     """Runs the training, or resumes it."""
-    chosen = command(preset=FULL if request.full else "quickstart", hand=request.reference)
+    preset = FULL if request.full else "quickstart"
+    new_run = command(preset=preset, hand=request.reference)
     log = request.run_dir.with_name(f"{request.run_dir.name}.log")
     note(f"Training {request.hand.name} in {request.run_dir} (log: {log})")
-    said, told = time.monotonic(), ""
+    noted_at = time.monotonic()
+    noted_line = ""
 
     def progress(line: str) -> None:
-        """Notes a line periodically."""
-        nonlocal said, told
-        if line != told and time.monotonic() - said > _LINE_SECONDS:
-            said, told = time.monotonic(), line
+        """Notes a new line periodically."""
+        nonlocal noted_at, noted_line
+        if line != noted_line and time.monotonic() - noted_at > _LINE_INTERVAL_S:
+            noted_at = time.monotonic()
+            noted_line = line
             note(f"  {line}")
 
-    options = [
-        *(command(physics=request.physics, updates=_UPDATES) if request.full else []),
-        *request.options,
-    ]
+    options = list(request.options)
+    if request.full:
+        options = command(physics=request.physics, updates=_FULL_TASK_UPDATES) + options
     train_in_background(
-        request.run_dir, chosen, options, patience=request.patience, progress=progress
+        request.run_dir, new_run, options, patience=request.patience, progress=progress
     )
     return request.run_dir / POLICY_FILE
 
 
 def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
     """Installs the policy for `--hand`, unless there is one of this hand with more experience."""
-    hand, own = request.hand, own_policy_file(request.hand.name)
+    hand = request.hand
+    installed_file = own_policy_file(hand.name)
     if not hand.text and hand.name in pretrained_hands():
         note(f"--hand {hand.name} remains the package's policy; this one is --policy {policy}.")
         return
-    if own.exists():
-        there, fresh = bundles.load(own), bundles.load(policy)
-        if there.spec.hand == hand.reference and there.transitions > fresh.transitions:
+    if installed_file.exists():
+        installed = bundles.load(installed_file)
+        trained = bundles.load(policy)
+        has_more_training = installed.transitions > trained.transitions
+        if installed.spec.hand == hand.reference and has_more_training:
             note(
-                f"{own} has more training ({there.transitions:,} steps) and remains; this one is "
-                f"--policy {policy}."
+                f"{installed_file} has more training ({installed.transitions:,} steps) and "
+                f"remains; this one is --policy {policy}."
             )
             return
-    write_atomically(own, policy.read_bytes())
-    note(f"The policy of --hand {hand.name} is {own}.")
+    write_atomically(installed_file, policy.read_bytes())
+    note(f"The policy of --hand {hand.name} is {installed_file}.")
 
 
 def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
     """Runs evaluation and report, unless they exist for this policy."""
-    rows, page = request.out / _ROWS, request.out / REPORT
-    about = {
+    rows = request.out / _ROWS
+    page = request.out / REPORT
+    measurement = {
         "content": bundles.content_hash(policy.read_bytes()),
         "episodes": request.episodes,
         "pool": request.pool,
     }
-    if not (page.exists() and rows.exists() and about.items() <= read_json(rows, _LARGEST).items()):
+    is_current = False
+    if page.exists() and rows.exists():
+        is_current = measurement.items() <= read_json(rows, _MAX_REPORT_BYTES).items()
+    if not is_current:
         note(f"Evaluating {request.episodes} episodes of each constraint …")
-        measured = {"physics": request.physics, "episodes": request.episodes, "pool": request.pool}
-        check = request.out / CHECK
-        arguments = command("report", request.run_dir, out=page, json=rows, check=check, **measured)
-        _run(request, "report", arguments, (0,), {})
-    for row in read_json(rows, _LARGEST)["rows"]:
+        arguments = command(
+            "report",
+            request.run_dir,
+            out=page,
+            json=rows,
+            check=request.out / CHECK,
+            physics=request.physics,
+            episodes=request.episodes,
+            pool=request.pool,
+        )
+        _run(request, "report", arguments, exit_codes=(0,))
+    for row in read_json(rows, _MAX_REPORT_BYTES)["rows"]:
         note(f"  {row['constraint']:22s} success {100 * row['success']:5.1f} %")
-    took = training_seconds(request.run_dir)
-    note(f"The report is {page}" + (f"; the training took {took / 60:.1f} min." if took else "."))
+    seconds = training_seconds(request.run_dir)
+    duration = f"; the training took {seconds / 60:.1f} min" if seconds else ""
+    note(f"The report is {page}{duration}.")
 
 
 def _run(
     request: Request,
     name: str,
     arguments: list[str],
-    fine: tuple[int, ...],
-    environment: dict[str, str],
+    *,
+    exit_codes: tuple[int, ...],
+    environment: Mapping[str, str] = types.MappingProxyType({}),
 ) -> None:
     """Runs a stage; raises a CongraspError unless it ends with one of the exit codes."""
-    child = Child(name, arguments, request.out / f"{name}.log", environment)
-    code = run_child(child, _PATIENCE)
-    if code not in fine:
-        why = (
-            f"was ended after {_PATIENCE / 60:.0f} min"
-            if code is None
-            else f"failed: {child.cause()}"
-        )
-        raise CongraspError(
-            f"The {name} of '{request.hand.name}' {why}", f"Its log is {child.log}."
-        )
+    child = Child(name, arguments, request.out / f"{name}.log", dict(environment))
+    code = run_child(child, _STAGE_TIMEOUT_S)
+    if code in exit_codes:
+        return
+    if code is None:
+        end = f"was ended after {_STAGE_TIMEOUT_S / 60:.0f} min"
+    else:
+        end = f"failed: {child.cause()}"
+    raise CongraspError(f"The {name} of '{request.hand.name}' {end}", f"Its log is {child.log}.")
 
 
-def _what_a_gpu_would_take(request: Request) -> str:
-    """Describes what the short training omits."""
+def _short_training_note(request: Request) -> str:
+    """Text about the short training, and about the full one on a GPU."""
     full = get_preset(FULL, request.reference)
-    steps = _UPDATES * full.environments * full.rollout_steps * full.rollouts_per_update
+    steps = _FULL_TASK_UPDATES * full.environments * full.rollout_steps * full.rollouts_per_update
+    minutes = steps / _H200_STEPS_PER_S / 60
     return (
         "This machine has no GPU: a short training of an easier task follows, whose policy grasps "
-        "from above at "
-        f"best. On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, "
-        f"about "
-        f"{steps / _RATE / 60:.0f} minutes of one H200 and five minutes for start and report."
+        "from above at best. On a GPU the same command trains the full task: "
+        f"{steps / 1e6:.0f} million steps, about {minutes:.0f} minutes of one H200 and five "
+        "minutes for start and report."
     )

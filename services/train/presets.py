@@ -1,5 +1,4 @@
-"""Named configurations: the full task for any hand, students with the sensors of a robot, and short
-runs.
+"""Named configurations: the full task for any hand, and short runs.
 
 Differences between hands in the recipe of the full task are computed from the hand.
 
@@ -25,7 +24,6 @@ Everything else is the same for all hands.
 """
 
 import dataclasses
-import pathlib
 from typing import Any
 
 from congrasp.common.config import (
@@ -39,21 +37,23 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import tip_forces
 from congrasp.common.hands.spec import Hand
-from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.pretrained import named_policy
-from congrasp.common.task.config import ControlConfig, RewardWeights, SensingConfig, TaskConfig
+from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import optional
-from congrasp.common.task.methods import CAMERA, STUDENT, with_method
 
+FULL = "full"
+"""Preset of the full task for the hand of the command line, the human hand by default."""
+FULL_FOR = ("human", "allegro", "sharpa")
+"""Hands whose names are presets equal to `FULL`."""
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part, included twice in training."""
-# Of the human hand: N, weight, share of the episodes
-_FORCE, _HEADING, _AFFORDANCE = (
-    5.0,
-    12.0,
-    0.6,
-)
-_STRONG = 0.3  # share of its fingertips' strength required of a strong hand
+_FORCE = 5.0
+"""`force_max` of the human hand, N."""
+_HEADING = 12.0
+"""Weight `heading_position` of the human hand."""
+_AFFORDANCE = 0.6
+"""Share of the human hand's episodes with an affordance."""
+_STRONG = 0.3
+"""Share of its fingertips' strength that the task requires of a strong hand."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +88,7 @@ def rules(hand: Hand) -> Rules:
 
 def recipe(hand: Hand) -> RunConfig:
     """Returns the paper's full task for a hand, sized for a GPU."""
-    own = rules(hand)
+    of_hand = rules(hand)
     return RunConfig(
         name=hand.name,
         environments=32_768,
@@ -96,7 +96,7 @@ def recipe(hand: Hand) -> RunConfig:
         updates=800,
         task=TaskConfig(
             hand=hand.reference,
-            p_affordance=own.p_affordance,
+            p_affordance=of_hand.p_affordance,
             p_pose=0.35,
             p_trajectory=0.35,
             p_fingers=0.2,
@@ -109,7 +109,7 @@ def recipe(hand: Hand) -> RunConfig:
             disturbed_references=0.5,
             mass_range=(0.6, 2.4),
             friction_range=(0.6, 1.2),
-            reward=RewardWeights(force_max=own.force_max),
+            reward=RewardWeights(force_max=of_hand.force_max),
         ),
         # Grasps first, then the precision of constraints: with the second weights from the
         # beginning, trajectories are not learnt.
@@ -117,21 +117,21 @@ def recipe(hand: Hand) -> RunConfig:
             ramp=(80, 160),
             reward=RewardWeights(
                 force=0.8,
-                force_max=own.force_max,
+                force_max=of_hand.force_max,
                 force_excess=0.02,
                 object_position=80.0,
                 object_rotation=6.0,
                 drop=5.0,
                 heading_direction=2.5,
-                heading_position=own.heading_position,
+                heading_position=of_hand.heading_position,
                 pose_finger=0.15,
                 pose_link=8.0,
                 pose_wrist_position=150.0,
                 pose_wrist_rotation=3.0,
                 trajectory_position=500.0,
                 trajectory_rotation=18.0,
-                affordance_distance=own.affordance_distance,
-                affordance_force=own.affordance_force,
+                affordance_distance=of_hand.affordance_distance,
+                affordance_force=of_hand.affordance_force,
             ),
         ),
         objects=ObjectsConfig(
@@ -142,10 +142,6 @@ def recipe(hand: Hand) -> RunConfig:
     )
 
 
-FULL = "full"
-"""Preset of the full task for the hand of the command line, the human hand by default."""
-FULL_FOR = ("human", "allegro", "sharpa")
-"""Hands whose names are presets equal to `FULL`."""
 QUICKSTART = RunConfig(
     name="quickstart",
     environments=64,
@@ -188,7 +184,8 @@ def easier(config: RunConfig) -> list[str]:
     """Phrases for the simplifications of a run relative to the full task; empty if there are
     none.
     """
-    task, full = config.task, get_preset(FULL)
+    task = config.task
+    full = get_preset(FULL)
     words = []
     if task.headings == "above" and full.task.headings != "above":
         words.append("hands approach from above only")
@@ -246,86 +243,5 @@ def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
     """Returns the configuration with another hand, or unchanged; a hand's file is included, for
     remote actors.
     """
-    found = get_hand(hand or config.task.hand)
-    return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))
-
-
-TRACKERS = SensingConfig(
-    period=(0.0, 0.1),
-    delay=(0.0, 0.1),
-    position_noise=(0.0, 0.01),
-    rotation_noise=(0.0, 0.105),
-    latency=(0.0, 0.04),
-    dropout=(0.0, 0.3),
-    position_bias=(0.0, 0.005),
-    rotation_bias=(0.0, 0.035),
-    settle=0.04,
-)
-"""From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost
-samples.
-
-All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the
-others). Servos follow targets up to 40 ms late."""
-
-
-CAMERAS = SensingConfig(
-    period=(0.1, 0.1),
-    delay=(0.0, 0.1),
-    position_noise=(0.0, 0.004),
-    latency=(0.0, 0.04),
-    dropout=(0.0, 0.5),
-    position_bias=(0.0, 0.005),
-    rotation_bias=(0.0, 0.035),
-    single_image=0.5,
-)
-"""A depth camera on one side: an image before the reach, in half of the episodes another at 10 Hz.
-
-The points' depth has errors of up to 4 mm, half of them may be missing, and the hand-eye
-calibration is off by up to 5 mm and 2° (standard deviations), constant in an episode."""
-_SENSING = {STUDENT: TRACKERS, CAMERA: CAMERAS}
-_STUDENT_STD = 0.15  # the action's least standard deviation: a teacher's is 0.1 once it has settled
-
-
-def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunConfig:
-    """Returns the run that distils a teacher, with twice its time and random sensors, mass,
-    friction and gains.
-
-    Args:
-      config: numbers, objects and networks.
-      teacher: a policy file, or the hand of a pretrained policy.
-      method: `student`, with a tracker, or `camera`.
-
-    Raises:
-      CongraspError: there is no such policy.
-    """
-    file = named_policy(teacher)
-    task = bundles.load(file).task
-    task = dataclasses.replace(
-        task,
-        # Servos that follow up to 40 ms late reach half as fast; a policy observes the time as a
-        # share of the episode.
-        approach_steps=2 * task.approach_steps,
-        sensing=_SENSING[method],
-        mass_range=(0.7, 1.4),
-        friction_range=(0.5, 1.2),
-        gain_range=(0.8, 1.2),
-    )
-    return with_method(
-        dataclasses.replace(
-            config,
-            name=f"{config.name}-{method}",
-            task=task,
-            # PPO after the distillation begins with a policy that obeys all constraints, and with
-            # its teacher's noise.
-            curriculum=dataclasses.replace(
-                config.curriculum, ramp=(0, int(config.curriculum.ramped))
-            ),
-            ppo=dataclasses.replace(config.ppo, least_std=_STUDENT_STD),
-            algorithm="distill",
-            distill=dataclasses.replace(
-                config.distill,
-                teacher=str(file.resolve()) if pathlib.Path(teacher) == file else teacher,
-            ),
-        ),
-        method,
-    )
+    reference = get_hand(hand or config.task.hand).reference
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=reference))

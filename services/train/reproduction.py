@@ -11,7 +11,7 @@ from congrasp.services.evaluate.experiment import Track
 from congrasp.services.evaluate.lineup import Entrant, read_entrant
 from congrasp.services.evaluate.paper.parts import BASELINES, RequiredPolicy, required_policies
 from congrasp.services.evaluate.paper.reproduction import AvailablePolicies, Training
-from congrasp.services.train import processes
+from congrasp.services.train import background
 from congrasp.services.train.presets import FULL
 
 
@@ -91,7 +91,7 @@ def train_all(
         run_dir = request.run_dir(policy)
         track(f"Training {policy.name} (log: {run_dir}.log)", None)
         try:
-            processes.train_in_background(
+            background.train_in_background(
                 run_dir, training_options(policy), request.options, patience=request.timeout_s
             )
         except CongraspError as error:
@@ -113,7 +113,7 @@ def _policy_file(request: PolicyRequest, policy: RequiredPolicy) -> pathlib.Path
         return request.given[policy].file
     if request.pretrained and policy.method == "ours":
         return pretrained_file(policy.hand)
-    return processes.trained(request.run_dir(policy))
+    return background.finished_policy(request.run_dir(policy))
 
 
 def _entrant(request: PolicyRequest, policy: RequiredPolicy) -> Entrant | None:
@@ -136,7 +136,7 @@ def _trainings(
     trainings = {}
     for policy in policies:
         run_dir = request.run_dir(policy)
-        seconds = processes.training_seconds(run_dir)
+        seconds = background.training_seconds(run_dir)
         if seconds:
             trainings[policy] = Training(run_dir, seconds)
     return trainings

@@ -73,9 +73,12 @@ class Folder(NamedTuple):
     @staticmethod
     def of(run_dir: pathlib.Path) -> "Folder":
         """Returns the current content."""
-        entries = frozenset(run_dir.iterdir()) if run_dir.is_dir() else frozenset[pathlib.Path]()
+        entries: frozenset[pathlib.Path] = frozenset()
+        if run_dir.is_dir():
+            entries = frozenset(run_dir.iterdir())
         folders = (run_dir, *run_dir.parents)
-        return Folder(run_dir, entries, tuple(each for each in folders if not each.exists()))
+        absent = tuple(each for each in folders if not each.exists())
+        return Folder(run_dir, entries, absent)
 
 
 @contextlib.contextmanager
@@ -92,12 +95,11 @@ def removed_without_checkpoint(before: Folder) -> Iterator[None]:
 
 def kept_log(run_dir: pathlib.Path, log: pathlib.Path) -> pathlib.Path:
     """Moves a process's log out of the folder of a run that did not start; returns its new path."""
-    kept = run_dir.with_name(f"{run_dir.name}.failed.log")
+    target = run_dir.with_name(f"{run_dir.name}.failed.log")
     if log.parent != run_dir / LOGS:
         return log
     with contextlib.suppress(OSError):
-        log.replace(kept)
-        return kept
+        return log.replace(target)
     return log
 
 

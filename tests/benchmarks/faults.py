@@ -32,6 +32,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.ops.audit import FAULTS as KINDS
 from congrasp.services.ops.audit import Report
 from congrasp.services.ops.audit import compare as audit
+from congrasp.services.train.launch import LAUNCH_FILE, read_launch
 
 _RUN = "quickstart"
 _OPTIONS = (
@@ -180,9 +181,10 @@ class Run:
         ]
 
     def _endpoint(self) -> str | None:
-        """Where the oldest learner listens."""
-        words = (child.cmdline() for child in self.children("learner"))
-        return next((line[line.index("--listen") + 1] for line in words), None)
+        """Where the learner listens; None before it has started."""
+        if not self.children("learner"):
+            return None
+        return read_launch(self.run_dir / LAUNCH_FILE).endpoint
 
 
 def until(look: Callable[[], Any]) -> Any:

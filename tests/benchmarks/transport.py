@@ -30,8 +30,9 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port, local_url
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import RolloutForm
-from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.learner.hub.task_ranges import Ranges
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from tests.bare_zenoh import bare_session

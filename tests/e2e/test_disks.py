@@ -13,7 +13,7 @@ from congrasp.common.io.journal import AUDIT, Journal, read_journal
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.learner.process import run_learner
+from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import LOGS, create_run
 from congrasp.services.ops.audit import compare as audit
 from congrasp.services.ops.status import ask
@@ -69,9 +69,11 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
             config,
             transport,
             stop_event=threading.Event(),
-            recorder=recorder,
-            on_update=on_update,
-            on_event=lambda level, text: said.append((level, text)),
+            outputs=Outputs(
+                recorder=recorder,
+                on_update=on_update,
+                on_event=lambda level, text: said.append((level, text)),
+            ),
         )
     actor.join(10.0)
     assert last.version == 12 and actor.ended == "The run is finished."
@@ -125,7 +127,7 @@ def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
             config,
             transport,
             stop_event=threading.Event(),
-            on_update=lambda values: values["update"] == 3 and fill(disk),
+            outputs=Outputs(on_update=lambda values: values["update"] == 3 and fill(disk)),
         )
     assert "\n" not in str(caught.value)
     assert (

@@ -16,7 +16,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, decode
 from congrasp.learner.hub.used_rollouts import journal_path, replay
-from congrasp.learner.process import run_learner
+from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.children import python
 from tests.learner.made_up_actor import random_steps
@@ -82,8 +82,10 @@ def train(run_dir, resume=False, killed_after=0):
             transport,
             stop_event=threading.Event(),
             resume=resume,
-            on_update=lambda values: (
-                values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL)
+            outputs=Outputs(
+                on_update=lambda values: (
+                    values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL)
+                ),
             ),
         )
     ended.set()

@@ -21,7 +21,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
 from congrasp.learner.distributed.ranks import Ranks, end_process
-from congrasp.learner.process import _Learner, run_learner
+from congrasp.learner.process import Outputs, _Learner, run_learner
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -82,8 +82,10 @@ def main() -> None:
             stop_event=threading.Event(),
             resume=mode == "resume",
             ranks=ranks,
-            on_update=lambda values: print("update", int(values["update"]), flush=True),
-            on_event=lambda level, text: print(level, text, flush=True),
+            outputs=Outputs(
+                on_update=lambda values: print("update", int(values["update"]), flush=True),
+                on_event=lambda level, text: print(level, text, flush=True),
+            ),
         )
     # A thread that is inside JAX when the interpreter ends takes the process down with it.
     actor.stop.set()

@@ -14,8 +14,8 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
 from congrasp.learner.algorithms.protocol import collate, partition_specs
-from congrasp.learner.hub.admission import Ranges
-from congrasp.learner.process import run_learner
+from congrasp.learner.hub.task_ranges import Ranges
+from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import create_run
 from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
@@ -66,10 +66,12 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
                 transport,
                 stop_event=stop,
                 resume=resume,
-                on_update=lambda values: (
-                    values["update"] == UPDATES // 2 and not resume and stop.set()
+                outputs=Outputs(
+                    on_update=lambda values: (
+                        values["update"] == UPDATES // 2 and not resume and stop.set()
+                    ),
+                    on_event=lambda level, text: events.append(text),
                 ),
-                on_event=lambda level, text: events.append(text),
             )
 
     half = learn(resume=False)

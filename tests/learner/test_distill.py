@@ -18,7 +18,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.privileged import extra, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate
-from congrasp.services.train.presets import TRACKERS
+from congrasp.services.train.students import TRACKERS
 from tests.policies import random_bundle
 
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)

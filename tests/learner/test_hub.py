@@ -17,10 +17,11 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub import hub
-from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.limits import RateLimit
 from congrasp.learner.hub.queue import Sequences
 from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.learner.hub.task_ranges import Ranges
 from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
 from tests import rollouts
 from tests.waits import eventually

@@ -17,7 +17,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.hub.admission import Admission
-from congrasp.learner.process import run_learner
+from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import create_run, initial_notes, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
@@ -52,10 +52,16 @@ def act(hub):
         actor.join(10.0)
 
 
-def learn(run_dir, hub, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
+def learn(run_dir, hub, config=CONFIG, stop_event=None, *, resume=False, **outputs) -> PolicyBundle:
+    """Runs a learner; `outputs` are fields of `Outputs`."""
     with MemoryTransport(hub) as transport:
         return run_learner(
-            run_dir, config, transport, stop_event=stop_event or threading.Event(), **options
+            run_dir,
+            config,
+            transport,
+            stop_event=stop_event or threading.Event(),
+            resume=resume,
+            outputs=Outputs(**outputs),
         )
 
 

@@ -17,7 +17,8 @@ from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.reward import terms
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import RECORDED
-from congrasp.learner.hub.admission import Admission, task_ranges
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.task_ranges import task_ranges
 from tests import task as suite
 
 TASK = TaskConfig(

@@ -19,7 +19,8 @@ import pytest
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
-from congrasp.learner.distributed.ranks import Ranks, ended_by, relay
+from congrasp.learner.distributed.ranks import Ranks, ended_by
+from congrasp.learner.distributed.relay import relay
 from congrasp.learner.run_directory import create_run
 from tests.children import python
 from tests.conftest import ROOT

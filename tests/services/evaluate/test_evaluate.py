@@ -23,7 +23,7 @@ from congrasp.services.evaluate.heading_rules import heading_rules
 from congrasp.services.evaluate.paper.figures import CENTER_GROUP
 from congrasp.services.evaluate.pictures import failure_sheets
 from congrasp.services.evaluate.variations import Center, Load
-from congrasp.services.train.presets import TRACKERS
+from congrasp.services.train.students import TRACKERS
 from tests import task
 
 OBJECTS = sorted(task.OBJECTS, key=lambda obj: obj.name)

@@ -33,7 +33,7 @@ from congrasp.services.evaluate.variations import (
 )
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.studio.grasping import PolicyGrasping
-from congrasp.services.train.presets import TRACKERS
+from congrasp.services.train.students import TRACKERS
 from tests import task
 from tests.task import HAND, OBJECTS
 

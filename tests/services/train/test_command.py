@@ -15,8 +15,9 @@ from congrasp.learner.run_directory import create_run
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
 from congrasp.services.train.command import EPISODE, _next_steps, _Progress
+from congrasp.services.train.launch import Launch, LearnerOptions
 from congrasp.services.train.presets import get_preset
-from congrasp.services.train.processes import Launch, ProcessDied
+from congrasp.services.train.processes import ProcessDied
 
 LAUNCH = Launch(actors=1)
 # 40 steps an update
@@ -220,7 +221,7 @@ def test_a_training_that_others_may_join_has_all_certificates_before_it_starts(t
     for role in ("learner", "actor", "observer"):
         issue(tmp_path, role)
     Launch(listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
-    Launch(listen="tcp/0.0.0.0:7447", insecure=True).planned(CONFIG)
+    Launch(listen="tcp/0.0.0.0:7447", learner=LearnerOptions(insecure=True)).planned(CONFIG)
     with pytest.raises(CongraspError, match="belongs to one role"):
         Launch(listen="tls/0.0.0.0:7447", certs=tmp_path / "learner.0").planned(CONFIG)
     with pytest.raises(CongraspError, match="With --actors 0 nothing listens"):

@@ -20,26 +20,26 @@ from congrasp.services.train import learn as training
 def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
     seen, events = {}, []
 
-    def learn(run_dir, config, *, wire, inside, stop, on_update, grace):
+    def learn(run_dir, config, *, wire, inside, stop, monitoring):
         seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
         assert pathlib.Path(run_dir, "config.json").exists()
         for update in range(2):
             events.append(f"update {update}")
-            on_update({})
+            monitoring.on_update({})
 
     monkeypatch.setattr(training, "learn", learn)
     stop = threading.Event()
     training.until_first_update(RunConfig(), "native", stop, lambda: events.append("reported"))
     assert events == ["update 0", "reported", "update 1"]
     assert stop.is_set() and seen["stop"] is stop
-    assert seen["inside"] == "native" and seen["config"].updates == 1
+    assert seen["inside"].physics == "native" and seen["config"].updates == 1
     assert not seen["run_dir"].exists()
 
 
 def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
-    def learn(run_dir, config, *, stop, on_update, **rest):
+    def learn(run_dir, config, *, stop, monitoring, **rest):
         stop.set()
-        on_update({})
+        monitoring.on_update({})
 
     reported = []
     monkeypatch.setattr(training, "learn", learn)
@@ -53,7 +53,9 @@ def test_an_engine_in_this_process_is_prepared_before_the_learner(monkeypatch, t
     begun, config = [], RunConfig()
     monkeypatch.setattr(training, "prepare_physics", lambda *engine: begun.append(engine))
     monkeypatch.setattr(training, "run_learner", lambda *run, **options: begun.append("learner"))
-    training.learn(tmp_path, config, wire=None, inside="native", stop=threading.Event())
+    training.learn(
+        tmp_path, config, wire=None, inside=training.InnerActor("native"), stop=threading.Event()
+    )
     assert begun == [("native", get_hand(config.task.hand), config.task), "learner"]
 
 

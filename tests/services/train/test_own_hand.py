@@ -161,7 +161,7 @@ def test_a_policy_of_more_experience_stays(stages, claw, tmp_path):
 
 def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     ran, _ = stages
-    monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
+    monkeypatch.setattr("congrasp.services.train.accelerators.detect", lambda: ("cpu", 1))
     (tmp_path / "hands" / "claw.json").unlink()
     command = [
         "hands",

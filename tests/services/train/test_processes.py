@@ -15,7 +15,7 @@ from congrasp.services.cli import main
 from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
-from congrasp.services.train import processes
+from congrasp.services.train import background, processes
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import MAX_RESTARTS, Child
 from congrasp.services.train.reproduction import PolicyRequest, train_all, training_options
@@ -127,7 +127,7 @@ DIES = "raise SystemExit(9)"
 @pytest.fixture
 def storm(tmp_path, monkeypatch):
     """Supervises a learner and an actor, one of which dies; progress is published or not."""
-    monkeypatch.setattr(processes, "_LONGEST_PAUSE", 1.0)
+    monkeypatch.setattr(processes, "_MAX_PAUSE_S", 1.0)
     children: list[Script] = []
 
     def run(role: str, deaths: int, *, progress: bool) -> list[str]:
@@ -205,7 +205,7 @@ def scripts(monkeypatch):
             folder = self.arguments[self.arguments.index("--run-dir") + 1]
             return [sys.executable, "-c", chosen[self.name], folder]
 
-    monkeypatch.setattr(processes, "Child", Training)
+    monkeypatch.setattr(background, "Child", Training)
     monkeypatch.setattr(lifetime, "_POLL", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
@@ -233,11 +233,13 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     assert "human-graspxl was stopped" in failures[GRAPSXL]
     runs = wanted.runs
     assert (
-        processes.trained(runs / OURS.name) is None
-        and processes.training_seconds(runs / OURS.name) is None
+        background.finished_policy(runs / OURS.name) is None
+        and background.training_seconds(runs / OURS.name) is None
     )
-    assert processes.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
-    assert processes.training_seconds(runs / PHASES.name) > 0.0
+    assert (
+        background.finished_policy(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
+    )
+    assert background.training_seconds(runs / PHASES.name) > 0.0
     assert not any("--resume" in child.arguments for child in started)
 
 

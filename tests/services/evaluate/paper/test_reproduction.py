@@ -181,7 +181,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
 def test_bad_input_is_refused_before_anything_begins(
     policy, tmp_path, monkeypatch, arguments, words
 ):
-    monkeypatch.setattr("congrasp.services.train.processes.accelerators", lambda: ("cpu", 1))
+    monkeypatch.setattr("congrasp.services.train.accelerators.detect", lambda: ("cpu", 1))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(CongraspError, match=words):
         load("reproduce")([text.format(policy=policy) for text in arguments])()
