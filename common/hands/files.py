@@ -23,6 +23,7 @@ run's configuration, of policies and of recorded episodes.
 
 import dataclasses
 import functools
+import itertools
 import json
 import pathlib
 from collections.abc import Iterator
@@ -195,8 +196,12 @@ def faults(hand: Hand) -> list[str]:  # noqa: C901
     tips = [link.name for link in hand.links if link.tip is not None]
     if hand.thumb not in tips or len(tips) < 2:
         found.append("the thumb must be a link with a tip, and at least one other link needs one")
-    elif not found and len({chain_of(hand, tip)[0] for tip in tips}) < len(tips):
-        found.append("two fingertips are on the same finger")
+    elif not found:
+        found += [
+            f"the fingertip of '{tip}' is on the finger of '{end}'"
+            for tip, end in itertools.permutations(tips, 2)
+            if tip in chain_of(hand, end)
+        ]
     if not min(hand.object_scale, *dataclasses.astuple(hand.wrist)) > 0:
         found.append("the object scale and the numbers of the wrist must be above zero")
     return found

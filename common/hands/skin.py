@@ -113,6 +113,8 @@ HUMAN_HANDS = ("human", "mano")
 MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
 """Materials of a surface."""
 _LARGEST = 0.5  # m
+_SHORT_NORMAL = 0.5
+"""Length below which a mean of unit normals is one of rounding errors."""
 _SECTIONS = 20  # sides of a housing
 _BEVEL = 0.45  # bevel of a housing's ends, in radii
 # Radius and half length of a joint's drum, in radii of its link
@@ -241,11 +243,9 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     ]
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
-    normals = np.concatenate([part.vertex_normals for part in parts]).astype(np.float32)
-    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points without faces, or with faces back to back
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
-        normals=normals,
+        normals=np.concatenate([_unit_normals(part) for part in parts]).astype(np.float32),
         faces=np.concatenate(
             [part.faces + start for part, start in zip(parts, starts, strict=True)]
         ).astype(np.int32),
@@ -253,6 +253,22 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
         origins=np.array([link_origin(link) for link in hand.links]),
         material=np.full(sum(counts), MATERIALS.index("link")),
     )
+
+
+def _unit_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Returns normals (V, 3) of a mesh's points.
+
+    Where the faces around a point are back to back and cancel, it is the normal of one of them; of
+    a point without a face that has an area, +z.
+    """
+    normals = np.array(mesh.vertex_normals)
+    is_degenerate = np.linalg.norm(normals, axis=-1) < _SHORT_NORMAL
+    substitutes = np.tile([0.0, 0.0, 1.0], (len(normals), 1))
+    has_area = np.linalg.norm(mesh.face_normals, axis=-1) > _SHORT_NORMAL
+    for corner in range(3):
+        substitutes[mesh.faces[has_area, corner]] = mesh.face_normals[has_area]
+    normals[is_degenerate] = substitutes[is_degenerate]
+    return normals
 
 
 def _rounded(link: Link) -> trimesh.Trimesh:

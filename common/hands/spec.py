@@ -8,6 +8,7 @@ kinematics is a product of exponentials (`common.hands.kinematics`) and the MJCF
 import dataclasses
 import functools
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
 
@@ -229,9 +230,23 @@ class Hand:
         return tuple(sorted(tips, key=lambda i: self.links[i].name != self.thumb))
 
     @functools.cached_property
+    def moved_tips(self) -> np.ndarray:
+        """(F, G) bool: the tips that each joint moves, thumb first."""
+        moved = np.zeros((len(self.joints), len(self.tip_links)), bool)
+        for tip, i in enumerate(self.tip_links):
+            chain = chain_of(self, self.links[i].name)
+            moved[:, tip] = [self.links[link].name in chain for link in self.joint_links]
+        return moved
+
+    @functools.cached_property
     def finger_roots(self) -> tuple[str, ...]:
-        """First link of each finger with a tip, thumb first."""
-        return tuple(chain_of(self, self.links[i].name)[0] for i in self.tip_links)
+        """First link of each finger, thumb first: the first one that carries no other tip."""
+        chains = [chain_of(self, self.links[i].name) for i in self.tip_links]
+        tips_of_link = Counter(itertools.chain.from_iterable(chains))
+        roots = []
+        for chain in chains:
+            roots.append(next(name for name in chain if tips_of_link[name] == 1))
+        return tuple(roots)
 
     @functools.cached_property
     def fingers(self) -> tuple[str, ...]:
@@ -241,11 +256,15 @@ class Hand:
 
     @functools.cached_property
     def link_fingers(self) -> np.ndarray:
-        """(L,) index of each link's finger, -1 for the palm and for links without a tip."""
-        roots = [next(iter(chain_of(self, link.name)), "") for link in self.links]
-        return np.array(
-            [self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots]
-        )
+        """(L,) index of each link's finger; -1 for the palm and links that carry no tip or
+        several.
+        """
+        finger_of_link = np.full(len(self.links), -1)
+        for i, link in enumerate(self.links):
+            for name in chain_of(self, link.name):
+                if name in self.finger_roots:
+                    finger_of_link[i] = self.finger_roots.index(name)
+        return finger_of_link
 
     @functools.cached_property
     def contact_weights(self) -> np.ndarray:
