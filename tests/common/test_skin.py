@@ -16,7 +16,7 @@ from congrasp.common.hands.flesh import surface_net
 from congrasp.common.hands.kinematics import link_transforms
 from congrasp.common.hands.meshes import save_meshes
 from congrasp.common.hands.mjcf import mujoco_link_poses
-from congrasp.common.hands.skin import MATERIALS, skin_of
+from congrasp.common.hands.skin import MATERIALS, skin_of, skin_of_meshes
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.procedural import plain_object
