@@ -151,10 +151,10 @@ def flesh(skeleton: Skeleton) -> Surface:
         points = points - distance[:, None] * _gradient(points, palm, fingers)
     normals = _gradient(points, palm, fingers)
     weights = _weights(len(skeleton.names), points, faces, palm, fingers)
-    for finger, (anchor, turn) in zip(fingers, turns, strict=True):  # undoes the spread
+    for finger, (anchor, matrix) in zip(fingers, turns, strict=True):  # undoes the spread
         share = weights[:, [cone.links[0] for cone in finger]].sum(1)[:, None]
-        points = points + share * ((points - anchor) @ turn + anchor - points)
-        normals = normals + share * (normals @ turn - normals)
+        points = points + share * ((points - anchor) @ matrix + anchor - points)
+        normals = normals + share * (normals @ matrix - normals)
     return Surface(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), faces, weights)
 
 
