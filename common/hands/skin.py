@@ -252,11 +252,11 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
     link_of_point = np.repeat(np.arange(len(parts)), counts)
-    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+    shifted_faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
         normals=np.concatenate([_unit_normals(part) for part in parts]).astype(np.float32),
-        faces=np.concatenate(faces).astype(np.int32),
+        faces=np.concatenate(shifted_faces).astype(np.int32),
         weights=np.eye(len(parts), dtype=np.float32)[link_of_point],
         origins=np.array([link_origin(link) for link in hand.links]),
         material=np.full(sum(counts), MATERIALS.index("link")),
