@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import HUMAN, MAX_BYTES, hand_from_text, read_hand, shipped_hand
+from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.mano import own_mano_hand
-from congrasp.common.hands.spec import Hand, left_hand, right_name
+from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import user_folder
 from congrasp.common.io.inputs import LONGEST_NAME
 

@@ -28,24 +28,41 @@ MARGIN = 0.03
 WIDEST = 0.14
 """Gap in metres, for objects of the human hand's size, beyond which no hand needs to open: 12 cm,
 the widest object that gets headings, plus a centimetre on either side."""
-# Weights of an offset (m^2) and of a motor's rotation (rad^2), in the unit of the gap (m^2)
-_OFFSET, _TURN = (
-    0.5,
-    2e-6,
-)
+_OFFSET_WEIGHT = 0.5
+"""Weight of a changed offset (m^2) relative to a missing gap (m^2)."""
+_TURN_WEIGHT = 2e-6
+"""Weight of a motor's rotation (rad^2) relative to a missing gap (m^2)."""
+
+
+class Outline(NamedTuple):
+    """Balls whose hull contains the hand, in S finger poses from the least to the most closed.
+
+    The frame has its origin at the hand's centre and the axes v, w and v x w of the grasp frame.
+    """
+
+    points: np.ndarray
+    """(S, E, 3) centres of the balls, m."""
+    radii: np.ndarray
+    """(E,) m."""
+    openings: np.ndarray
+    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w
+    (`common.hands.closure`).
+    """
+
+
+CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
+"""A ball of 1 cm around the hand's centre, for requests that name no hand."""
 
 
 def closure_pose(hand: Hand, closure: Array) -> Array:
     """Finger angles (..., F) at closures (..., 1), or at (..., F) closures, one for each joint."""
     c = jnp.asarray(closure)
-    q_wide, q_open, q_closed = (
-        jnp.asarray(q) for q in (wide_angles(hand), hand.q_open, hand.q_closed)
-    )
-    return (
-        q_open
-        + jnp.maximum(c, 0.0) * (q_closed - q_open)
-        + jnp.maximum(-c, 0.0) * (q_wide - q_open)
-    )
+    q_wide = jnp.asarray(wide_angles(hand))
+    q_open = jnp.asarray(hand.q_open)
+    q_closed = jnp.asarray(hand.q_closed)
+    to_closed = jnp.maximum(c, 0.0) * (q_closed - q_open)
+    to_wide = jnp.maximum(-c, 0.0) * (q_wide - q_open)
+    return q_open + to_closed + to_wide
 
 
 def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
@@ -53,15 +70,15 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
     opens; m.
     """
     gaps = table_of_gaps(hand)
-    return closure_pose(hand, jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])[..., None])
+    closure = jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])
+    return closure_pose(hand, closure[..., None])
 
 
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    gaps = np.asarray(
-        kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32)), np.float64
-    )
+    least_gaps = kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32))
+    gaps = np.asarray(least_gaps, np.float64)
     return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
 
 
@@ -91,43 +108,43 @@ def widest_pose(hand: Hand) -> dict[str, float]:
     start = np.asarray(motor_positions(hand, hand.q_open), float)
     program = jax.jit(jax.value_and_grad(functools.partial(_cost, hand)))
 
-    def cost(motors: np.ndarray) -> list[np.ndarray]:
-        # The default tolerances of L-BFGS-B assume costs around one.
-        return [
-            np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))
-        ]
+    def scaled_cost(motors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cost () and gradient (M,); the default tolerances of L-BFGS-B assume costs around one."""
+        cost, gradient = program(jnp.asarray(motors, jnp.float32))
+        return np.asarray(cost, float) / _TURN_WEIGHT, np.asarray(gradient, float) / _TURN_WEIGHT
 
-    found = minimize(
-        cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)
-    ).x
-    q = np.asarray(joint_positions(hand, jnp.asarray(found, jnp.float32)))
+    bounds = np.stack([lower, upper], -1)
+    result = minimize(scaled_cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    q = np.asarray(joint_positions(hand, jnp.asarray(result.x, jnp.float32)))
     followers = {coupling.joint for coupling in hand.couplings}
-    return {
-        j.name: round(float(x), 3)
-        for j, x in zip(hand.joints, q, strict=True)
-        if j.name not in followers
-    }
+    angles = {}
+    for joint, angle in zip(hand.joints, q, strict=True):
+        if joint.name not in followers:
+            angles[joint.name] = round(float(angle), 3)
+    return angles
 
 
 def _cost(hand: Hand, motors: Array) -> Array:
     """Cost () in m^2 that `widest_pose` minimises."""
-    started = motor_positions(hand, jnp.asarray(hand.q_open))
-    tips, open_tips = (
-        _tips(hand, q) for q in (joint_positions(hand, motors), jnp.asarray(hand.q_open))
-    )
-    missing = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
+    open_q = jnp.asarray(hand.q_open)
+    open_motors = motor_positions(hand, open_q)
+    tips = _tips(hand, joint_positions(hand, motors))
+    open_tips = _tips(hand, open_q)
+    missing_gap = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
     moved = (tips[1:] - tips[0]) - (open_tips[1:] - open_tips[0])
+    offset = moved[:, ::2]  # along v and v x w
     return (
-        jnp.sum(missing**2)
-        + _OFFSET * jnp.sum(moved[:, ::2] ** 2)
-        + _TURN * jnp.sum((motors - started) ** 2)
+        jnp.sum(missing_gap**2)
+        + _OFFSET_WEIGHT * jnp.sum(offset**2)
+        + _TURN_WEIGHT * jnp.sum((motors - open_motors) ** 2)
     )
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _least_gaps(hand: Hand, closures: Array) -> Array:
     """Gaps (S,) in m of a hand at closures (S,), compiled as one program."""
-    return jnp.min(_gaps(hand, _tips(hand, closure_pose(hand, closures[:, None]))), -1)
+    q = closure_pose(hand, closures[:, None])
+    return jnp.min(_gaps(hand, _tips(hand, q)), -1)
 
 
 def _tips(hand: Hand, q: Array) -> Array:
@@ -144,35 +161,18 @@ def _gaps(hand: Hand, tips: Array) -> Array:
     return tips[..., 1:, 1] - tips[..., :1, 1] - radii[1:] - radii[0]
 
 
-class Outline(NamedTuple):
-    """Balls whose hull contains the hand, in S finger poses from the least to the most closed.
-
-    The frame has its origin at the hand's centre and the axes v, w and v x w of the grasp frame.
-    """
-
-    points: np.ndarray
-    """(S, E, 3) centres of the balls, m."""
-    radii: np.ndarray
-    """(E,) m."""
-    openings: np.ndarray
-    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w
-    (`common.hands.closure`).
-    """
-
-
-CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
-"""A ball of 1 cm around the hand's centre, for requests that name no hand."""
-
-
 @functools.cache
 def outline(hand: Hand) -> Outline:
     """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    posed = kinematics.untraced(_posed, hand, CLOSURES.astype(np.float32))
-    ends, center = (np.asarray(part, np.float64) for part in posed)
-    radii = np.repeat(hand.capsule_radii, 2).astype(np.float64)
-    return Outline((ends - center[:, None]) @ axes.T, radii, table_of_gaps(hand))
+    ends, center = kinematics.untraced(_posed, hand, CLOSURES.astype(np.float32))
+    from_center = np.asarray(ends, np.float64) - np.asarray(center, np.float64)[:, None]
+    return Outline(
+        points=from_center @ axes.T,
+        radii=np.repeat(hand.capsule_radii, 2).astype(np.float64),
+        openings=table_of_gaps(hand),
+    )
 
 
 def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
@@ -182,7 +182,8 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
       outline: outline of the hand.
       up: (H, 3) unit, vertical of the world in the outline's frame.
     """
-    return -(np.einsum("sei,hi->she", outline.points, up) - outline.radii).min(-1)
+    heights = np.einsum("sei,hi->she", outline.points, up) - outline.radii
+    return -heights.min(-1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -192,6 +193,5 @@ def _posed(hand: Hand, closures: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     transforms = kinematics.link_transforms(hand, closure_pose(hand, closures[:, None]))
     ends = kinematics.capsules(hand, transforms)
-    return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(
-        hand, kinematics.keypoints(hand, transforms)
-    )
+    center = kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))
+    return ends.reshape(*ends.shape[:-3], -1, 3), center

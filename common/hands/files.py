@@ -21,11 +21,14 @@ Names of fields, units and frames are those of `common.hands.spec`. The file's t
 run's configuration, of policies and of recorded episodes.
 """
 
+import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import pathlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import dacite
@@ -33,18 +36,24 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import motor_limits
-from congrasp.common.hands.spec import Hand, Solid, chain_of
+from congrasp.common.hands.spec import Hand, Joint, Motor, Solid, chain_of
 from congrasp.common.io.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
 """Largest size of a hand file in bytes."""
 _SHIPPED = pathlib.Path(__file__).with_name("data")
-_LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # limits for a hand, a hand and a link
-_LARGEST = 1e5  # bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000
+_MAX_LINKS = 64
+_MAX_JOINTS = 64
+_MAX_SHAPES = 16
+"""Most capsules, or solids, of a link."""
+_MAX_NUMBER = 1e5
+"""Bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000."""
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
-_ROUNDING = 1e-5  # rad, of single precision
-_TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
+_ROUNDING = 1e-5
+"""Tolerance of angles in single precision, rad."""
+_NORM_TOLERANCE = 1e-3
+_TAKEN_LINKS = {"hand_base", "table", "anchor", "object", "hold", "world"}
 _WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
 TAKEN_JOINTS = _WRIST | {"object", "hold"}
 """Names reserved for joints, actuators and equalities of the scene: no joint or tendon may have
@@ -79,21 +88,22 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
       CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand is not
         valid.
     """
-    try:
-        fields = json.loads(text) if len(text) <= MAX_BYTES else None
-    except (ValueError, RecursionError):
-        fields = None
+    fields = None
+    if len(text) <= MAX_BYTES:
+        with contextlib.suppress(ValueError, RecursionError):
+            fields = json.loads(text)
     if not isinstance(fields, dict):
         raise CongraspError(
             f"{source} is not JSON, or is longer than {MAX_BYTES} characters.", _REMEDY
         )
-    found = fields.pop("format", None)
-    if found != FORMAT:
-        raise CongraspError(f"{source} has the format {found!r:.20}, not {FORMAT}.", _REMEDY)
+    version = fields.pop("format", None)
+    if version != FORMAT:
+        raise CongraspError(f"{source} has the format {version!r:.20}, not {FORMAT}.", _REMEDY)
     # Without spaces, since the text is sent with every episode.
-    hand, wrong = _described(json.dumps({"format": FORMAT, **fields}, separators=(",", ":")))
-    if hand is None or wrong:
-        raise CongraspError(f"{source}: {wrong}.", _REMEDY)
+    compact = json.dumps({"format": FORMAT, **fields}, separators=(",", ":"))
+    hand, fault = _described(compact)
+    if hand is None or fault:
+        raise CongraspError(f"{source}: {fault}.", _REMEDY)
     return hand
 
 
@@ -125,168 +135,225 @@ def shipped_hand(name: str) -> Hand:
     return dataclasses.replace(read_hand(_SHIPPED / f"{name}.json"), text="")
 
 
-def faults(hand: Hand) -> list[str]:  # noqa: C901
-    """Returns the faults of a hand, one phrase each."""
-    if too_much := _out_of_bounds(hand):
-        return [too_much]
-    found: list[str] = []
-    names = [link.name for link in hand.links]
+def faults(hand: Hand) -> list[str]:
+    """Returns the faults of a hand, one phrase each.
+
+    A fault that makes further checks impossible is the last of the list.
+    """
+    out_of_bounds = _out_of_bounds(hand)
+    if out_of_bounds:
+        return [out_of_bounds]
+    faults = _name_faults(hand)
+    if not hand.links or hand.links[0].joints or hand.links[0].parent:
+        return [*faults, "the first link must be the palm, without a parent and without joints"]
+    if not hand.joints:
+        return [*faults, "it has no joints"]
+    for i in range(len(hand.links)):
+        faults += _link_faults(hand, i)
+    for joint in hand.joints:
+        faults += _joint_faults(joint)
+    faults = faults or _coupling_faults(hand)
+    if faults:
+        return faults
+    faults += _motor_faults(hand)
+    faults += _pose_faults(hand, "open", hand.open_pose, hand.q_open)
+    faults += _pose_faults(hand, "closed", hand.closed_pose, hand.q_closed)
+    faults += _tip_faults(hand)
+    if not min(hand.object_scale, *dataclasses.astuple(hand.wrist)) > 0:
+        faults.append("the object scale and the numbers of the wrist must be above zero")
+    return faults
+
+
+def _name_faults(hand: Hand) -> list[str]:
+    """Returns the faults of the names of the hand, its links and its joints."""
+    faults = []
+    links = [link.name for link in hand.links]
     joints = [joint.name for joint in hand.joints]
     if not hand.name.isidentifier() or len(hand.name) > LONGEST_NAME:
-        found.append(
+        faults.append(
             f"the name '{hand.name}' has characters other than letters, digits and underscores"
         )
-    for name in sorted(
-        {name for name in names + joints if (names + joints).count(name) > 1 or not name}
-    ):
-        found.append(f"the name '{name}' occurs more than once or is empty")
-    found += [
-        f"the name '{name}' is taken"
-        for name in sorted((_TAKEN & {*names}) | (TAKEN_JOINTS & {*joints}))
-    ]
-    if not hand.links or hand.links[0].joints or hand.links[0].parent:
-        return [*found, "the first link must be the palm, without a parent and without joints"]
-    if not joints:
-        return [*found, "it has no joints"]
-    for i, link in enumerate(hand.links):
-        if i and link.parent not in names[:i]:
-            found.append(f"the parent '{link.parent}' of '{link.name}' must precede it")
-        if i and not link.joints:
-            found.append(f"the link '{link.name}' has no joint: make it part of its parent")
-        if not link.capsules or any(capsule.radius <= 0 for capsule in link.capsules):
-            found.append(f"the link '{link.name}' needs capsules with radii above zero")
-        if any(min(_sizes(solid)) <= 0 for solid in link.solids):
-            found.append(f"the link '{link.name}' has a solid without a size")
-        if any(abs(float(np.linalg.norm(solid.quaternion)) - 1) > 1e-3 for solid in link.solids):
-            found.append(f"the link '{link.name}' has a solid whose quaternion is not normalised")
-        if not link.mass > 0 or link.contact_weight < 0:
-            found.append(
-                f"the link '{link.name}' needs a mass above zero and a contact weight of at least "
-                f"zero"
-            )
-    for joint in hand.joints:
-        if not joint.lower < joint.upper:
-            found.append(
-                f"the limits {joint.lower:g} and {joint.upper:g} of '{joint.name}' are in the "
-                f"wrong order"
-            )
-        if abs(float(np.linalg.norm(joint.axis)) - 1) > 1e-3:
-            found.append(f"the axis of '{joint.name}' is not a unit vector")
-        if min(joint.damping, joint.armature) < 0:
-            found.append(f"damping and armature of '{joint.name}' must be at least zero")
-    if found := found or _coupling_faults(hand):
-        return found
+    counts = Counter(links + joints)
+    for name in sorted(counts):
+        if counts[name] > 1 or not name:
+            faults.append(f"the name '{name}' occurs more than once or is empty")
+    taken = (_TAKEN_LINKS & {*links}) | (TAKEN_JOINTS & {*joints})
+    for name in sorted(taken):
+        faults.append(f"the name '{name}' is taken")
+    return faults
+
+
+def _link_faults(hand: Hand, i: int) -> list[str]:
+    """Returns the faults of the link with this index."""
+    faults = []
+    link = hand.links[i]
+    is_palm = i == 0
+    names_before = [other.name for other in hand.links[:i]]
+    if not is_palm and link.parent not in names_before:
+        faults.append(f"the parent '{link.parent}' of '{link.name}' must precede it")
+    if not is_palm and not link.joints:
+        faults.append(f"the link '{link.name}' has no joint: make it part of its parent")
+    if not link.capsules or any(capsule.radius <= 0 for capsule in link.capsules):
+        faults.append(f"the link '{link.name}' needs capsules with radii above zero")
+    if any(min(_sizes(solid)) <= 0 for solid in link.solids):
+        faults.append(f"the link '{link.name}' has a solid without a size")
+    if not all(_is_unit(solid.quaternion) for solid in link.solids):
+        faults.append(f"the link '{link.name}' has a solid whose quaternion is not normalised")
+    if not link.mass > 0 or link.contact_weight < 0:
+        faults.append(
+            f"the link '{link.name}' needs a mass above zero and a contact weight of at least zero"
+        )
+    return faults
+
+
+def _joint_faults(joint: Joint) -> list[str]:
+    """Returns the faults of a joint."""
+    faults = []
+    if not joint.lower < joint.upper:
+        faults.append(
+            f"the limits {joint.lower:g} and {joint.upper:g} of '{joint.name}' are in the wrong "
+            f"order"
+        )
+    if not _is_unit(joint.axis):
+        faults.append(f"the axis of '{joint.name}' is not a unit vector")
+    if min(joint.damping, joint.armature) < 0:
+        faults.append(f"damping and armature of '{joint.name}' must be at least zero")
+    return faults
+
+
+def _is_unit(numbers: Sequence[float]) -> bool:
+    """True for a vector or quaternion of length one."""
+    return not abs(float(np.linalg.norm(numbers)) - 1) > _NORM_TOLERANCE
+
+
+def _motor_faults(hand: Hand) -> list[str]:
+    """Returns the faults of the motors' gains."""
+    faults = []
     for motor in hand.motors:
         if min(motor.kp, motor.torque_limit) <= 0 or motor.kv < 0:
-            found.append(
+            faults.append(
                 f"kp and torque limit of '{motor.name}' must be above zero, and kv at least zero"
             )
-    for pose, named, q in (
-        ("open", hand.open_pose, hand.q_open),
-        ("closed", hand.closed_pose, hand.q_closed),
-    ):
-        found += [
-            f"the {pose} pose names '{name}', which is not a joint"
-            for name in sorted({*named} - {*joints})
-        ]
-        for joint, angle in zip(hand.joints, q, strict=True):
-            if not joint.lower - _ROUNDING <= angle <= joint.upper + _ROUNDING:
-                found.append(f"'{joint.name}' is outside its limits in the {pose} pose")
+    return faults
+
+
+def _pose_faults(hand: Hand, pose: str, angles: dict[str, float], q: np.ndarray) -> list[str]:
+    """Returns the faults of a pose.
+
+    Args:
+      hand: the hand.
+      pose: name of the pose.
+      angles: its angles by names of joints, rad.
+      q: (F,) all angles, rad.
+    """
+    faults = []
+    joints = {joint.name for joint in hand.joints}
+    for name in sorted({*angles} - joints):
+        faults.append(f"the {pose} pose names '{name}', which is not a joint")
+    for joint, angle in zip(hand.joints, q, strict=True):
+        if not joint.lower - _ROUNDING <= angle <= joint.upper + _ROUNDING:
+            faults.append(f"'{joint.name}' is outside its limits in the {pose} pose")
+    return faults
+
+
+def _tip_faults(hand: Hand) -> list[str]:
+    """Returns the faults of the fingertips."""
     tips = [link.name for link in hand.links if link.tip is not None]
     if hand.thumb not in tips or len(tips) < 2:
-        found.append("the thumb must be a link with a tip, and at least one other link needs one")
-    elif not found and len({chain_of(hand, tip)[0] for tip in tips}) < len(tips):
-        found.append("two fingertips are on the same finger")
-    if not min(hand.object_scale, *dataclasses.astuple(hand.wrist)) > 0:
-        found.append("the object scale and the numbers of the wrist must be above zero")
-    return found
+        return ["the thumb must be a link with a tip, and at least one other link needs one"]
+    faults = []
+    for tip, end in itertools.permutations(tips, 2):
+        if tip in chain_of(hand, end):
+            faults.append(f"the fingertip of '{tip}' is on the finger of '{end}'")
+    return faults
 
 
 def _coupling_faults(hand: Hand) -> list[str]:
     """Returns the faults of couplings and tendons."""
+    faults = []
     joints = [joint.name for joint in hand.joints]
     followers = [coupling.joint for coupling in hand.couplings]
-    pulled = [name for tendon in hand.tendons for name in tendon.joints]
-    tendons = [tendon.name for tendon in hand.tendons]
-    found = []
-    for x in hand.couplings:
-        if (
-            x.joint not in joints
-            or x.leader not in joints
-            or x.leader in followers
-            or followers.count(x.joint) > 1
-        ):
-            found.append(
-                f"'{x.joint}' cannot follow '{x.leader}': one is not a joint, or follows another"
+    for coupling in hand.couplings:
+        are_joints = coupling.joint in joints and coupling.leader in joints
+        follows_once = followers.count(coupling.joint) == 1 and coupling.leader not in followers
+        if not are_joints or not follows_once:
+            faults.append(
+                f"'{coupling.joint}' cannot follow '{coupling.leader}': one is not a joint, or "
+                f"follows another"
             )
-        if not x.ratio:
-            found.append(f"'{x.joint}' follows '{x.leader}' with the ratio zero")
+        if not coupling.ratio:
+            faults.append(f"'{coupling.joint}' follows '{coupling.leader}' with the ratio zero")
     for tendon in hand.tendons:
-        odd = [
-            name
-            for name in tendon.joints
-            if name not in joints or name in followers or pulled.count(name) > 1
-        ]
-        if odd:
-            found.append(
-                f"the tendon '{tendon.name}' pulls '{odd[0]}', which is not a joint, follows "
-                f"another, or has two "
-                "tendons"
+        faults += _tendon_faults(hand, tendon)
+    if faults:
+        return faults
+    lower, upper = motor_limits(hand)
+    for motor, low, high in zip(hand.motors, lower, upper, strict=True):
+        if not low < high:
+            faults.append(f"the limits of the joints that '{motor.name}' moves leave it no range")
+    return faults
+
+
+def _tendon_faults(hand: Hand, tendon: Motor) -> list[str]:
+    """Returns the faults of one of the hand's tendons."""
+    faults = []
+    joints = [joint.name for joint in hand.joints]
+    followers = [coupling.joint for coupling in hand.couplings]
+    pulled = Counter(itertools.chain.from_iterable(other.joints for other in hand.tendons))
+    for name in tendon.joints:
+        if name not in joints or name in followers or pulled[name] > 1:
+            faults.append(
+                f"the tendon '{tendon.name}' pulls '{name}', which is not a joint, follows "
+                f"another, or has two tendons"
             )
-        if len(tendon.joints) < 2 or not all(tendon.joints.values()):
-            found.append(
-                f"the tendon '{tendon.name}' needs at least two joints and nonzero coefficients"
-            )
-        if (
-            tendon.name in TAKEN_JOINTS | {*joints}
-            or tendons.count(tendon.name) > 1
-            or not tendon.name
-        ):
-            found.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
-    if not found:
-        lower, upper = motor_limits(hand)
-        found += [
-            f"the limits of the joints that '{motor.name}' moves leave it no range"
-            for motor, low, high in zip(hand.motors, lower, upper, strict=True)
-            if not low < high
-        ]
-    return found
+            break
+    if len(tendon.joints) < 2 or not all(tendon.joints.values()):
+        faults.append(
+            f"the tendon '{tendon.name}' needs at least two joints and nonzero coefficients"
+        )
+    names = [other.name for other in hand.tendons]
+    is_taken = tendon.name in TAKEN_JOINTS | {*joints} or names.count(tendon.name) > 1
+    if is_taken or not tendon.name:
+        faults.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
+    return faults
 
 
 def _out_of_bounds(hand: Hand) -> str:
     """Returns why a hand is not valid at all (numbers that are not finite, too many parts), or an
     empty string.
     """
-    if len(hand.links) > _LINKS or len(hand.joints) > _JOINTS:
-        return f"it has more than {_LINKS} links or {_JOINTS} joints"
-    if (
-        max(
-            len(hand.couplings), *(len(tendon.joints) for tendon in hand.tendons), len(hand.tendons)
-        )
-        > _JOINTS
-    ):
-        return f"it has more than {_JOINTS} couplings, tendons or joints of a tendon"
-    if any(max(len(link.capsules), len(link.solids)) > _CAPSULES for link in hand.links):
-        return f"it has a link of more than {_CAPSULES} capsules or solids"
+    if len(hand.links) > _MAX_LINKS or len(hand.joints) > _MAX_JOINTS:
+        return f"it has more than {_MAX_LINKS} links or {_MAX_JOINTS} joints"
+    counts = [len(hand.couplings), len(hand.tendons)]
+    counts += [len(tendon.joints) for tendon in hand.tendons]
+    if max(counts) > _MAX_JOINTS:
+        return f"it has more than {_MAX_JOINTS} couplings, tendons or joints of a tendon"
+    if any(max(len(link.capsules), len(link.solids)) > _MAX_SHAPES for link in hand.links):
+        return f"it has a link of more than {_MAX_SHAPES} capsules or solids"
     fields = dataclasses.asdict(hand)
     del fields["text"]
     for number in _numbers(fields):
-        if not abs(number) <= _LARGEST:
-            return f"it holds {number:g}, which is not a finite number of at most {_LARGEST:g}"
+        if not abs(number) <= _MAX_NUMBER:
+            return f"it holds {number:g}, which is not a finite number of at most {_MAX_NUMBER:g}"
     return ""
 
 
 def _sizes(solid: Solid) -> tuple[float, ...]:
     """Returns the entries of a solid's size that its shape uses."""
-    return solid.size[:2] if solid.kind in ("cylinder", "capsule") else solid.size
+    if solid.kind in ("cylinder", "capsule"):
+        return solid.size[:2]
+    return solid.size
 
 
 def _numbers(value: Any) -> Iterator[float]:
     """Yields the numbers in fields, at any depth."""
     if isinstance(value, (int, float)):
         yield value
-    elif isinstance(value, (dict, list, tuple)):
-        for item in value.values() if isinstance(value, dict) else value:
+        return
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, (list, tuple)):
+        for item in value:
             yield from _numbers(item)
 
 

@@ -6,6 +6,7 @@ finger, so that closed fingers stay apart. Everything is in the wrist frame with
 zero, in metres.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,41 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.spec import Hand, link_origin
+
+_CELL = 0.0039
+"""Side of a cell of the grid that the surface is cut from, m."""
+_PALM_BLEND = 0.014
+"""Width of the blend between parts of the palm, m."""
+_FINGER_BLEND = 0.008
+"""Width of the blend of a finger with the palm, m."""
+_THUMB_BLEND = 0.020
+"""Width of the blend of the thumb with the palm, m."""
+_WRIST_LENGTH = 0.040
+"""Distance by which the wrist extends backwards, m."""
+_WRIST_WIDTH = 1.9
+"""Width of the wrist relative to the start of the palm."""
+_CUT = 0.012
+"""Rounding of the wrist's end, m."""
+_BALL = ((0.10, 0.75, 0.0120, 0.0105), (0.45, 0.55, 0.0090, 0.0080))
+"""The ball of the thumb and the fold between thumb and index finger: where they begin and end, as
+shares of the length of the nearest metacarpal and of the thumb's, and radii there (m)."""
+_SPREAD = 0.0035
+"""Difference of the distances to two links over which their weights change by a factor e, m."""
+_SPREADING = 9.0
+"""Rotation by which fingers are spread while their surface is made, for each metre between
+knuckles, rad/m."""
+_FOLD = 0.004
+"""A point whose distances to two fingers differ by less belongs to the palm, m."""
+_MAX_INFLUENCES = 4
+"""Most links that move a point."""
+_MIN_WEIGHT = 0.01
+"""Smallest weight of a link that moves a point."""
+_SMOOTHINGS = 4
+"""Iterations of smoothing of weights over neighbours."""
+_PROJECTIONS = 3
+"""Steps from the centre of a cell to the surface."""
+_GRADIENT_STEP = 2e-4
+"""Half step of a gradient, m."""
 
 
 class Skeleton(NamedTuple):
@@ -42,57 +78,34 @@ class Skeleton(NamedTuple):
 
     def chains(self) -> list[list[int]]:
         """Links from the palm (excluded) to each last link with a capsule, a thumb first."""
-        found = []
+        chains = []
         for tip in np.unique(self.capsule_link):
-            if tip and not (self.parents == tip).any():
-                chain = [int(tip)]
-                while self.parents[chain[0]] > 0:
-                    chain.insert(0, int(self.parents[chain[0]]))
-                found.append([link for link in chain if (self.capsule_link == link).any()])
-        return sorted(found, key=lambda chain: not self.names[chain[-1]].startswith("thumb"))
+            is_last = not (self.parents == tip).any()
+            if not tip or not is_last:
+                continue
+            chain = [int(tip)]
+            while self.parents[chain[0]] > 0:
+                chain.insert(0, int(self.parents[chain[0]]))
+            chains.append([link for link in chain if (self.capsule_link == link).any()])
+        return sorted(chains, key=lambda chain: not self.names[chain[-1]].startswith("thumb"))
 
 
 def skeleton_of(hand: Hand) -> Skeleton:
     """Returns the skeleton of a hand."""
     names = tuple(link.name for link in hand.links)
+    parents = [names.index(link.parent) if link.parent else -1 for link in hand.links]
     return Skeleton(
-        hand.name,
-        names,
-        np.array([names.index(link.parent) if link.parent else -1 for link in hand.links]),
-        np.array([link_origin(link) for link in hand.links], float),
-        hand.capsules.astype(float),
-        hand.capsule_radii.astype(float),
-        hand.capsule_links,
-        np.array([joint.anchor for joint in hand.joints], float),
-        np.array([joint.axis for joint in hand.joints], float),
-        hand.joint_links,
+        hand=hand.name,
+        names=names,
+        parents=np.array(parents),
+        origins=np.array([link_origin(link) for link in hand.links], float),
+        capsules=hand.capsules.astype(float),
+        radii=hand.capsule_radii.astype(float),
+        capsule_link=hand.capsule_links,
+        anchors=np.array([joint.anchor for joint in hand.joints], float),
+        axes=np.array([joint.axis for joint in hand.joints], float),
+        joint_link=hand.joint_links,
     )
-
-
-_CELL = 0.0039  # side of a cell of the grid that the surface is cut from, m
-# Width of the blend between parts, m
-_PALM_BLEND, _FINGER_BLEND, _THUMB_BLEND = (
-    0.014,
-    0.008,
-    0.020,
-)
-# Distance by which the wrist extends backwards, m; its width relative to the start of the palm
-_WRIST, _WIDTH = (
-    0.040,
-    1.9,
-)
-_CUT = 0.012  # rounding of the wrist's end, m
-_BALL = ((0.10, 0.75, 0.0120, 0.0105), (0.45, 0.55, 0.0090, 0.0080))
-"""The ball of the thumb and the fold between thumb and index finger: where they begin and end, as
-shares of the length of the nearest metacarpal and of the thumb's, and radii there (m)."""
-# Difference of the distances to two links over which their weights change by a factor e, m
-_SPREAD = 0.0035
-# Rotation for each metre between knuckles by which fingers are spread while their surface is
-# made, rad/m
-_SPREADING = 9.0
-_FOLD = 0.004  # m; a point whose distances to two fingers differ by less belongs to the palm
-_INFLUENCES, _LEAST = 4, 0.01  # most links that move a point, and the smallest weight kept
-_ROUNDS = 4  # iterations of smoothing of weights over neighbours
 
 
 class Cone(NamedTuple):
@@ -121,29 +134,27 @@ class Surface(NamedTuple):
 
 def flesh(skeleton: Skeleton) -> Surface:
     """Returns the surface of a human hand whose links' capsules are phalanges and metacarpals."""
-    palm, together = _palm(skeleton), _fingers(skeleton)
-    turns = _spread(together)
-    fingers = [
-        [_turned(cone, turn) for cone in finger]
-        for finger, turn in zip(together, turns, strict=True)
-    ]
-    low, high = _bounds([*palm, *(cone for finger in fingers for cone in finger)])
+    palm = _palm(skeleton)
+    fingers_together = _fingers(skeleton)
+    turns = _spread(fingers_together)
+    fingers = []
+    for finger, turn in zip(fingers_together, turns, strict=True):
+        fingers.append([_turned(cone, turn) for cone in finger])
+    low, high = _bounds([*palm, *itertools.chain.from_iterable(fingers)])
     axes = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    cells, faces = surface_net(
-        _distance(grid.reshape(-1, 3), palm, fingers).reshape(grid.shape[:3])
-    )
+    distances = _distance(grid.reshape(-1, 3), palm, fingers)
+    cells, faces = surface_net(distances.reshape(grid.shape[:3]))
     points = low + _CELL * cells
-    for _ in range(3):  # from the centre of a cell to the surface
-        points = points - _distance(points, palm, fingers)[:, None] * _gradient(
-            points, palm, fingers
-        )
+    for _ in range(_PROJECTIONS):
+        distance = _distance(points, palm, fingers)
+        points = points - distance[:, None] * _gradient(points, palm, fingers)
     normals = _gradient(points, palm, fingers)
     weights = _weights(len(skeleton.names), points, faces, palm, fingers)
-    for finger, (anchor, turn) in zip(fingers, turns, strict=True):  # undoes the spread
+    for finger, (anchor, matrix) in zip(fingers, turns, strict=True):  # undoes the spread
         share = weights[:, [cone.links[0] for cone in finger]].sum(1)[:, None]
-        points = points + share * ((points - anchor) @ turn + anchor - points)
-        normals = normals + share * (normals @ turn - normals)
+        points = points + share * ((points - anchor) @ matrix + anchor - points)
+        normals = normals + share * (normals @ matrix - normals)
     return Surface(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), faces, weights)
 
 
@@ -151,10 +162,9 @@ def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndar
     """Point (3,) and rotation (3, 3) that separate each finger from its neighbours by at least a
     cell of the grid.
     """
-    others = fingers[1:]
-    roots, tips = (
-        np.array(ends) for ends in zip(*((f[0].start, f[-1].end) for f in others), strict=True)
-    )
+    other_fingers = fingers[1:]
+    roots = np.array([finger[0].start for finger in other_fingers])
+    tips = np.array([finger[-1].end for finger in other_fingers])
     across = np.linalg.svd(roots - roots.mean(0))[2][0]
     up = np.cross(across, (tips - roots).mean(0))
     turns = [(fingers[0][0].start, np.eye(3))]
@@ -168,7 +178,8 @@ def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndar
 def _turned(cone: Cone, turn: tuple[np.ndarray, np.ndarray]) -> Cone:
     """Returns the cone rotated about a point (3,) by a matrix (3, 3)."""
     anchor, matrix = turn
-    start, end = (anchor + matrix @ (point - anchor) for point in (cone.start, cone.end))
+    start = anchor + matrix @ (cone.start - anchor)
+    end = anchor + matrix @ (cone.end - anchor)
     return cone._replace(start=start, end=end)
 
 
@@ -188,15 +199,21 @@ def _fingers(skeleton: Skeleton) -> list[list[Cone]]:
 
 def _palm(skeleton: Skeleton) -> list[Cone]:
     """Cones of metacarpals, wrist and the ball of the thumb."""
-    mine = skeleton.capsule_link == 0
-    metacarpals, radii = skeleton.capsules[mine], skeleton.radii[mine]
+    is_of_palm = skeleton.capsule_link == 0
+    metacarpals = skeleton.capsules[is_of_palm]
+    radii = skeleton.radii[is_of_palm]
     thumb = _of_link(skeleton, skeleton.chains()[0][0])
     centres, widest, back = wrist_circles(skeleton)
     palm = []
     for (start, end), radius, wide, last in zip(metacarpals, radii, centres, widest, strict=True):
         palm.append(Cone(start, end, (radius, radius), (0,)))
         palm.append(
-            Cone(wide - 0.2 * _WRIST * back, wide + _WRIST * back, (1.1 * radius, last), (0,))
+            Cone(
+                wide - 0.2 * _WRIST_LENGTH * back,
+                wide + _WRIST_LENGTH * back,
+                (1.1 * radius, last),
+                (0,),
+            )
         )
     start, end = min(metacarpals, key=lambda ends: float(np.linalg.norm(ends.mean(0) - thumb[1])))
     for near, far, first, last in _BALL:
@@ -209,13 +226,13 @@ def wrist_circles(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """Centres (n, 3) and radii (n,) of circles that a wrist's end is about, and the unit direction
     (3,) to its back.
     """
-    mine = skeleton.capsule_link == 0
-    starts = skeleton.capsules[mine, 0]
+    is_of_palm = skeleton.capsule_link == 0
+    starts = skeleton.capsules[is_of_palm, 0]
     root = starts.mean(0)
     knuckles = [_of_link(skeleton, chain[0])[0] for chain in skeleton.chains()[1:]]
     return (
-        root + _WIDTH * (starts - root),
-        1.3 * skeleton.radii[mine],
+        root + _WRIST_WIDTH * (starts - root),
+        1.3 * skeleton.radii[is_of_palm],
         _unit(root - np.mean(knuckles, 0)),
     )
 
@@ -262,11 +279,12 @@ def _distance(
     # Palm[1] belongs to the wrist
     beyond = (points - palm[1].end) @ _unit(palm[1].end - palm[1].start)
     body = -_blend(-body, -beyond, _CUT)  # the wrist ends flat
-    found = body
+    nearest = body
     for i, finger in enumerate(fingers):
-        mine = np.min([_to(points, cone) for cone in finger], 0)
-        found = np.minimum(found, _blend(body, mine, _FINGER_BLEND if i else _THUMB_BLEND))
-    return found
+        to_finger = np.min([_to(points, cone) for cone in finger], 0)
+        width = _FINGER_BLEND if i else _THUMB_BLEND
+        nearest = np.minimum(nearest, _blend(body, to_finger, width))
+    return nearest
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
@@ -278,8 +296,8 @@ def _gradient(
     points: np.ndarray, palm: Sequence[Cone], fingers: Sequence[Sequence[Cone]]
 ) -> np.ndarray:
     """Unit gradients (n, 3) of the distances."""
-    step = 2e-4
-    moved = (points[:, None] + step * np.concatenate([np.eye(3), -np.eye(3)])).reshape(-1, 3)
+    steps = _GRADIENT_STEP * np.concatenate([np.eye(3), -np.eye(3)])
+    moved = (points[:, None] + steps).reshape(-1, 3)
     values = _distance(moved, palm, fingers).reshape(-1, 6)
     rise = values[:, :3] - values[:, 3:]
     return rise / (np.linalg.norm(rise, axis=-1, keepdims=True) + 1e-12)
@@ -296,14 +314,14 @@ def surface_net(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
       crossings; and triangles (F, 3) with outward normals.
     """
     inside = values < 0
-    sums, counts = (
-        np.zeros((*np.subtract(values.shape, 1), 3)),
-        np.zeros(np.subtract(values.shape, 1), int),
-    )
+    cells = np.subtract(values.shape, 1)
+    sums = np.zeros((*cells, 3))
+    counts = np.zeros(cells, int)
     quads = []
     number = np.arange(counts.size).reshape(counts.shape)
     for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
         first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
         crossed = np.argwhere(np.moveaxis((first < 0) != (second < 0), 0, axis))
         at = tuple(crossed.T)
@@ -340,15 +358,17 @@ def _weights(
     distances = np.stack(
         [np.min([_to(points, cone) for cone in finger], 0) for finger in fingers], 1
     )
-    nearest, (first, second) = distances.argmin(1), np.sort(distances, 1).T[:2]
+    nearest = distances.argmin(1)
+    first, second = np.sort(distances, 1).T[:2]
     for cone in palm:
         for link in cone.links:
             far[:, link] = np.minimum(far[:, link], _to(points, cone))
     for i, finger in enumerate(fingers):
-        mine = nearest == i
+        is_nearest = nearest == i
         for cone in finger:
             (link,) = cone.links
-            far[mine, link] = np.minimum(far[mine, link], _to(points[mine], cone))
+            distance = _to(points[is_nearest], cone)
+            far[is_nearest, link] = np.minimum(far[is_nearest, link], distance)
     weights = np.exp((far.min(1, keepdims=True) - far) / _SPREAD)
     weights /= weights.sum(1, keepdims=True)
     weights[:, 1:] *= np.clip((second - first) / _FOLD, 0, 1)[:, None]
@@ -361,10 +381,10 @@ def _weights(
     others = [
         (nearest != i, [cone.links[0] for cone in finger]) for i, finger in enumerate(fingers)
     ]
-    for _ in range(_ROUNDS):
+    for _ in range(_SMOOTHINGS):
         weights = 0.5 * weights + 0.5 * (around @ weights) / around.sum(1)[:, None]
         for beyond, theirs in others:
             weights[np.ix_(beyond, theirs)] = 0.0
         weights[:, 0] = 1 - weights[:, 1:].sum(1)
-    weights[weights < np.maximum(np.sort(weights, 1)[:, -_INFLUENCES, None], _LEAST)] = 0.0
+    weights[weights < np.maximum(np.sort(weights, 1)[:, -_MAX_INFLUENCES, None], _MIN_WEIGHT)] = 0.0
     return weights / weights.sum(1, keepdims=True)

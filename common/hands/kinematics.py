@@ -22,13 +22,14 @@ T = TypeVar("T")
 
 
 class _Chain(NamedTuple):
-    """Joints grouped by depth: `levels[d]` holds joint indices whose parents (-1: the palm) are one
-    level up.
-    """
+    """Joints of a hand, grouped by depth."""
 
     levels: tuple[tuple[int, ...], ...]
+    """Joints at each depth; their parents are one level up."""
     parents: tuple[int, ...]
-    link_joint: tuple[int, ...]  # last joint that moves each link, -1 for the palm
+    """Joint before each joint; -1 for the palm."""
+    link_joint: tuple[int, ...]
+    """Last joint that moves each link; -1 for the palm."""
 
 
 class GraspFrame(NamedTuple):
@@ -51,19 +52,20 @@ def _chain(hand: Hand) -> _Chain:
     """Returns the hand's joints by depth."""
     index = {link.name: i for i, link in enumerate(hand.links)}
     parents: list[int] = []
-    last: list[int] = []
     depth: list[int] = []
+    link_joint: list[int] = []
     for link in hand.links:
-        tail = last[index[link.parent]] if link.parent else -1
+        last = link_joint[index[link.parent]] if link.parent else -1
         for _ in link.joints:
-            parents.append(tail)
-            depth.append(depth[tail] + 1 if tail >= 0 else 0)
-            tail = len(parents) - 1
-        last.append(tail)
-    levels = tuple(
-        tuple(j for j, d in enumerate(depth) if d == level) for level in range(max(depth) + 1)
-    )
-    return _Chain(levels, tuple(parents), tuple(last))
+            joint = len(parents)
+            parents.append(last)
+            depth.append(depth[last] + 1 if last >= 0 else 0)
+            last = joint
+        link_joint.append(last)
+    levels = []
+    for level in range(max(depth) + 1):
+        levels.append(tuple(j for j, d in enumerate(depth) if d == level))
+    return _Chain(levels=tuple(levels), parents=tuple(parents), link_joint=tuple(link_joint))
 
 
 def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
@@ -80,33 +82,37 @@ def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
     chain = _chain(hand)
     axes = jnp.array([joint.axis for joint in hand.joints])
     anchors = jnp.array([joint.anchor for joint in hand.joints])
-    local = rotations.axis_rotation(axes, q)
-    offset = anchors - rotations.apply(local, anchors[:, None])[..., 0, :]
+    joint_rotation = rotations.axis_rotation(axes, q)
+    turned_anchors = rotations.apply(joint_rotation, anchors[:, None])[..., 0, :]
+    joint_translation = anchors - turned_anchors
     batch = q.shape[:-1]
-    done_r = jnp.broadcast_to(jnp.eye(3), (*batch, 1, 3, 3))
-    done_t = jnp.zeros((*batch, 1, 3))
-    place = {-1: 0}
+    # Motions of the palm and of the joints so far, level by level
+    rotation = jnp.broadcast_to(jnp.eye(3), (*batch, 1, 3, 3))
+    translation = jnp.zeros((*batch, 1, 3))
+    row = {-1: 0}
     for level in chain.levels:
-        above = np.array([place[chain.parents[j]] for j in level])
-        parent_r, parent_t = done_r[..., above, :, :], done_t[..., above, :]
-        here = np.array(level)
-        r = rotations.apply(local[..., here, :, :].mT, parent_r)
-        t = parent_t + rotations.apply(parent_r, offset[..., here, None, :])[..., 0, :]
-        place.update({j: done_t.shape[-2] + k for k, j in enumerate(level)})
-        done_r = jnp.concatenate([done_r, r], -3)
-        done_t = jnp.concatenate([done_t, t], -2)
-    order = np.array([place[j] for j in chain.link_joint])
-    return done_r[..., order, :, :], done_t[..., order, :]
+        parents = np.array([row[chain.parents[j]] for j in level])
+        joints = np.array(level)
+        parent_rotation = rotation[..., parents, :, :]
+        parent_translation = translation[..., parents, :]
+        offset = joint_translation[..., joints, None, :]
+        new_rotation = rotations.apply(joint_rotation[..., joints, :, :].mT, parent_rotation)
+        new_translation = parent_translation + rotations.apply(parent_rotation, offset)[..., 0, :]
+        for j in level:
+            row[j] = len(row)
+        rotation = jnp.concatenate([rotation, new_rotation], -3)
+        translation = jnp.concatenate([translation, new_translation], -2)
+    rows = np.array([row[j] for j in chain.link_joint])
+    return rotation[..., rows, :, :], translation[..., rows, :]
 
 
 def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     """Link origins and fingertips (..., P, 3), from `link_transforms`."""
     rotation, translation = transforms
-    carrier = hand.keypoint_links
-    points = rotations.apply(rotation[..., carrier, :, :], jnp.array(hand.keypoints)[:, None])[
-        ..., 0, :
-    ]
-    return points + translation[..., carrier, :]
+    links = hand.keypoint_links
+    at_zero = jnp.array(hand.keypoints)[:, None]
+    turned = rotations.apply(rotation[..., links, :, :], at_zero)[..., 0, :]
+    return turned + translation[..., links, :]
 
 
 def capsules(hand: Hand, transforms: tuple[Array, Array]) -> Array:
@@ -123,10 +129,8 @@ def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
     """Origins (..., L, 3) and orientations (..., L, 4) of the links' frames."""
     rotation, translation = link_transforms(hand, q)
     origins = jnp.array([link_origin(link) for link in hand.links])
-    return (
-        rotations.apply(rotation, origins[:, None])[..., 0, :] + translation,
-        rotations.from_matrix(rotation),
-    )
+    position = rotations.apply(rotation, origins[:, None])[..., 0, :] + translation
+    return position, rotations.from_matrix(rotation)
 
 
 def hand_center(hand: Hand, points: Array) -> Array:
@@ -147,12 +151,11 @@ def _points(hand: Hand, q: Array) -> Array:
 
 
 def untraced(function: Callable[..., T], *arguments: Any) -> T:
-    """The result of a function; inside a trace, it has numbers, and is not compiled operation by
-    operation.
+    """Returns the result of a function as numbers, also when called inside a trace.
+
+    It runs in another thread, in which nothing is traced.
     """
-    with concurrent.futures.ThreadPoolExecutor(
-        1
-    ) as thread:  # in another thread nothing is being traced
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
         return thread.submit(library_settings()(function), *arguments).result()
 
 
@@ -168,4 +171,9 @@ def grasp_frame(hand: Hand) -> GraspFrame:
     opening = float(np.linalg.norm(across))
     cross = across / opening
     forward = center - (center @ cross) * cross
-    return GraspFrame(forward / np.linalg.norm(forward), cross, center, opening)
+    return GraspFrame(
+        heading=forward / np.linalg.norm(forward),
+        cross=cross,
+        center=center,
+        opening=opening,
+    )

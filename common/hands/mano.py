@@ -45,6 +45,10 @@ _MASSES = {
     "ring": (0.0076, 0.0050, 0.0029),
     "little": (0.0043, 0.0028, 0.0016),
 }
+_PALM_MASS = 0.250
+"""kg."""
+_METACARPAL_RADIUS = 0.0100
+"""m."""
 _LIMITS = {"mcp_abduction": (-20, 20), "mcp_flexion": (-20, 90), "pip": (0, 105), "dip": (-5, 85)}
 _THUMB_LIMITS = {
     "cmc_abduction": (-15, 50),
@@ -78,12 +82,10 @@ class ManoModel:
         """
         vertices = self.vertices
         if betas is not None:
-            vertices = vertices + self.shape_directions[..., : len(betas)] @ np.asarray(
-                betas, float
-            )
-        return self.regressor @ vertices, vertices[
-            [TIP_VERTICES[finger] for finger in MANO_FINGERS]
-        ]
+            directions = self.shape_directions[..., : len(betas)]
+            vertices = vertices + directions @ np.asarray(betas, float)
+        tip_vertices = [TIP_VERTICES[finger] for finger in MANO_FINGERS]
+        return self.regressor @ vertices, vertices[tip_vertices]
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
@@ -101,12 +103,7 @@ def read_mano(path: pathlib.Path) -> ManoModel:
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)
-        if (
-            array is None
-            or array.dtype.kind not in "iuf"
-            or array.shape != shape
-            or not np.isfinite(array).all()
-        ):
+        if array is None or not _has_finite_numbers(array, shape):
             raise CongraspError(f"{path} has no array '{name}' {shape} of finite numbers.", _REMEDY)
         arrays.append(array.astype(float))
     model = ManoModel(*arrays)
@@ -114,6 +111,13 @@ def read_mano(path: pathlib.Path) -> ManoModel:
     if (joints[1:, 0] - joints[0, 0]).mean() > 0:
         raise CongraspError(f"{path} is a left hand.", _REMEDY)
     return model
+
+
+def _has_finite_numbers(array: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """True for an array of this shape without infinite values or NaN."""
+    if array.dtype.kind not in "iuf" or array.shape != shape:
+        return False
+    return bool(np.isfinite(array).all())
 
 
 def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
@@ -140,44 +144,27 @@ def mano_hand(model: ManoModel) -> Hand:
     """Returns the hand of a MANO model, of its mean shape."""
     joints, tips = model.skeleton()
     axes = mano_axes(joints, tips).reshape(5, 3, 3, 3)
-    anchors, ends = (joints[1:] - joints[0]).reshape(5, 3, 3), tips - joints[0]
+    anchors = (joints[1:] - joints[0]).reshape(5, 3, 3)
+    tips = tips - joints[0]
     links: list[Link] = []
-    palm: list[Capsule] = []
+    metacarpals: list[Capsule] = []
     for finger in ("thumb", "index", "middle", "ring", "little"):
         i = MANO_FINGERS.index(finger)
-        radii = _RADII[finger]
-        # The skin ends at the fingertip, a capsule's axis one radius before it.
-        end = ends[i] - radii[2] * _unit(ends[i] - anchors[i, 2])
-        points = [vector(point) for point in (*anchors[i], end)]
-        limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS
-        moved = [
-            dataclasses.replace(
-                HUMAN.joints[0],
-                name=f"{finger}_{name}",
-                axis=vector(axis),
-                anchor=points[bone],
-                lower=float(np.radians(limits[name][0])),
-                upper=float(np.radians(limits[name][1])),
-            )
-            for name, bone, axis in zip(
-                limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True
-            )
-        ]
-        names = (
-            ("metacarpal", "proximal", "distal")
-            if finger == "thumb"
-            else ("proximal", "middle", "distal")
-        )
-        weights = (2.0, 2.0, 6.0) if finger == "thumb" else (1.0, 1.0, 3.0)
-        groups = [(moved[0], moved[1]), (moved[2],), (moved[3],)]
-        links += chain(
-            [f"{finger}_{name}" for name in names], groups, points, radii, _MASSES[finger], weights
-        )
+        links += _finger(finger, axes[i], anchors[i], tips[i])
         if finger != "thumb":
-            palm.append(Capsule(vector(0.2 * anchors[i, 0]), points[0], 0.0100))
+            start = vector(0.2 * anchors[i, 0])
+            metacarpals.append(Capsule(start, vector(anchors[i, 0]), _METACARPAL_RADIUS))
+    palm = Link(
+        "palm",
+        parent="",
+        joints=(),
+        capsules=tuple(metacarpals),
+        mass=_PALM_MASS,
+        contact_weight=1.0,
+    )
     return Hand(
         name="mano",
-        links=(Link("palm", "", (), tuple(palm), 0.250, 1.0), *links),
+        links=(palm, *links),
         thumb="thumb_distal",
         open_pose={
             "thumb_cmc_abduction": 0.55,
@@ -197,6 +184,48 @@ def mano_hand(model: ManoModel) -> Hand:
     )
 
 
+def _finger(
+    finger: str, axes: np.ndarray, anchors: np.ndarray, tip: np.ndarray
+) -> tuple[Link, ...]:
+    """Returns the links of a finger.
+
+    Args:
+      finger: its name.
+      axes: (3, 3, 3) of its joints, from `mano_axes`.
+      anchors: (3, 3) of its joints, wrist frame, m.
+      tip: (3,) its fingertip, wrist frame, m.
+    """
+    is_thumb = finger == "thumb"
+    radii = _RADII[finger]
+    # The skin ends at the fingertip, a capsule's axis one radius before it.
+    end = tip - radii[2] * _unit(tip - anchors[2])
+    points = [vector(point) for point in (*anchors, end)]
+    limits = _THUMB_LIMITS if is_thumb else _LIMITS
+    bones = (0, 0, 1, 2)
+    joint_axes = (axes[0, 1], axes[0, 2], axes[1, 2], axes[2, 2])
+    joints = []
+    for name, bone, axis in zip(limits, bones, joint_axes, strict=True):
+        lower, upper = np.radians(limits[name])
+        joint = dataclasses.replace(
+            HUMAN.joints[0],
+            name=f"{finger}_{name}",
+            axis=vector(axis),
+            anchor=points[bone],
+            lower=float(lower),
+            upper=float(upper),
+        )
+        joints.append(joint)
+    names = ("metacarpal", "proximal", "distal") if is_thumb else ("proximal", "middle", "distal")
+    return chain(
+        [f"{finger}_{name}" for name in names],
+        joints=[(joints[0], joints[1]), (joints[2],), (joints[3],)],
+        points=points,
+        radii=radii,
+        masses=_MASSES[finger],
+        weights=(2.0, 2.0, 6.0) if is_thumb else (1.0, 1.0, 3.0),
+    )
+
+
 def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
     """Returns the user's MANO model from `path` or the environment variable `CONGRASP_MANO`; None
     if neither is set.
@@ -204,8 +233,10 @@ def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
     Raises:
       CongraspError: see `read_mano`.
     """
-    named = path or os.environ.get(VARIABLE)
-    return read_mano(pathlib.Path(named)) if named else None
+    file = path or os.environ.get(VARIABLE)
+    if not file:
+        return None
+    return read_mano(pathlib.Path(file))
 
 
 def own_mano_hand() -> Hand:
@@ -226,11 +257,11 @@ def own_mano_hand() -> Hand:
 
 def _each(**angles: float) -> dict[str, float]:
     """Returns the same angles for the joints of the four fingers."""
-    return {
-        f"{finger}_{name}": x
-        for finger in ("index", "middle", "ring", "little")
-        for name, x in angles.items()
-    }
+    pose = {}
+    for finger in ("index", "middle", "ring", "little"):
+        for name, angle in angles.items():
+            pose[f"{finger}_{name}"] = angle
+    return pose
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

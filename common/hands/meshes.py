@@ -25,14 +25,13 @@ MAX_DISTANCE = 2.0
 """Greatest distance of a mesh's coordinates from the wrist's origin, m; a larger one means a file
 in another unit.
 """
-PARTS = ("vertices", "faces")
 _REMEDY = "Run 'congrasp hands import' again, or delete the file."
 
 Meshes = dict[str, tuple[np.ndarray, np.ndarray]]
 """Vertices (V, 3) m, wrist frame at zero, and triangles (E, 3), by link name."""
 
 
-def beside(path: pathlib.Path) -> pathlib.Path:
+def mesh_file(path: pathlib.Path) -> pathlib.Path:
     """Returns the path of the meshes of a hand file."""
     return path.with_suffix(SUFFIX)
 
@@ -43,39 +42,43 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
     Raises:
       CongraspError: the file is damaged, has links that the hand lacks, or is too large for a hand.
     """
-    file = beside(path)
+    file = mesh_file(path)
     if not file.is_file():
         return {}
     arrays = read_npz(file, _REMEDY, kind="the meshes of a hand", largest=MAX_BYTES)
-    found = {}
+    meshes = {}
     for name in dict.fromkeys(key.rpartition("/")[0] for key in arrays):
-        vertices, faces = (arrays.get(f"{name}/{part}", np.zeros(0)) for part in PARTS)
-        fits = (
-            vertices.ndim == faces.ndim == 2
-            and vertices.shape[1] == faces.shape[1] == 3
-            and faces.size
-        )
-        fits = (
-            fits
-            and vertices.dtype.kind == "f"
-            and faces.dtype.kind == "i"
-            and np.isfinite(vertices).all()
-        )
-        if not fits or faces.min() < 0 or faces.max() >= len(vertices) or len(faces) > MAX_FACES:
+        vertices = arrays.get(f"{name}/vertices", np.zeros(0))
+        faces = arrays.get(f"{name}/faces", np.zeros(0))
+        if not _is_mesh(vertices, faces):
             raise CongraspError(f"{file} holds no mesh of '{name[:60]}'.", _REMEDY)
-        if (farthest := np.abs(vertices).max()) > MAX_DISTANCE:
+        farthest = np.abs(vertices).max()
+        if farthest > MAX_DISTANCE:
             raise CongraspError(
                 f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist, more than "
                 f"{MAX_DISTANCE:g} m.",
                 f"Check the file's unit. {_REMEDY}",
             )
-        found[name] = vertices, faces
-    if odd := sorted({*found} - {link.name for link in hand.links}):
+        meshes[name] = (vertices, faces)
+    unknown_links = sorted({*meshes} - {link.name for link in hand.links})
+    if unknown_links:
         raise CongraspError(
-            f"{file} does not belong to the hand '{hand.name}', which has no link '{odd[0][:60]}'.",
+            f"{file} does not belong to the hand '{hand.name}', which has no link "
+            f"'{unknown_links[0][:60]}'.",
             _REMEDY,
         )
-    return found
+    return meshes
+
+
+def _is_mesh(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """True for finite vertices (V, 3) and 1 to `MAX_FACES` triangles (E, 3) of them."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f":
+        return False
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind != "i":
+        return False
+    if not 0 < len(faces) <= MAX_FACES or not np.isfinite(vertices).all():
+        return False
+    return bool(faces.min() >= 0 and faces.max() < len(vertices))
 
 
 def own_meshes(hand: Hand) -> Meshes:
@@ -89,21 +92,23 @@ def own_meshes(hand: Hand) -> Meshes:
     if file is None:
         return {}
     try:
-        mine = get_hand(hand.name)
+        stored_hand = get_hand(hand.name)
     except CongraspError:  # a different hand of this name whose file cannot be read
         return {}
-    return load_meshes(file, hand) if mine.text == hand.text else {}
+    if stored_hand.text != hand.text:
+        return {}
+    return load_meshes(file, hand)
 
 
 def save_meshes(path: pathlib.Path, meshes: Meshes) -> None:
     """Writes the meshes of a hand next to its file; without any, removes an existing file."""
     if not meshes:
-        beside(path).unlink(missing_ok=True)
+        mesh_file(path).unlink(missing_ok=True)
         return
-    parts = [
-        (name, *part) for name, mesh in meshes.items() for part in zip(PARTS, mesh, strict=True)
-    ]
-    arrays: dict[str, Any] = {f"{name}/{part}": array for name, part, array in parts}
+    arrays: dict[str, Any] = {}
+    for name, (vertices, faces) in meshes.items():
+        arrays[f"{name}/vertices"] = vertices
+        arrays[f"{name}/faces"] = faces
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    write_atomically(beside(path), buffer.getvalue())
+    write_atomically(mesh_file(path), buffer.getvalue())

@@ -1,7 +1,7 @@
 """A hand as MuJoCo bodies: virtual wrist, links with capsules or solids, and position actuators."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,26 @@ from congrasp.common.runtime.physics_library import mujoco
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: geoms that collide with it have this bit in their conaffinity."""
-_COUPLING_TIME = 0.005  # time constant of joint couplings, s
+_COUPLING_TIME = 0.005
+"""Time constant of joint couplings, s."""
+_SLIDING_FRICTION = 0.1
+"""Of the hand; MuJoCo uses the greater of two, so that the object's decides."""
+_SOLVER_WEIGHT = 1000.0
+"""Weight of the hand's solver parameters, against 1 of other geoms, so that they decide."""
+_NO_FRICTION = 1
+_TORSIONAL_FRICTION = 4
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
+
+
+class _Contacts(NamedTuple):
+    """Contacts of a link."""
+
+    with_hand: bool
+    """True if it collides with other links."""
+    time: float
+    """Time constant, s."""
+    torsional_friction: float
+    """m; 0 is a link without."""
 
 
 def add_hand(
@@ -37,15 +55,14 @@ def add_hand(
     fingertips have the torsional friction `torsional_friction` in metres.
     """
     base = spec.worldbody.add_body(name="hand_base")
-    bodies: dict[str, mujoco.MjsBody] = {}
+    bodies = {"": base}
+    origins = {"": np.zeros(3)}
     for link in hand.links:
-        parent = bodies[link.parent] if link.parent else base
-        parent_origin = np.array(
-            link_origin(next(x for x in hand.links if x.name == link.parent)) if link.parent else 0
-        )
         origin = np.array(link_origin(link))
-        body = parent.add_body(name=link.name, pos=origin - parent_origin, gravcomp=1.0)
+        offset = origin - origins[link.parent]
+        body = bodies[link.parent].add_body(name=link.name, pos=offset, gravcomp=1.0)
         bodies[link.name] = body
+        origins[link.name] = origin
         if not link.parent:
             _add_wrist(spec, body, hand)
         for joint in link.joints:
@@ -59,14 +76,12 @@ def add_hand(
                 damping=joint.damping,
                 armature=joint.armature,
             )
-        _add_shapes(
-            body,
-            link,
-            origin,
-            self_collision,
-            contact_time,
-            torsional_friction if link.tip else 0.0,
+        contacts = _Contacts(
+            with_hand=self_collision,
+            time=contact_time,
+            torsional_friction=torsional_friction if link.tip else 0.0,
         )
+        _add_shapes(body, link, origin, contacts)
     _add_transmission(spec, hand)
     if self_collision:
         for first, second in overlapping(hand):
@@ -112,56 +127,65 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
     """
     spec = mujoco.MjSpec()
     bodies: dict[str, mujoco.MjsBody] = {}
+    contacts = _Contacts(with_hand=True, time=CONTACT_TIME, torsional_friction=0.0)
     for link in hand.links:
         parent = bodies[link.parent] if link.parent else spec.worldbody
-        bodies[link.name] = body = parent.add_body(name=link.name)
+        body = parent.add_body(name=link.name)
+        bodies[link.name] = body
         if not link.parent:
             body.add_freejoint()
         for joint in link.joints:
             body.add_joint(name=joint.name, axis=joint.axis, pos=joint.anchor)
-        _add_shapes(body, link, np.zeros(3), True, CONTACT_TIME, 0.0)
+        _add_shapes(body, link, np.zeros(3), contacts)
     model = spec.compile()
     data = mujoco.MjData(model)
-    found: set[tuple[int, int]] = set()
+    pairs: set[tuple[int, int]] = set()
     for q in (hand.q_open, np.clip(0.0, hand.lower, hand.upper)):
         data.qpos[7:] = q
         mujoco.mj_forward(model, data)
-        touching = data.contact.geom[data.contact.dist < 0]
-        found |= {tuple(pair) for pair in np.sort(model.geom_bodyid[touching], axis=-1).tolist()}
-    return tuple((model.body(a).name, model.body(b).name) for a, b in sorted(found))
+        touching_geoms = data.contact.geom[data.contact.dist < 0]
+        touching_bodies = np.sort(model.geom_bodyid[touching_geoms], axis=-1)
+        pairs |= {(first, second) for first, second in touching_bodies.tolist()}
+    return tuple(
+        (model.body(first).name, model.body(second).name) for first, second in sorted(pairs)
+    )
 
 
 def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
     """Adds the six joints of the virtual wrist with their actuators."""
     gains = hand.wrist
-    for i, name in enumerate(WRIST_JOINTS):
-        slide = i < 3
+    slides = WRIST_JOINTS[:3]
+    hinges = WRIST_JOINTS[3:]
+    for axis, name in zip(np.eye(3), slides, strict=True):
         body.add_joint(
             name=name,
-            type=mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE,
-            axis=np.eye(3)[i % 3],
-            armature=gains.slide_armature if slide else gains.hinge_armature,
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=axis,
+            armature=gains.slide_armature,
         )
-        _add_position_actuator(
-            spec,
-            name,
-            mujoco.mjtTrn.mjTRN_JOINT,
-            gains.slide_kp if slide else gains.hinge_kp,
-            gains.slide_kv if slide else gains.hinge_kv,
-            gains.slide_limit if slide else gains.hinge_limit,
+        servo = _Servo(mujoco.mjtTrn.mjTRN_JOINT, gains.slide_kp, gains.slide_kv, gains.slide_limit)
+        _add_servo(spec, name, servo)
+    for axis, name in zip(np.eye(3), hinges, strict=True):
+        body.add_joint(
+            name=name,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=axis,
+            armature=gains.hinge_armature,
         )
+        servo = _Servo(mujoco.mjtTrn.mjTRN_JOINT, gains.hinge_kp, gains.hinge_kv, gains.hinge_limit)
+        _add_servo(spec, name, servo)
 
 
 def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
     """Adds motors, tendons that pull several joints, and couplings of joints."""
     for motor in hand.motors:
-        alone = motor.joints == {motor.name: 1.0}
-        if not alone:
+        moves_one_joint = motor.joints == {motor.name: 1.0}
+        if not moves_one_joint:
             tendon = spec.add_tendon(name=motor.name)
             for joint, coefficient in motor.joints.items():
                 tendon.wrap_joint(joint, coefficient)
-        kind = mujoco.mjtTrn.mjTRN_JOINT if alone else mujoco.mjtTrn.mjTRN_TENDON
-        _add_position_actuator(spec, motor.name, kind, motor.kp, motor.kv, motor.torque_limit)
+        kind = mujoco.mjtTrn.mjTRN_JOINT if moves_one_joint else mujoco.mjtTrn.mjTRN_TENDON
+        _add_servo(spec, motor.name, _Servo(kind, motor.kp, motor.kv, motor.torque_limit))
     for coupling in hand.couplings:
         spec.add_equality(
             name=coupling.joint,
@@ -175,51 +199,57 @@ def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
         )
 
 
-def _add_position_actuator(
-    spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, kp: float, kv: float, limit: float
-) -> None:
-    """Adds a position servo for the joint or tendon of this name, with this force limit."""
+class _Servo(NamedTuple):
+    """A position servo, with gains in SI units of its joint or tendon."""
+
+    kind: mujoco.mjtTrn
+    """Whether it moves a joint or a tendon."""
+    kp: float
+    kv: float
+    limit: float
+    """Greatest force or torque."""
+
+
+def _add_servo(spec: mujoco.MjSpec, name: str, servo: _Servo) -> None:
+    """Adds a position servo for the joint or tendon of this name."""
     actuator = spec.add_actuator(
         name=name,
         target=name,
-        trntype=kind,
-        forcerange=(-limit, limit),
+        trntype=servo.kind,
+        forcerange=(-servo.limit, servo.limit),
         forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
     )
-    actuator.set_to_position(kp, kv=kv)
+    actuator.set_to_position(servo.kp, kv=servo.kv)
 
 
-def _add_shapes(
-    body: mujoco.MjsBody,
-    link: Link,
-    origin: np.ndarray,
-    self_collision: bool,
-    contact_time: float,
-    torsion: float,
-) -> None:
-    """Adds a link's solids, or its capsules if it has none; they share its mass by volume."""
-    found = [_solid(solid, origin) for solid in link.solids] or [
-        _capsule(x, origin) for x in link.capsules
-    ]
-    volumes = np.array([volume for _, volume in found])
-    for i, ((fields, _), share) in enumerate(zip(found, volumes / volumes.sum(), strict=True)):
+def _add_shapes(body: mujoco.MjsBody, link: Link, origin: np.ndarray, contacts: _Contacts) -> None:
+    """Adds a link's solids, or its capsules if it has none; they share its mass by volume.
+
+    Args:
+      body: body of the link.
+      link: the link.
+      origin: (3,) of the body's frame.
+      contacts: contacts of the link.
+    """
+    if link.solids:
+        shapes_of_link = [_solid(solid, origin) for solid in link.solids]
+    else:
+        shapes_of_link = [_capsule(capsule, origin) for capsule in link.capsules]
+    volumes = np.array([volume for _, volume in shapes_of_link])
+    shares = volumes / volumes.sum()
+    # The greater condim of two geoms decides: 1 between links, 3 or more with the object
+    condim = _TORSIONAL_FRICTION if contacts.torsional_friction else _NO_FRICTION
+    for i, (fields, _) in enumerate(shapes_of_link):
         body.add_geom(
             name=f"{link.name}_{i}",
             **fields,
-            mass=link.mass * share,
+            mass=link.mass * shares[i],
             contype=HAND_CONTYPE,
-            conaffinity=HAND_CONTYPE if self_collision else 0,
-            condim=4
-            if torsion
-            else 1,  # the greater of the two decides: 1 between links, 3 against the object
-            solref=(contact_time, 1.0),
-            solmix=1000.0,  # against 1 of other geoms, so that it decides
-            # MuJoCo uses the greater of two: the object's sliding friction decides
-            friction=(
-                0.1,
-                torsion,
-                0.0,
-            ),
+            conaffinity=HAND_CONTYPE if contacts.with_hand else 0,
+            condim=condim,
+            solref=(contacts.time, 1.0),
+            solmix=_SOLVER_WEIGHT,
+            friction=(_SLIDING_FRICTION, contacts.torsional_friction, 0.0),
         )
 
 

@@ -16,6 +16,13 @@ import numpy as np
 from congrasp.common.hands.spec import Hand, Link, chain_of
 
 Array = Any
+HUMAN_OPENING = 0.106
+"""Opening in m between thumb and fingers of the human hand, whose object scale is one."""
+_SCALE_EXPONENT = 0.6
+_MIN_SCALE = 0.3
+_MAX_SCALE = 3.0
+_MIN_LEVER = 1e-6
+"""Least displacement of a tip per radian of a motor, m."""
 
 
 class _Transmission(NamedTuple):
@@ -39,52 +46,81 @@ class _Transmission(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def transmission(hand: Hand) -> _Transmission:
-    """The hand's motors and joints, as arrays."""
+    """Returns the mapping between the hand's motors and joints, as arrays."""
     index = {joint.name: j for j, joint in enumerate(hand.joints)}
-    most = max(len(motor.joints) for motor in hand.motors)
-    pulled, coefficients = (
-        np.zeros((len(hand.motors), most), int),
-        np.zeros((len(hand.motors), most)),
-    )
-    owner, ratio, rest = np.zeros(len(index), int), np.ones(len(index)), np.zeros(len(index))
+    most_joints = max(len(motor.joints) for motor in hand.motors)
+    pulled = np.zeros((len(hand.motors), most_joints), int)
+    coefficients = np.zeros((len(hand.motors), most_joints))
+    motor_of_joint = np.zeros(len(index), int)
+    ratio = np.ones(len(index))
+    rest = np.zeros(len(index))
     for m, motor in enumerate(hand.motors):
-        joints, c = (
-            np.array([index[name] for name in motor.joints]),
-            np.array([*motor.joints.values()]),
-        )
-        pulled[m, : len(c)], coefficients[m, : len(c)] = joints, c
-        owner[joints] = m
+        joints = np.array([index[name] for name in motor.joints])
+        c = np.array([*motor.joints.values()])
+        pulled[m, : len(c)] = joints
+        coefficients[m, : len(c)] = c
+        motor_of_joint[joints] = m
         if len(c) > 1:
-            lower, upper = (
-                np.array([getattr(hand.joints[j], side) for j in joints])
-                for side in ("lower", "upper")
-            )
-            start, end = np.where(c > 0, (lower, upper), (upper, lower))
-            ratio[joints] = (end - start) / (c @ (end - start))
-            rest[joints] = start - ratio[joints] * (c @ start)
+            ratio[joints], rest[joints] = _tendon_motion(hand, joints, c)
         else:
             ratio[joints] = 1.0 / c
     for coupling in hand.couplings:
-        j, leader = index[coupling.joint], index[coupling.leader]
-        owner[j], ratio[j] = owner[leader], coupling.ratio * ratio[leader]
-        rest[j] = coupling.offset + coupling.ratio * rest[leader]
-    ends = np.sort([((getattr(hand, side) - rest) / ratio) for side in ("lower", "upper")], axis=0)
-    limits = np.array(
-        [
-            [ends[0][owner == m].max() for m in range(len(pulled))],
-            [ends[1][owner == m].min() for m in range(len(pulled))],
-        ]
+        follower = index[coupling.joint]
+        leader = index[coupling.leader]
+        motor_of_joint[follower] = motor_of_joint[leader]
+        ratio[follower] = coupling.ratio * ratio[leader]
+        rest[follower] = coupling.offset + coupling.ratio * rest[leader]
+    return _Transmission(
+        pulled=pulled,
+        coefficients=coefficients.astype(np.float32),
+        motor=motor_of_joint,
+        ratio=ratio.astype(np.float32),
+        rest=rest.astype(np.float32),
+        limits=_motor_limits(hand, motor_of_joint, ratio, rest).astype(np.float32),
     )
-    single = (x.astype(np.float32) for x in (ratio, rest, limits))
-    return _Transmission(pulled, coefficients.astype(np.float32), owner, *single)
+
+
+def _tendon_motion(
+    hand: Hand, joints: np.ndarray, coefficients: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motion of the joints of a tendon, which reach their limits together.
+
+    Args:
+      hand: the hand.
+      joints: (T,) indices of the joints.
+      coefficients: (T,) of the joints.
+
+    Returns:
+      Radians (T,) of each joint per radian of the motor, and its angle (T,) where that is at zero.
+    """
+    lower = np.array([hand.joints[j].lower for j in joints])
+    upper = np.array([hand.joints[j].upper for j in joints])
+    start = np.where(coefficients > 0, lower, upper)
+    end = np.where(coefficients > 0, upper, lower)
+    ratio = (end - start) / (coefficients @ (end - start))
+    return ratio, start - ratio * (coefficients @ start)
+
+
+def _motor_limits(
+    hand: Hand, motor_of_joint: np.ndarray, ratio: np.ndarray, rest: np.ndarray
+) -> np.ndarray:
+    """Positions (2, M) of the motors between which all of their joints are within their limits."""
+    at_lower = (hand.lower - rest) / ratio
+    at_upper = (hand.upper - rest) / ratio
+    first, last = np.sort([at_lower, at_upper], axis=0)
+    limits = np.zeros((2, len(hand.motors)))
+    for m in range(len(hand.motors)):
+        limits[0, m] = first[motor_of_joint == m].max()
+        limits[1, m] = last[motor_of_joint == m].min()
+    return limits
 
 
 def motor_positions(hand: Hand, q: Array) -> Array:
     """Positions (..., M) of the motors at joint angles (..., F), rad."""
     if len(hand.motors) == len(hand.joints):
         return q
-    own = transmission(hand)
-    return (own.coefficients * q[..., own.pulled]).sum(-1)
+    mapping = transmission(hand)
+    return (mapping.coefficients * q[..., mapping.pulled]).sum(-1)
 
 
 def joint_positions(hand: Hand, motors: Array) -> Array:
@@ -93,8 +129,8 @@ def joint_positions(hand: Hand, motors: Array) -> Array:
     """
     if len(hand.motors) == len(hand.joints):
         return motors
-    own = transmission(hand)
-    return own.ratio * motors[..., own.motor] + own.rest
+    mapping = transmission(hand)
+    return mapping.ratio * motors[..., mapping.motor] + mapping.rest
 
 
 def motor_limits(hand: Hand) -> np.ndarray:
@@ -107,25 +143,15 @@ def coupled(hand: Hand, q: Array) -> Array:
     if not hand.couplings:
         return q
     names = [joint.name for joint in hand.joints]
-    leader, ratio, offset = (
-        np.arange(len(names)),
-        np.ones(len(names), np.float32),
-        np.zeros(len(names), np.float32),
-    )
+    leader = np.arange(len(names))
+    ratio = np.ones(len(names), np.float32)
+    offset = np.zeros(len(names), np.float32)
     for coupling in hand.couplings:
-        j = names.index(coupling.joint)
-        leader[j], ratio[j], offset[j] = (
-            names.index(coupling.leader),
-            coupling.ratio,
-            coupling.offset,
-        )
+        follower = names.index(coupling.joint)
+        leader[follower] = names.index(coupling.leader)
+        ratio[follower] = coupling.ratio
+        offset[follower] = coupling.offset
     return ratio * q[..., leader] + offset
-
-
-HUMAN_OPENING = 0.106
-"""Opening in m between thumb and fingers of the human hand, whose object scale is one."""
-_EXPONENT = 0.6
-_SCALES = 0.3, 3.0
 
 
 def fitting_scale(opening: float) -> float:
@@ -135,7 +161,8 @@ def fitting_scale(opening: float) -> float:
     1.75 times the human hand's gives Allegro's 1.4, one of 1.16 times Sharpa's 1.1. It is below one
     because the mass of an object grows with the cube of its lengths.
     """
-    return round(float(np.clip((opening / HUMAN_OPENING) ** _EXPONENT, *_SCALES)), 1)
+    scale = (opening / HUMAN_OPENING) ** _SCALE_EXPONENT
+    return round(float(np.clip(scale, _MIN_SCALE, _MAX_SCALE)), 1)
 
 
 @functools.cache
@@ -154,15 +181,18 @@ def tip_forces(hand: Hand) -> np.ndarray:
 def _force(hand: Hand, link: Link) -> float:
     """Returns the force of the finger that ends with this link, N."""
     assert link.tip is not None
-    own, finger = transmission(hand), chain_of(hand, link.name)
-    moved = [joint for other in hand.links for joint in other.joints if other.name in finger]
-    index = {joint.name: j for j, joint in enumerate(hand.joints)}
-    ways: dict[int, np.ndarray] = {}
-    for joint in moved:
-        j = index[joint.name]
-        way = own.ratio[j] * np.cross(joint.axis, np.subtract(link.tip, joint.anchor))
-        ways[int(own.motor[j])] = ways.get(int(own.motor[j]), np.zeros(3)) + way
-    return min(
-        hand.motors[m].torque_limit / max(float(np.linalg.norm(way)), 1e-6)
-        for m, way in ways.items()
-    )
+    mapping = transmission(hand)
+    finger = chain_of(hand, link.name)
+    displacements: dict[int, np.ndarray] = {}
+    """Displacement (3,) of the tip per radian of each motor, m."""
+    for j, joint in enumerate(hand.joints):
+        if hand.links[hand.joint_links[j]].name not in finger:
+            continue
+        lever = np.cross(joint.axis, np.subtract(link.tip, joint.anchor))
+        motor = int(mapping.motor[j])
+        displacements[motor] = displacements.get(motor, np.zeros(3)) + mapping.ratio[j] * lever
+    forces = []
+    for motor, displacement in displacements.items():
+        length = max(float(np.linalg.norm(displacement)), _MIN_LEVER)
+        forces.append(hand.motors[motor].torque_limit / length)
+    return min(forces)

@@ -14,10 +14,30 @@ from scipy.spatial import cKDTree
 
 from congrasp.common import mirror
 from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of, wrist_circles
+from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
-from congrasp.common.hands.spec import Hand, Link, link_origin, right_name
+from congrasp.common.hands.spec import Hand, Link, link_origin
 
-_AROUND = 28  # points of a ring
+HUMAN_HANDS = ("human", "mano")
+"""Names of hands with flesh."""
+MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
+"""Materials of a surface."""
+_MAX_SIZE = 0.5
+"""Size of a hand with flesh, m."""
+_SHORT_NORMAL = 0.5
+"""Length below which a mean of unit normals is one of rounding errors."""
+_SMALLEST_LENGTH = 1e-12
+"""Length of a normal that has a direction."""
+_SECTIONS = 20
+"""Sides of a housing."""
+_BEVEL = 0.45
+"""Bevel of a housing's ends, in radii."""
+_DRUM_RADIUS = 0.72
+"""Radius of a joint's drum, in radii of its link."""
+_DRUM_LENGTH = 1.04
+"""Half length of a joint's drum, in radii of its link."""
+_AROUND = 28
+"""Points of a ring."""
 _NAIL = (
     (0.2, 0.0005),
     (0.55, 0.0005),
@@ -27,10 +47,14 @@ _NAIL = (
     (0.2, -0.0012),
 )
 """Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
-_NAIL_WIDTH, _NAIL_LENGTH, _NAIL_BACK = 0.90, 0.85, 0.30
-"""Half width of a nail, rad about the finger; its half length, and its distance behind the centre
-of the fingertip, in radii of the tip."""
-_SQUARE = 0.65  # exponent of the nail's outline; 1 is an ellipse
+_NAIL_WIDTH = 0.90
+"""Half width of a nail, rad about the finger."""
+_NAIL_LENGTH = 0.85
+"""Half length of a nail, in radii of the fingertip."""
+_NAIL_BACK = 0.30
+"""Distance of a nail behind the centre of the fingertip, in radii of the fingertip."""
+_SQUARE = 0.65
+"""Exponent of the nail's outline; 1 is an ellipse."""
 _SLEEVE = (
     *((0.026, -0.004), (0.0245, 0.0008), (0.0245, 0.0030), (0.0265, 0.0042), (0.034, 0.0044)),
     *((0.036, 0.0034), (0.060, 0.0042), (0.082, 0.0056), (0.086, 0.0040)),
@@ -42,7 +66,8 @@ m.
 
 def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
     """A nail on the back of each fingertip that a joint bends; it moves with the skin below it."""
-    found, below = [], cKDTree(skin.points)
+    surfaces = []
+    skin_points = cKDTree(skin.points)
     for chain in skeleton.chains():
         bends = np.flatnonzero(skeleton.joint_link == chain[-1])
         if not len(bends):
@@ -66,9 +91,10 @@ def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
             out = np.cos(down) * radial + np.sin(down) * along
             rings.append(end + np.minimum(place, 0)[:, None] * along + (radius + height) * out)
         nail = _shell(np.array(rings), chain[-1], len(skeleton.names))
-        moves = skin.weights[below.query(nail.points)[1]].mean(0)
-        found.append(nail._replace(weights=np.tile(moves, (len(nail.points), 1))))
-    return found
+        nearest = skin_points.query(nail.points)[1]
+        weights = skin.weights[nearest].mean(0)
+        surfaces.append(nail._replace(weights=np.tile(weights, (len(nail.points), 1))))
+    return surfaces
 
 
 def sleeve(skeleton: Skeleton) -> Surface:
@@ -106,21 +132,6 @@ def _shell(rings: np.ndarray, link: int, links: int) -> Surface:
     weights = np.zeros((len(points), links))
     weights[:, link] = 1.0
     return Surface(points, np.array(mesh.vertex_normals), np.array(mesh.faces), weights)
-
-
-HUMAN_HANDS = ("human", "mano")
-"""Names of hands with flesh."""
-MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
-"""Materials of a surface."""
-_LARGEST = 0.5  # m
-_SHORTEST = 1e-12  # length of a normal that has a direction
-_SECTIONS = 20  # sides of a housing
-_BEVEL = 0.45  # bevel of a housing's ends, in radii
-# Radius and half length of a joint's drum, in radii of its link
-_DRUM_RADIUS, _DRUM_LENGTH = (
-    0.72,
-    1.04,
-)
 
 
 class Skin(NamedTuple):
@@ -165,16 +176,15 @@ class Skin(NamedTuple):
         """Points (V, 3) and unit normals (V, 3) for link frames at (L, 3) with rotations (L, 3,
         3).
         """
-        matrices = np.concatenate(
-            [rotation, (position - np.einsum("lij,lj->li", rotation, self.origins))[..., None]], -1
-        )
-        mixed = (self.weights @ matrices.reshape(len(matrices), 12).astype(np.float32)).reshape(
-            -1, 3, 4
-        )
-        points = np.einsum("vij,vj->vi", mixed[..., :3], self.points) + mixed[..., 3]
-        normals = np.einsum("vij,vj->vi", mixed[..., :3], self.normals)
+        translation = position - np.einsum("lij,lj->li", rotation, self.origins)
+        matrices = np.concatenate([rotation, translation[..., None]], -1)
+        rows = matrices.reshape(len(matrices), 12).astype(np.float32)
+        mixed = (self.weights @ rows).reshape(-1, 3, 4)
+        mixed_rotation = mixed[..., :3]
+        points = np.einsum("vij,vj->vi", mixed_rotation, self.points) + mixed[..., 3]
+        normals = np.einsum("vij,vj->vi", mixed_rotation, self.normals)
         # The normals of a vertex between two links may cancel out
-        lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _SHORTEST)
+        lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _SMALLEST_LENGTH)
         return points, normals / lengths
 
 
@@ -236,26 +246,41 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     """Returns a surface of the links' meshes, each rigid, and the capsules of links without a
     mesh.
     """
-    parts = [
-        trimesh.Trimesh(*meshes[link.name], process=False)
-        if link.name in meshes
-        else _rounded(link)
-        for link in hand.links
-    ]
+    parts = []
+    for link in hand.links:
+        if link.name in meshes:
+            vertices, faces = meshes[link.name]
+            parts.append(trimesh.Trimesh(vertices, faces, process=False))
+        else:
+            parts.append(_rounded(link))
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
-    normals = np.concatenate([part.vertex_normals for part in parts]).astype(np.float32)
-    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points without faces, or with faces back to back
+    link_of_point = np.repeat(np.arange(len(parts)), counts)
+    shifted_faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
-        normals=normals,
-        faces=np.concatenate(
-            [part.faces + start for part, start in zip(parts, starts, strict=True)]
-        ).astype(np.int32),
-        weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
+        normals=np.concatenate([_unit_normals(part) for part in parts]).astype(np.float32),
+        faces=np.concatenate(shifted_faces).astype(np.int32),
+        weights=np.eye(len(parts), dtype=np.float32)[link_of_point],
         origins=np.array([link_origin(link) for link in hand.links]),
         material=np.full(sum(counts), MATERIALS.index("link")),
     )
+
+
+def _unit_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Returns normals (V, 3) of a mesh's points.
+
+    Where the faces around a point are back to back and cancel, it is the normal of one of them; of
+    a point without a face that has an area, +z.
+    """
+    normals = np.array(mesh.vertex_normals)
+    is_degenerate = np.linalg.norm(normals, axis=-1) < _SHORT_NORMAL
+    substitutes = np.tile([0.0, 0.0, 1.0], (len(normals), 1))
+    has_area = np.linalg.norm(mesh.face_normals, axis=-1) > _SHORT_NORMAL
+    for corner in range(3):
+        substitutes[mesh.faces[has_area, corner]] = mesh.face_normals[has_area]
+    normals[is_degenerate] = substitutes[is_degenerate]
+    return normals
 
 
 def _rounded(link: Link) -> trimesh.Trimesh:
@@ -276,15 +301,15 @@ def _anatomical(skeleton: Skeleton) -> bool:
     """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's
     size.
     """
-    chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
-    return (
-        len(chains) > 2
-        and skeleton.names[chains[0][0]].startswith("thumb")
-        and all(len(chain) > 1 for chain in chains)
-        and with_capsule == set(range(len(skeleton.names)))
-        and float(np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max() + skeleton.radii.max())
-        < _LARGEST
-    )
+    chains = skeleton.chains()
+    if len(chains) < 3 or any(len(chain) < 2 for chain in chains):
+        return False
+    if not skeleton.names[chains[0][0]].startswith("thumb"):
+        return False
+    if {*skeleton.capsule_link.tolist()} != {*range(len(skeleton.names))}:
+        return False
+    extent = np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max()
+    return float(extent + skeleton.radii.max()) < _MAX_SIZE
 
 
 def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:

@@ -8,22 +8,21 @@ kinematics is a product of exponentials (`common.hands.kinematics`) and the MJCF
 import dataclasses
 import functools
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
-from congrasp.common import mirror
-
 Vector = tuple[float, float, float]
 CONTACT_TIME = 0.006
 """Time constant of contacts that are as stiff as flesh or rubber, s."""
-_ARM = 0.65  # inertia that an arm adds to that of the hand, kg
-_GYRATION = 0.06  # m, a hand's radius of gyration about its wrist
-LEFT = "_left"
-"""Ends the name of a left hand."""
-SIDE = ":left"
-"""The same, as a user may write it."""
+_ARM_MASS = 0.65
+"""Inertia that an arm adds to that of the hand, kg."""
+_GYRATION_RADIUS = 0.06
+"""Radius of gyration of a hand about its wrist, m."""
+_TIP_WEIGHT = 4.0
+"""Weight of a fingertip relative to a link origin in the distance reward."""
 
 
 def vector(array: np.ndarray) -> Vector:
@@ -189,18 +188,26 @@ class Hand:
         """The M motors in the order of the first joints that they pull; see
         `common.hands.motors`.
         """
-        tendons = {
-            next(joint.name for joint in self.joints if joint.name in x.joints): x
-            for x in self.tendons
-        }
-        driven = {name for tendon in self.tendons for name in tendon.joints} | {
-            x.joint for x in self.couplings
-        }
-        return tuple(
-            tendons.get(j.name) or Motor(j.name, {j.name: 1.0}, j.kp, j.kv, j.torque_limit)
-            for j in self.joints
-            if j.name in tendons or j.name not in driven
-        )
+        tendon_by_first_joint: dict[str, Motor] = {}
+        driven_joints = {coupling.joint for coupling in self.couplings}
+        for tendon in self.tendons:
+            pulled = [joint.name for joint in self.joints if joint.name in tendon.joints]
+            tendon_by_first_joint[pulled[0]] = tendon
+            driven_joints |= tendon.joints.keys()
+        motors = []
+        for joint in self.joints:
+            if joint.name in tendon_by_first_joint:
+                motors.append(tendon_by_first_joint[joint.name])
+            elif joint.name not in driven_joints:
+                motor = Motor(
+                    joint.name,
+                    joints={joint.name: 1.0},
+                    kp=joint.kp,
+                    kv=joint.kv,
+                    torque_limit=joint.torque_limit,
+                )
+                motors.append(motor)
+        return tuple(motors)
 
     @functools.cached_property
     def lower(self) -> np.ndarray:
@@ -229,23 +236,45 @@ class Hand:
         return tuple(sorted(tips, key=lambda i: self.links[i].name != self.thumb))
 
     @functools.cached_property
+    def moved_tips(self) -> np.ndarray:
+        """(F, G) bool: the tips that each joint moves, thumb first."""
+        moved = np.zeros((len(self.joints), len(self.tip_links)), bool)
+        for tip, i in enumerate(self.tip_links):
+            chain = chain_of(self, self.links[i].name)
+            moved[:, tip] = [self.links[link].name in chain for link in self.joint_links]
+        return moved
+
+    @functools.cached_property
     def finger_roots(self) -> tuple[str, ...]:
-        """First link of each finger with a tip, thumb first."""
-        return tuple(chain_of(self, self.links[i].name)[0] for i in self.tip_links)
+        """First link of each finger, thumb first: the first one that carries no other tip."""
+        chains = [chain_of(self, self.links[i].name) for i in self.tip_links]
+        tips_of_link = Counter(itertools.chain.from_iterable(chains))
+        roots = []
+        for chain in chains:
+            roots.append(next(name for name in chain if tips_of_link[name] == 1))
+        return tuple(roots)
 
     @functools.cached_property
     def fingers(self) -> tuple[str, ...]:
         """Names of the G fingers, thumb first: `index` for `index_proximal` if that is unique."""
-        short = tuple(root.rpartition("_")[0] or root for root in self.finger_roots)
-        return short if len(set(short)) == len(short) else self.finger_roots
+        short_names = []
+        for root in self.finger_roots:
+            without_last_word = root.rpartition("_")[0]
+            short_names.append(without_last_word or root)
+        are_unique = len(set(short_names)) == len(short_names)
+        return tuple(short_names) if are_unique else self.finger_roots
 
     @functools.cached_property
     def link_fingers(self) -> np.ndarray:
-        """(L,) index of each link's finger, -1 for the palm and for links without a tip."""
-        roots = [next(iter(chain_of(self, link.name)), "") for link in self.links]
-        return np.array(
-            [self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots]
-        )
+        """(L,) index of each link's finger; -1 for the palm and links that carry no tip or
+        several.
+        """
+        finger_of_link = np.full(len(self.links), -1)
+        for i, link in enumerate(self.links):
+            for name in chain_of(self, link.name):
+                if name in self.finger_roots:
+                    finger_of_link[i] = self.finger_roots.index(name)
+        return finger_of_link
 
     @functools.cached_property
     def contact_weights(self) -> np.ndarray:
@@ -267,27 +296,29 @@ class Hand:
     @functools.cached_property
     def keypoint_radii(self) -> np.ndarray:
         """(P,) skin radius around each keypoint: that of its link's first capsule."""
-        return np.array([self.links[i].capsules[0].radius for i in self.keypoint_links], np.float32)
+        first_capsules = [self.links[i].capsules[0] for i in self.keypoint_links]
+        return np.array([capsule.radius for capsule in first_capsules], np.float32)
 
     @functools.cached_property
     def keypoint_weights(self) -> np.ndarray:
         """(P,) weights of the keypoints in the distance reward: fingertips count four times; their
         mean is one.
         """
-        weights = np.concatenate([np.ones(len(self.links)), 4 * np.ones(len(self.tip_links))])
+        of_links = np.ones(len(self.links))
+        of_tips = _TIP_WEIGHT * np.ones(len(self.tip_links))
+        weights = np.concatenate([of_links, of_tips])
         return (weights / weights.mean()).astype(np.float32)
 
     @functools.cached_property
     def capsules(self) -> np.ndarray:
         """(C, 2, 3) end points of the capsules of all links, in the wrist frame at zero."""
-        return np.array(
-            [(c.start, c.end) for link in self.links for c in link.capsules], np.float32
-        )
+        ends = [(capsule.start, capsule.end) for capsule in self._link_capsules]
+        return np.array(ends, np.float32)
 
     @functools.cached_property
     def capsule_radii(self) -> np.ndarray:
         """(C,) radii in m."""
-        return np.array([c.radius for link in self.links for c in link.capsules], np.float32)
+        return np.array([capsule.radius for capsule in self._link_capsules], np.float32)
 
     @functools.cached_property
     def capsule_links(self) -> np.ndarray:
@@ -295,31 +326,35 @@ class Hand:
         return np.array([i for i, link in enumerate(self.links) for _ in link.capsules])
 
     @functools.cached_property
+    def _link_capsules(self) -> tuple[Capsule, ...]:
+        """The C capsules in the order of the links."""
+        return tuple(capsule for link in self.links for capsule in link.capsules)
+
+    @functools.cached_property
     def wrist_inertia(self) -> np.ndarray:
         """(2,) inertia moved by the virtual wrist's servos: kg along a slide, kg.m^2 about a
         hinge.
         """
         mass = sum(link.mass for link in self.links)
-        return np.array(
-            [mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature]
-        )
+        about_wrist = mass * _GYRATION_RADIUS**2
+        return np.array([mass + self.wrist.slide_armature, about_wrist + self.wrist.hinge_armature])
 
     @functools.cached_property
     def wrist_servos(self) -> np.ndarray:
         """(2, 6) stiffness kp / m (1/s^2) and damping kv / m (1/s) of the wrist joints' servos."""
-        gains, (mass, inertia) = self.wrist, self.wrist_inertia
-        slide, hinge = (
-            (gains.slide_kp / mass, gains.slide_kv / mass),
-            (gains.hinge_kp / inertia, gains.hinge_kv / inertia),
-        )
-        return np.repeat(np.array([slide, hinge], np.float32).T, 3, axis=1)
+        gains = self.wrist
+        mass, inertia = self.wrist_inertia
+        stiffness = [gains.slide_kp / mass, gains.hinge_kp / inertia]
+        damping = [gains.slide_kv / mass, gains.hinge_kv / inertia]
+        return np.repeat(np.array([stiffness, damping], np.float32), 3, axis=1)
 
     def posed(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints; coupled joints are set by their leaders."""
-        follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}
-        return np.array(
-            [(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32
-        )
+        all_angles = dict(angles)
+        for coupling in self.couplings:
+            leader_angle = angles.get(coupling.leader, 0.0)
+            all_angles[coupling.joint] = coupling.offset + coupling.ratio * leader_angle
+        return np.array([all_angles.get(joint.name, 0.0) for joint in self.joints], np.float32)
 
 
 def link_origin(link: Link) -> Vector:
@@ -331,9 +366,8 @@ def link_origin(link: Link) -> Vector:
 
 def capsule_ends(link: Link) -> np.ndarray:
     """(C, 2, 3) end points of the link's capsules, in its frame, m."""
-    return np.array([(capsule.start, capsule.end) for capsule in link.capsules]).reshape(
-        -1, 2, 3
-    ) - link_origin(link)
+    ends = np.array([(capsule.start, capsule.end) for capsule in link.capsules])
+    return ends.reshape(-1, 2, 3) - link_origin(link)
 
 
 def chain(
@@ -357,38 +391,32 @@ def chain(
       weights: n contact weights.
       parent: parent of the first link.
     """
-    rows = zip(
-        names,
-        (parent, *names),
-        joints,
-        itertools.pairwise(points),
-        radii,
-        masses,
-        weights,
-        strict=False,
-    )
-    return tuple(
-        Link(
+    links = []
+    parents = (parent, *names)
+    for i, name in enumerate(names):
+        is_last = i == len(names) - 1
+        end = points[i + 1]
+        link = Link(
             name,
-            above,
-            moved,
-            (Capsule(start, end, radius),),
-            mass,
-            weight,
-            end if name == names[-1] else None,
+            parent=parents[i],
+            joints=joints[i],
+            capsules=(Capsule(points[i], end, radii[i]),),
+            mass=masses[i],
+            contact_weight=weights[i],
+            tip=end if is_last else None,
         )
-        for name, above, moved, (start, end), radius, mass, weight in rows
-    )
+        links.append(link)
+    return tuple(links)
 
 
 def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
     """Names of the links from the palm (excluded) to this one."""
     parents = {link.name: link.parent for link in hand.links}
-    above: list[str] = []
+    chain: list[str] = []
     while parents[name]:
-        above.insert(0, name)
+        chain.insert(0, name)
         name = parents[name]
-    return tuple(above)
+    return tuple(chain)
 
 
 def wrist_gains(mass: float) -> WristGains:
@@ -398,59 +426,15 @@ def wrist_gains(mass: float) -> WristGains:
     The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) for any
     mass.
     """
-    moved, heavier = mass + _ARM, (mass + 0.2) / 0.55
+    moved_mass = mass + _ARM_MASS
+    inertia_scale = (mass + 0.2) / 0.55
     return WristGains(
-        slide_kp=1800.0 * moved,
-        slide_kv=90.0 * moved,
-        slide_limit=150.0 * moved,
-        slide_armature=_ARM,
-        hinge_kp=50.0 * heavier,
-        hinge_kv=3.0 * heavier,
-        hinge_limit=20.0 * heavier,
-        hinge_armature=0.01 * heavier,
+        slide_kp=1800.0 * moved_mass,
+        slide_kv=90.0 * moved_mass,
+        slide_limit=150.0 * moved_mass,
+        slide_armature=_ARM_MASS,
+        hinge_kp=50.0 * inertia_scale,
+        hinge_kv=3.0 * inertia_scale,
+        hinge_limit=20.0 * inertia_scale,
+        hinge_armature=0.01 * inertia_scale,
     )
-
-
-def right_name(name: str) -> tuple[str, bool]:
-    """Name of the right hand whose mirror image a hand is, or its own name; and True if it is a
-    left hand.
-    """
-    for ending in (SIDE, LEFT):
-        if name.endswith(ending):
-            return name.removesuffix(ending), True
-    return name, False
-
-
-@functools.cache
-def left_hand(hand: Hand) -> Hand:
-    """The left hand of a right one, with the same names, angles, limits and gains."""
-    return dataclasses.replace(hand, name=hand.name + LEFT, links=tuple(map(_link, hand.links)))
-
-
-def _link(link: Link) -> Link:
-    """A mirrored link."""
-    return dataclasses.replace(
-        link,
-        joints=tuple(map(_joint, link.joints)),
-        capsules=tuple(Capsule(_point(x.start), _point(x.end), x.radius) for x in link.capsules),
-        tip=link.tip and _point(link.tip),
-        solids=tuple(map(_solid, link.solids)),
-    )
-
-
-def _joint(joint: Joint) -> Joint:
-    """A mirrored joint, whose angles mean the same."""
-    return dataclasses.replace(
-        joint, axis=vector(mirror.axial(joint.axis)), anchor=_point(joint.anchor)
-    )
-
-
-def _solid(solid: Solid) -> Solid:
-    """A mirrored solid; each kind is symmetric in its own frame."""
-    w, x, y, z = mirror.quaternion(solid.quaternion).tolist()
-    return dataclasses.replace(solid, position=_point(solid.position), quaternion=(w, x, y, z))
-
-
-def _point(point: Vector) -> Vector:
-    """A mirrored point."""
-    return vector(mirror.vector(point))

@@ -6,6 +6,9 @@ tendons they share: theta_DIP = 2/3 theta_PIP (Rijpkema and Girard 1991, "Comput
 knowledge-based human grasping"; Lin, Wu and Huang 2000, "Modeling the constraints of human hand
 motion", which also states that neighbouring fingers bend together).
 
+The wrist is not measured. Its flexion and deviation are angles to the forearm, which a hand without
+an arm does not have; the direction assumed for it would decide the result.
+
 Bending is counted as a share of the way from the open hand to the fist, so that one measure serves
 hands of any size; deviations are converted to radians with the length of that way.
 """

@@ -17,7 +17,8 @@ from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common import mirror
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.spec import LEFT, Hand, right_name
+from congrasp.common.hands.left import LEFT, right_name
+from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles

@@ -16,7 +16,7 @@ from congrasp.common.hands.flesh import surface_net
 from congrasp.common.hands.kinematics import link_transforms
 from congrasp.common.hands.meshes import save_meshes
 from congrasp.common.hands.mjcf import mujoco_link_poses
-from congrasp.common.hands.skin import MATERIALS, skin_of
+from congrasp.common.hands.skin import MATERIALS, skin_of, skin_of_meshes
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.procedural import plain_object
@@ -203,6 +203,16 @@ def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
     # A hand of this name that someone else sent is not drawn by our meshes.
     stranger = hand_from_text(hand_text(dataclasses.replace(own, object_scale=0.5)))
     assert not np.array_equal(skin_of(stranger).faces, skin.faces)
+
+
+def test_skin_of_faces_back_to_back_has_unit_normals(own):
+    points = np.array([(0, 0, 0), (0.02, 0, 0), (0.007, 0.013, 0.011), (1, 1, 1)], np.float32)
+    sheet = np.array([(0, 1, 2), (1, 0, 2), (0, 0, 1)])
+    skin = skin_of_meshes(own, {"palm": (points, sheet)})
+    np.testing.assert_allclose(np.linalg.norm(skin.normals, axis=-1), 1.0, atol=1e-5)
+    side = np.cross(points[1] - points[0], points[2] - points[0])
+    cosines = skin.normals[:3] @ side / np.linalg.norm(side)
+    np.testing.assert_allclose(np.abs(cosines), 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("damaged", ["own_claw.json", "own_claw.visual.npz"])

@@ -27,12 +27,14 @@ from congrasp.common.task.sampling.table import (
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.options import Options
+from congrasp.services.assets.captures.postures import posture_deviations
 from congrasp.services.assets.captures.references import (
     deepest,
     demonstrated_headings,
     separated,
     transferred,
 )
+from congrasp.services.assets.captures.surface import Surface
 
 IN_TABLE = 0.005
 """Tolerated depth of a captured hand in the table if no resting pose avoids it, m."""
@@ -152,6 +154,13 @@ def report_rows(hand: Hand, group: Group, built: BuiltSet) -> Iterator[dict[str,
     below = from_below(hand, built.message)
     overlap = np.asarray(deepest(hand, built.captured_q))
     moved = np.abs(arrays["pose/q"][0] - built.captured_q).max(-1)
+    posture = posture_deviations(
+        hand,
+        arrays["pose/q"][0],
+        arrays["pose/position"][0],
+        arrays["pose/quaternion"][0],
+        Surface(group.obj.scaled(float(built.message.meta["object_scale"]))),
+    )
     for m, demonstration in enumerate(group.demonstrations):
         yield {
             "sequence": demonstration.name,
@@ -163,6 +172,7 @@ def report_rows(hand: Hand, group: Group, built: BuiltSet) -> Iterator[dict[str,
             "residual_tip_m": round(demonstration.fit.tip, 5),
             "overlap_m": round(float(overlap[m]), 5),
             "moved_apart_rad": round(float(moved[m]), 5),
+            "posture_rad": round(float(posture[m]), 5),
             "touched_points": len(demonstration.contact),
             "clear_of_table": bool(usable[m]),
             "from_below": bool(below[m]),

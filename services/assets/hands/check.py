@@ -1,15 +1,16 @@
 """Self-check of a hand before training: tests by geometry and physics whether it can grasp.
 
 Every check is a line with a measurement and, if in doubt or failed, the field or option to change.
-Palm, joints, opening and strength are computed from the hand's data (`geometry_checks`); servos,
-overlaps and grips are simulated (`trials`) in the physics of the full task (`physics_checks`).
+Fingers (`finger_checks`), palm, joints, opening and strength (`geometry_checks`) are computed from
+the hand's data. Servos, overlaps and grips are simulated (`trials`) in the physics of the full task
+(`physics_checks`).
 """
 
 from typing import NamedTuple
 
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands import geometry_checks, physics_checks
+from congrasp.services.assets.hands import finger_checks, geometry_checks, physics_checks
 from congrasp.services.assets.hands.findings import Finding
 from congrasp.services.assets.hands.trials import Grip, closed_overlap, grips, responses
 
@@ -35,6 +36,7 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
       threads: threads of the physics.
     """
     findings = [geometry_checks.palm_finding(hand)]
+    findings += finger_checks.finger_findings(hand)
     findings += geometry_checks.joint_findings(hand)
     findings.append(geometry_checks.opening_finding(hand))
     findings.append(geometry_checks.strength_finding(hand))

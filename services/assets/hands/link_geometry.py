@@ -101,7 +101,20 @@ def link_mesh(tree: Tree, link: int) -> tuple[np.ndarray, np.ndarray] | None:
         mesh = mesh.simplify_quadric_decimation(face_count=MAX_FACES)
     if not 0 < len(mesh.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
         mesh = _small_hull(joined)
+    _remove_degenerate_faces(mesh)
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def _remove_degenerate_faces(mesh: trimesh.Trimesh) -> None:
+    """Removes faces without an area and, of faces with the same corners, all but one.
+
+    Simplification leaves such faces, and their normals are zero or cancel. A mesh of nothing else
+    stays unchanged.
+    """
+    is_regular = mesh.nondegenerate_faces() & mesh.unique_faces()
+    if is_regular.any():
+        mesh.update_faces(is_regular)
+        mesh.remove_unreferenced_vertices()
 
 
 def _stored_mesh(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:

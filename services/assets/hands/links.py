@@ -27,14 +27,16 @@ class Tree:
     """Bodies of each link, the palm's first."""
     owner: dict[int, int]
     """Link of each body."""
-    ends: tuple[int, ...]
-    """Last link of each finger."""
     names: dict[int, str]
     """Name of each link for a hand file."""
 
     def above(self, link: int) -> int:
         """Returns the link that carries another one, which is not the palm."""
         return self.owner[int(self.model.body_parentid[link])]
+
+    def carried(self, link: int) -> list[int]:
+        """Returns the links directly on another one."""
+        return [other for other in self.groups if other != self.palm and self.above(other) == link]
 
     def joints(self, link: int) -> list[int]:
         """Returns indices of the joints between a link and the one above."""
@@ -91,7 +93,6 @@ def hand_tree(model: mujoco.MjModel, palm_name: str, notes: list[str]) -> Tree:
         palm=palm,
         groups=groups,
         owner=owner,
-        ends=_finger_ends(model, owner, groups, palm),
         names=dict(zip(groups, numbered, strict=True)),
     )
 
@@ -100,28 +101,6 @@ def _floats_in_world(model: mujoco.MjModel, body: int) -> bool:
     """True for a body on a free joint in the world."""
     is_in_world = not model.body_parentid[body]
     return is_in_world and mujoco.mjtJoint.mjJNT_FREE in model.jnt_type[hinges(model, body)]
-
-
-def _finger_ends(
-    model: mujoco.MjModel, owner: dict[int, int], groups: dict[int, list[int]], palm: int
-) -> tuple[int, ...]:
-    """Last link of each finger; where it branches again, that on its longest branch."""
-    depth = {palm: 0}
-    root = {palm: palm}
-    for link in groups:
-        if link == palm:
-            continue
-        above = owner[int(model.body_parentid[link])]
-        depth[link] = depth[above] + 1
-        root[link] = link if above == palm else root[above]
-    last: dict[int, int] = {}
-    for link in groups:
-        if link == palm:
-            continue
-        deepest = last.get(root[link], palm)
-        if depth[link] > depth[deepest]:
-            last[root[link]] = link
-    return tuple(last.values())
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:

@@ -18,6 +18,7 @@ from congrasp.common.hands.motors import fitting_scale
 from congrasp.common.hands.spec import Hand, Link, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import robot_spec
+from congrasp.services.assets.hands.fingers import finger_ends
 from congrasp.services.assets.hands.link_geometry import link_mesh, placed, solids_of
 from congrasp.services.assets.hands.links import Tree, hand_tree, identifier
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
@@ -91,9 +92,10 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     _, model = robot_spec(path, notes)
     tree = hand_tree(model, choices.palm, notes)
     palm = model.body(tree.palm).name
-    _check_fingers(path, tree, palm)
+    ends = finger_ends(tree, notes)
+    _check_fingers(path, tree, ends)
     _note_large_inertias(tree, notes)
-    links, drive = proposed_links(tree, _points(path, tree), notes)
+    links, drive = proposed_links(tree, ends, _points(path, tree), notes)
     check_units(path, links)
     if choices.own_collision:
         links = _with_file_collision(links, tree, notes)
@@ -117,15 +119,16 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     return Proposal(hand, palm, tuple(dict.fromkeys(notes)), meshes)
 
 
-def _check_fingers(path: pathlib.Path, tree: Tree, palm: str) -> None:
-    """Raises a CongraspError for a palm with fewer than two fingers."""
-    if len(tree.ends) >= 2:
+def _check_fingers(path: pathlib.Path, tree: Tree, ends: tuple[int, ...]) -> None:
+    """Raises a CongraspError for a palm with fewer than two fingers, of these last links."""
+    if len(ends) >= 2:
         return
     if not tree.model.njnt:
         raise CongraspError(
             f"{path} has no joints.", "If it is a part, import the file that includes it."
         )
-    count = "one finger" if tree.ends else "no finger"
+    count = "one finger" if ends else "no finger"
+    palm = tree.model.body(tree.palm).name
     raise CongraspError(
         f"{path} has {count} on its palm '{identifier(palm, f'body_{tree.palm}')}'.",
         "A hand has two or more: import a file with all of them, or pass another --palm.",

@@ -7,6 +7,7 @@ every joint that brings them together.
 """
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -189,15 +190,19 @@ class _Body:
         """Reads the fingers that links and motors belong to."""
         hand = self.hand
         self._finger_of_body: dict[int, str] = {}
-        finger_of_joint: dict[str, str] = {}
-        for link in hand.links:
-            root = next(iter(chain_of(hand, link.name)), "")
-            self._finger_of_body[self._model.body(link.name).id] = root
-            for joint in link.joints:
-                finger_of_joint[joint.name] = root
-        motors = range(len(hand.motors))
-        self.fingers = [{finger_of_joint[name] for name in self._moved(m)} for m in motors]
-        """Root links of the fingers moved by each motor."""
+        for link, finger in zip(hand.links, hand.link_fingers, strict=True):
+            body = self._model.body(link.name).id
+            self._finger_of_body[body] = hand.finger_roots[finger] if finger >= 0 else ""
+        self.fingers = []
+        """Root links of the fingers whose tips each motor moves."""
+        for motor in range(len(hand.motors)):
+            moved_joints = self._moved(motor)
+            moves_tip = np.zeros(len(hand.finger_roots), bool)
+            for joint, moved_tips in zip(hand.joints, hand.moved_tips, strict=True):
+                if joint.name in moved_joints:
+                    moves_tip |= moved_tips
+            fingers = itertools.compress(hand.finger_roots, moves_tip)
+            self.fingers.append(set(fingers))
         self.thumb = np.array([hand.finger_roots[0] in fingers for fingers in self.fingers])
         """(M,) bool: motors of the thumb."""
 

@@ -20,12 +20,16 @@ _TIP_CONTACT_WEIGHT = 3.0
 
 
 def proposed_links(
-    tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]
+    tree: Tree,
+    ends: tuple[int, ...],
+    points: dict[int, list[np.ndarray]],
+    notes: list[str],
 ) -> tuple[list[Link], Drive]:
     """Returns the links of a hand, and their drive.
 
     Args:
       tree: the hand in the model.
+      ends: the last link of each finger.
       points: (3,) of each link's geometry, m.
       notes: proposals are appended.
 
@@ -35,7 +39,7 @@ def proposed_links(
     anchors = {link: _anchor(tree, link) for link in tree.groups}
     geometry_notes: list[str] = []
     capsules = _capsules(tree, points, anchors, geometry_notes)
-    tips = {link: far_end(capsules[link], anchors[link]) for link in tree.ends}
+    tips = {link: far_end(capsules[link], anchors[link]) for link in ends}
     joints = _joint_names(tree, notes)
     drive = Drive(tree.model, tree.data, joints, _levers(tree, tips))
     links = []
@@ -82,9 +86,8 @@ def _capsules(
             if link_points:
                 from_inertia.append(tree.names[link])
         if not link_points:
-            carried = [other for other in tree.groups if other != tree.palm]
-            carried = [other for other in carried if tree.above(other) == link]
-            link_points = bare(anchors[link], *(anchors[other] for other in carried))
+            carried_anchors = [anchors[other] for other in tree.carried(link)]
+            link_points = bare(anchors[link], *carried_anchors)
             empty.append(tree.names[link])
         capsules[link] = fit_capsules(np.array(link_points))
     notes += listed(

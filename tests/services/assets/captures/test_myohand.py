@@ -78,6 +78,7 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
         known.check(sets["box"].arrays, m, case)
     assert sets["box"].meta["demonstrations"] == [case.name for case in cases]
     assert sets["box"].meta["source"] == "myohand"
+    assert all(0.0 <= row["posture_rad"] <= 1.0 for row in report.kept)
 
 
 @pytest.mark.parametrize("headings", ["sampled", "demonstrated"])

