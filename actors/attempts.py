@@ -98,6 +98,12 @@ class Attempts:
         return self._task.approach_steps + self._after
 
     @property
+    def simulated_steps(self) -> int:
+        """Control steps of a run: those of the episode, and of the tests of the hold after it."""
+        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        return self.steps + protocols.stress_steps(self._task, height)
+
+    @property
     def speed(self) -> float:
         """Initial speed of the wrist along the heading, m/s."""
         return initial.handover_speed(self._hand, self._task) if self.phases.approach else 0.0
@@ -131,7 +137,7 @@ class Attempts:
         Args:
           obj: the object.
           request: the episodes.
-          progress: called with the number of completed control steps.
+          progress: called with the number of completed control steps, of `simulated_steps`.
         """
         task, hold, lift = self._task, self._after, self.phases.lift
         conditions, resolution = _given(self._hand, task, request, hold, self.speed)
@@ -148,7 +154,11 @@ class Attempts:
         self._worker.begin(conditions)
         parameters = self._bundle.inference_parameters
         rollout = self._worker.collect(parameters, task.approach_steps + hold, progress)
-        after = self._worker.collect(parameters, protocols.stress_steps(task, height))
+        after = self._worker.collect(
+            parameters,
+            protocols.stress_steps(task, height),
+            lambda step: progress(self.steps + step),
+        )
         parts = ((part.trace, part.probed) for part in (rollout, after))
         trace, samples = jax.tree.map(lambda *x: np.concatenate(x), *parts)
         names = metric_names(task)

@@ -112,6 +112,31 @@ def _current(progress: Progress) -> str:
     return task.description + (f", {task.completed:g} of {task.total:g}" if task.total else "")
 
 
+class PhaseBar:
+    """A bar for work in phases, each of which counts its own steps.
+
+    The current phase alone is shown. A phase without steps to count has no total.
+    """
+
+    def __init__(self, progress: Progress, phase: str):
+        """Shows the first phase, which counts nothing yet."""
+        self._progress = progress
+        self._phase = phase
+        self._task = progress.add_task(phase, total=None)
+
+    def update(self, phase: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` steps of a phase are completed; 0 of 0 if it has no steps to
+        count.
+        """
+        check_stopped()
+        if phase != self._phase:
+            self._progress.remove_task(self._task)
+            self._phase = phase
+            self._task = self._progress.add_task(phase, total=None)
+        if done:
+            self._progress.update(self._task, completed=done, total=total)
+
+
 @contextlib.contextmanager
 def tracked() -> Iterator[Track]:
     """Context with bars for work that reports its progress."""

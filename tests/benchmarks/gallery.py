@@ -17,7 +17,9 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
-from congrasp.services.grasp.jobs import Result, Settings, find_objects, grasp_object
+from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object
+from congrasp.services.grasp.progress import ignore_progress
+from congrasp.services.grasp.result import Result
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.viz.render import grasp_steps, render_episode_frames
 from congrasp.services.viz.views import camera_of, views
@@ -152,7 +154,7 @@ def _results(
             again=False,
             rest=shown.rest,
         )
-        result = grasp_object(at, graspers[shown.hand], settings, lambda what, done, total: None)
+        result = grasp_object(at, graspers[shown.hand], settings, ignore_progress)
         yield result._replace(name=shown.name)
         if result.error:
             continue
