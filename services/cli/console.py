@@ -16,10 +16,12 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from congrasp.common.errors import CongraspError, printable
 from congrasp.services.ops.interrupts import check_stopped
@@ -85,7 +87,7 @@ def bars() -> Iterator[Progress]:
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
+        _Counts(),
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
@@ -109,7 +111,21 @@ def _current(progress: Progress) -> str:
     if not tasks:
         return "Starting"
     task = tasks[-1]
-    return task.description + (f", {task.completed:g} of {task.total:g}" if task.total else "")
+    if not task.completed:
+        return task.description
+    if not task.total:
+        return f"{task.description}, {task.completed:g}"
+    return f"{task.description}, {task.completed:g} of {task.total:g}"
+
+
+class _Counts(MofNCompleteColumn):
+    """Completed and total steps of a task; nothing before its first step."""
+
+    def render(self, task: Task) -> Text:
+        """Returns the counts, or an empty text."""
+        if not task.completed:
+            return Text()
+        return super().render(task)
 
 
 class PhaseBar:
