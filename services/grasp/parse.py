@@ -33,7 +33,8 @@ from congrasp.services.assets.objects.affordance import from_part
 from congrasp.services.assets.objects.mesh_files import upright
 from congrasp.services.assets.objects.options import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
-from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
+from congrasp.services.grasp.csv_paths import HUGE, read_csv
+from congrasp.services.grasp.wrist_paths import read_wrist_path
 from congrasp.services.record.episode import grasp_span
 
 _LARGEST = 4 << 20  # bytes of a JSON or CSV file
