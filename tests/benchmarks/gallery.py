@@ -36,10 +36,13 @@ python -m tests.benchmarks gallery --scans object_sim    # these grasps, picture
 
 Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are MyoSuite's
 (Apache-2.0, `simhive/object_sim`). `runs/gallery` holds the grasps; two of them serve as references of others.
+The policies are {policies}.
 
 | grasp | command, attempts that hold the object |
 |---|---|
 """
+_DIGITS = 16
+"""Digits of a policy's hash on the page."""
 
 
 class Shown(NamedTuple):
@@ -164,13 +167,23 @@ def _results(
         Image.fromarray(picture).save(out / f"{shown.name}.jpg", quality=_QUALITY)
         if shown.film:
             save_film(out / f"{shown.name}.gif", episode)
-        held = f"{result.facts['attempts_held']} of {result.facts['attempts']}"
-        rows.append(
-            f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{held} |\n"
+        claim = (
+            f"{result.facts['attempts_held']} of {result.facts['attempts']}, "
+            f"resting pose {result.facts['rest']}"
         )
-    (out / "index.md").write_text(_HEAD + "".join(rows))
+        rows.append(
+            f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{claim} |\n"
+        )
+    (out / "index.md").write_text(_HEAD.format(policies=_policies()) + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
+
+
+def _policies() -> str:
+    """Hands and hashes of the policies that ship, for the page."""
+    hands = dict.fromkeys(shown.hand for shown in SHOWN)
+    hashes = {hand: bundles.load(policy_file(None, hand)).actor_sha256 for hand in hands}
+    return ", ".join(f"`{hand}` {digest[:_DIGITS]}" for hand, digest in hashes.items())
 
 
 def _given(value: Any, work: pathlib.Path) -> Any:
