@@ -28,7 +28,7 @@ _PLAIN = Columns(pose=list(range(7)), count=7, metres=1.0)
 
 
 class _Refusal(Exception):
-    """What is wrong with a line, and what to do."""
+    """Fault of a line as text, and its remedy."""
 
     def __init__(self, fault: str, remedy: str):
         super().__init__(fault)

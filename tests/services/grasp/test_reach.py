@@ -18,7 +18,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.files import steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose
-from congrasp.services.grasp.parse import grasp_part
 from congrasp.services.grasp.reach import (
     ACCELERATION,
     CLEARANCE,
@@ -28,6 +27,7 @@ from congrasp.services.grasp.reach import (
     plan_reach,
     with_reach,
 )
+from congrasp.services.grasp.reference_files import grasp_part
 from congrasp.services.viz.render import grasp_steps
 from tests.episodes import CONTROL_DT, episode
 
