@@ -34,8 +34,15 @@ def _field(option: Option) -> tuple[str, Any, Any]:
     return option.name, Annotated[kind, Doc(option.help)], kind()
 
 
-_OPTIONS = [_field(option) for constraint in CONSTRAINTS for option in constraint.options]
-Constraints: Any = dataclasses.make_dataclass("Constraints", _OPTIONS, frozen=True)
+def _fields() -> list[tuple[str, Any, Any]]:
+    """Options of all constraints as the fields of a dataclass."""
+    fields = []
+    for constraint in CONSTRAINTS:
+        fields += [_field(option) for option in constraint.options]
+    return fields
+
+
+Constraints: Any = dataclasses.make_dataclass("Constraints", _fields(), frozen=True)
 """The options of all constraints."""
 
 

@@ -102,8 +102,12 @@ def _words(value: Any) -> list[str]:
     """The words of a text, a number, or a sequence of such, also nested and of different
     lengths.
     """
-    nested = np.iterable(value) and not isinstance(value, str)
-    return [word for part in value for word in _words(part)] if nested else [str(value)]
+    if isinstance(value, str) or not np.iterable(value):
+        return [str(value)]
+    words = []
+    for part in value:
+        words += _words(part)
+    return words
 
 
 def _place(text: str, target: Target) -> np.ndarray:
