@@ -38,7 +38,7 @@ class Columns(NamedTuple):
 
     pose: list[int]
     """Those of x, y, z and the quaternion w, x, y, z."""
-    count: int
+    width: int
     """Number of columns of the file."""
     metres: float
     """Metres per unit of the position."""
@@ -47,7 +47,7 @@ class Columns(NamedTuple):
 class _Column(NamedTuple):
     """A column whose name ends in one of the letters w, x, y, z."""
 
-    index: int
+    position: int
     unit: str
 
 
@@ -118,8 +118,8 @@ def pose_columns(names: list[str], *, titled: bool) -> Columns | None:
     _check_single("quaternion", quaternions)
     position = positions[0].columns
     quaternion = quaternions[0].columns
-    indices = [position[letter].index for letter in "xyz"]
-    indices += [quaternion[letter].index for letter in "wxyz"]
+    indices = [position[letter].position for letter in "xyz"]
+    indices += [quaternion[letter].position for letter in "wxyz"]
     return Columns(indices, len(names), METRES[_unit_of(positions[0])])
 
 

@@ -23,7 +23,7 @@ HUGE = 1e9
 _NANOSECONDS_PER_SECOND = 1e9
 _WRITE_ROWS = "Write x, y, z, qw, qx, qy, qz in every line."
 _NAME_COLUMNS = "Name them x, y, z, qw, qx, qy, qz."
-_PLAIN = Columns(pose=list(range(7)), count=7, metres=1.0)
+_PLAIN = Columns(pose=list(range(7)), width=7, metres=1.0)
 """Columns of a file without a header."""
 
 
@@ -122,7 +122,7 @@ class _Reader:
             value = number_in(cells[column]) if column < len(cells) else None
             if value is not None and abs(value) < HUGE:
                 pose.append(value)
-        width = self.columns.count
+        width = self.columns.width
         if len(cells) < width or any(cells[width:]) or len(pose) < len(self.columns.pose):
             raise _Refusal(f"is not {width} finite numbers", _WRITE_ROWS)
         stamp = []
