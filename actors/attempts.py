@@ -100,6 +100,12 @@ class Attempts:
         return self._task.approach_steps + self._after
 
     @property
+    def simulated_steps(self) -> int:
+        """Control steps of a run: those of the episode, and of the tests of the hold after it."""
+        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        return self.steps + protocols.stress_steps(self._task, height)
+
+    @property
     def speed(self) -> float:
         """Initial speed of the wrist along the heading, m/s."""
         if not self.phases.approach:
@@ -133,7 +139,7 @@ class Attempts:
         Args:
           obj: the object.
           request: the episodes.
-          progress: called with the number of completed control steps.
+          progress: called with the number of completed control steps, of `simulated_steps`.
         """
         task = self._task
         hold = self._after
@@ -144,7 +150,11 @@ class Attempts:
         worker.begin(conditions)
         parameters = self._bundle.inference_parameters
         rollout = worker.collect(parameters, task.approach_steps + hold, progress)
-        stressed = worker.collect(parameters, protocols.stress_steps(task, self._stress_height))
+        stressed = worker.collect(
+            parameters,
+            protocols.stress_steps(task, self._stress_height),
+            lambda step: progress(self.steps + step),
+        )
         trace, samples = jax.tree.map(
             lambda *parts: np.concatenate(parts),
             (rollout.trace, rollout.probed),

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
-    from congrasp.services.grasp.grasper import Grasper, grasp
+    from congrasp.services.grasp.grasper import Grasper
+    from congrasp.services.grasp.interface import grasp
     from congrasp.services.grasp.motion import Grasp
     from congrasp.services.gym.vector_env import make_vec
     from congrasp.services.serve.inference import load_policy
@@ -87,7 +88,7 @@ _MODULES = {
     "Policy": "congrasp.services.client.policy",
     "PolicyClient": "congrasp.services.client.policy_client",
     "Ticker": "congrasp.services.client.ticker",
-    "grasp": "congrasp.services.grasp.grasper",
+    "grasp": "congrasp.services.grasp.interface",
     "load_motion": "congrasp.services.export.motion_file",
     "load_policy": "congrasp.services.serve.inference",
     "make_vec": "congrasp.services.gym.vector_env",

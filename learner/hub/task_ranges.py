@@ -128,9 +128,7 @@ def _evaluate(hand: Hand, task: TaskConfig, extremes: _Extremes) -> tuple[Any, A
     scene = scene._replace(load=load)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
-    of_policy = scene._replace(
-        task=task, readings=extremes.readings, measured=extremes.measured
-    )
+    of_policy = scene._replace(task=task, readings=extremes.readings, measured=extremes.measured)
     return (
         observe(of_policy),
         observe_for_teacher(scene, of_policy, task.control),

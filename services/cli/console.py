@@ -16,10 +16,12 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from congrasp.common.errors import CongraspError, printable
 from congrasp.services.ops.interrupts import check_stopped
@@ -85,7 +87,7 @@ def bars() -> Iterator[Progress]:
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
+        _Counts(),
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
@@ -109,7 +111,46 @@ def _current(progress: Progress) -> str:
     if not tasks:
         return "Starting"
     task = tasks[-1]
-    return task.description + (f", {task.completed:g} of {task.total:g}" if task.total else "")
+    if not task.completed:
+        return task.description
+    if not task.total:
+        return f"{task.description}, {task.completed:g}"
+    return f"{task.description}, {task.completed:g} of {task.total:g}"
+
+
+class _Counts(MofNCompleteColumn):
+    """Completed and total steps of a task; nothing before its first step."""
+
+    def render(self, task: Task) -> Text:
+        """Returns the counts, or an empty text."""
+        if not task.completed:
+            return Text()
+        return super().render(task)
+
+
+class PhaseBar:
+    """A bar for work in phases, each of which counts its own steps.
+
+    The current phase alone is shown. A phase without steps to count has no total.
+    """
+
+    def __init__(self, progress: Progress, phase: str):
+        """Shows the first phase, which counts nothing yet."""
+        self._progress = progress
+        self._phase = phase
+        self._task = progress.add_task(phase, total=None)
+
+    def update(self, phase: str, done: int, total: int) -> None:
+        """Shows that `done` of `total` steps of a phase are completed; 0 of 0 if it has no steps to
+        count.
+        """
+        check_stopped()
+        if phase != self._phase:
+            self._progress.remove_task(self._task)
+            self._phase = phase
+            self._task = self._progress.add_task(phase, total=None)
+        if done:
+            self._progress.update(self._task, completed=done, total=total)
 
 
 @contextlib.contextmanager

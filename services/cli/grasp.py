@@ -14,14 +14,18 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.specs import Option
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.cli.console import bars, in_range, report_error, say
+from congrasp.services.cli.console import PhaseBar, bars, in_range, report_error, say
 from congrasp.services.cli.dependent_options import check_together
 
 if TYPE_CHECKING:
-    from congrasp.services.grasp.jobs import Result
+    from congrasp.services.assets.objects.named import ObjectAt
+    from congrasp.services.grasp.grasper import Grasper
+    from congrasp.services.grasp.jobs import Settings
+    from congrasp.services.grasp.result import Result
 
-NOT_HELD, BAD_INPUT = 1, 2
-_MOST_ATTEMPTS = 1024
+NOT_HELD = 1
+BAD_INPUT = 2
+_MAX_ATTEMPTS = 1024
 _FILMED_APPROACH_S = 0.7
 _FILMED_LIFT_M = 0.12
 """Approach and lift of a film, which shows the grasp on the table."""
@@ -33,8 +37,15 @@ def _field(option: Option) -> tuple[str, Any, Any]:
     return option.name, Annotated[kind, Doc(option.help)], kind()
 
 
-_OPTIONS = [_field(option) for constraint in CONSTRAINTS for option in constraint.options]
-Constraints: Any = dataclasses.make_dataclass("Constraints", _OPTIONS, frozen=True)
+def _fields() -> list[tuple[str, Any, Any]]:
+    """Options of all constraints as the fields of a dataclass."""
+    fields = []
+    for constraint in CONSTRAINTS:
+        fields += [_field(option) for option in constraint.options]
+    return fields
+
+
+Constraints: Any = dataclasses.make_dataclass("Constraints", _fields(), frozen=True)
 """The options of all constraints."""
 
 
@@ -105,66 +116,94 @@ class Grasp:
     arm: Annotated[ArmOptions, tyro.conf.OmitArgPrefixes] = ArmOptions()  # noqa: RUF009
     """The arm that carries the hand."""
 
-    def _default(self, value: float | None, filmed: float) -> float:
-        """The value of an option; without one, `filmed` with a video and zero otherwise."""
-        if value is not None:
-            return value
-        return filmed if self.video else 0.0
-
     def __call__(self) -> int:
         """Grasps one object after another."""
         from congrasp.actors.attempts import Phases
-        from congrasp.services.grasp.grasper import open_grasper
-        from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
-        from congrasp.services.viz.film import film_of
-        from congrasp.services.viz.views import view_of
+        from congrasp.services.grasp.interface import open_grasper
+        from congrasp.services.grasp.jobs import find_objects
+        from congrasp.services.grasp.summary import save_summary
 
+        self._check()
+        phases = Phases(self._approach, self._lift)
+        grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
+        entries, results = find_objects(self.objects, self.folder)
+        settings = self._settings()
+        for result in results:
+            _show(result)
+        results += _grasp_each(entries, grasper, settings)
+        grasper.close()
+        if entries:
+            save_summary(self.out, grasper.hand.name, results)
+        return _conclude(results, len(entries), self.out)
+
+    def _check(self) -> None:
+        """Raises a CongraspError for an option out of range, or without the one it needs."""
         if not self.objects:
             raise CongraspError(
                 "There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj"
             )
         check_together(self, ("size", "fps", "overlays"), "video")
-        in_range(1, _MOST_ATTEMPTS, "side by side", attempts=self.attempts)
-        approach = self._default(self.approach, _FILMED_APPROACH_S)
-        lift = self._default(self.lift, _FILMED_LIFT_M)
-        in_range(0.0, 10.0, "seconds", approach=approach)
-        in_range(0.0, 0.5, "metres", lift=lift)
+        in_range(1, _MAX_ATTEMPTS, "side by side", attempts=self.attempts)
+        in_range(0.0, 10.0, "seconds", approach=self._approach)
+        in_range(0.0, 0.5, "metres", lift=self._lift)
         in_range(1.0, 120.0, "frames a second", fps=self.fps)
-        phases = Phases(approach, lift)
-        grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
-        found, results = find_objects(self.objects, self.folder)
-        settings = Settings(
+
+    @property
+    def _approach(self) -> float:
+        """Duration of the approach, s."""
+        if self.approach is not None:
+            return self.approach
+        return _FILMED_APPROACH_S if self.video else 0.0
+
+    @property
+    def _lift(self) -> float:
+        """Height of the lift, m."""
+        if self.lift is not None:
+            return self.lift
+        return _FILMED_LIFT_M if self.video else 0.0
+
+    def _settings(self) -> "Settings":
+        """Settings shared by all objects."""
+        from congrasp.services.grasp.jobs import Settings
+        from congrasp.services.viz.film import film_of
+        from congrasp.services.viz.views import view_of
+
+        film = None
+        if self.video:
+            film = film_of(self.size, self.fps, self.overlays)
+        return Settings(
             out=self.out,
             options=self.mesh,
             constraints=dataclasses.asdict(self.constraint),
-            film=film_of(self.size, self.fps, self.overlays) if self.video else None,
+            film=film,
             view=view_of(self.camera),
             pictures=self.pictures,
             again=self.again,
             rest=self.rest,
         )
-        for result in results:
+
+
+def _grasp_each(
+    entries: "list[ObjectAt]", grasper: "Grasper", settings: "Settings"
+) -> "list[Result]":
+    """Grasps objects with progress bars, and prints each outcome."""
+    from congrasp.services.grasp.jobs import grasp_object
+
+    results = []
+    with bars() as progress:
+        objects = progress.add_task("Objects", total=len(entries), visible=len(entries) > 1)
+        phases = PhaseBar(progress, "Starting")
+        for entry in entries:
+
+            def report(activity: str, done: int, total: int, name: str = entry.name) -> None:
+                """Shows the activity with the name of the object."""
+                phases.update(f"{name}: {activity}", done, total)
+
+            result = grasp_object(entry, grasper, settings, report)
+            results.append(result)
             _show(result)
-        with bars() as bar:
-            whole = bar.add_task("Objects", total=len(found), visible=len(found) > 1)
-            part = bar.add_task("Starting", total=None)
-            for at in found:
-
-                def progress(what: str, done: int, total: int, name: str = at.name) -> None:
-                    bar.update(
-                        part,
-                        description=f"{name}: {what}",
-                        completed=done,
-                        total=total if done else None,
-                    )
-
-                results.append(grasp_object(at, grasper, settings, progress))
-                _show(results[-1])
-                bar.advance(whole)
-        grasper.close()
-        if found:
-            save_summary(self.out, grasper.hand.name, results)
-        return _conclude(results, len(found), self.out)
+            progress.advance(objects)
+    return results
 
 
 def _show(result: "Result") -> None:
@@ -172,15 +211,21 @@ def _show(result: "Result") -> None:
     if result.error:
         report_error(result.error)
         return
-    done = " (done before)" if result.skipped else ""
-    line = f"[bold]{escape(result.name)}[/]{done}: {escape(printable(result.line()))}"
+    skipped = " (done before)" if result.skipped else ""
+    line = f"[bold]{escape(result.name)}[/]{skipped}: {escape(printable(result.line()))}"
     Console(highlight=False).print(line, soft_wrap=True)
     say(*(f"  {note}" for note in result.facts["notes"]))
 
 
-def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
-    """Prints a summary and the location of the results; returns the exit code."""
-    from congrasp.services.grasp.jobs import SHEET
+def _conclude(results: "list[Result]", count: int, out: pathlib.Path) -> int:
+    """Prints a summary and the location of the results; returns the exit code.
+
+    Args:
+      results: results of all names.
+      count: number of objects that the names stand for.
+      out: folder of the results.
+    """
+    from congrasp.services.grasp.summary import SHEET
 
     held = sum(result.held for result in results)
     failed = sum(bool(result.error) for result in results)
@@ -189,9 +234,11 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
             f"{held} of {len(results)} objects are held; {failed} could not be used. {out / SHEET} "
             f"shows them."
         )
-    if found > failed:
+    if count > failed:
         say(f"Everything is in {out}.")
-    return BAD_INPUT if failed else NOT_HELD if held < len(results) else 0
+    if failed:
+        return BAD_INPUT
+    return NOT_HELD if held < len(results) else 0
 
 
 COMMAND = Grasp

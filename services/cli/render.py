@@ -53,7 +53,7 @@ def episode(
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
-    from congrasp.services.grasp.files import save_robot_video
+    from congrasp.services.grasp.arm_files import save_robot_video
     from congrasp.services.record.episode import arm_of_episode
     from congrasp.services.record.reader import pick_episode
     from congrasp.services.viz.film import Film, save_episode_video

@@ -134,7 +134,8 @@ def make(
       shards: locations of the shards.
       pools: result of `pools_of` for the recipe.
       wanted: numbers of the shards to make.
-      progress: called with the number of finished episodes.
+      progress: called with the number of simulated episodes; those of a running batch count by
+        their share of control steps.
     """
     done = 0
     with contextlib.ExitStack() as stack, prepared(recipe.template, pools, wanted) as ready:
@@ -153,10 +154,14 @@ def make(
                     running.replace_objects(own.scaled, own.field)
                 else:
                     running = stack.enter_context(own.simulator())
-                for part in _episodes(running, pool, recipe.shares):
+
+                def report(episodes: int, before: int = done) -> None:
+                    """Reports the pool's episodes with those of earlier pools."""
+                    progress(before + episodes)
+
+                for part in _episodes(running, pool, recipe.shares, report):
                     rows.append(_counted(part, recipe.keep, counts))
                     done += len(part["episode"])
-                    progress(done)
             said = {**recipe.about, "shard": own.pool, "counts": counts, "left_out": pool.left_out}
             found = {name: np.concatenate([part[name] for part in rows]) for name in rows[0]}
             of_objects = table(object_columns(), object_rows(own.scaled[: pool.real]), said)
@@ -193,10 +198,16 @@ def _begun(
 
 
 def _episodes(
-    running: Episodes, pool: Pool, shares: Mapping[str, int]
+    running: Episodes, pool: Pool, shares: Mapping[str, int], progress: Callable[[int], None]
 ) -> Iterator[dict[str, np.ndarray]]:
     """Yields columns of the real objects' episodes, batch by batch; a batch holds episodes under
     any constraints.
+
+    Args:
+      running: simulator of the pool's objects.
+      pool: the pool.
+      shares: episodes of each object, by constraints.
+      progress: called with the number of simulated episodes of the pool.
     """
     begun, known = _begun(pool, shares)
     if not begun:
@@ -206,9 +217,16 @@ def _episodes(
     for start in range(0, total, running.batch):
         chosen = np.arange(start, start + running.batch).clip(max=total - 1)
         of = {name: column[chosen] for name, column in known.items()}
+        count = min(running.batch, total - start)
+
+        def report(share: float, start: int = start, count: int = count) -> None:
+            """Counts the episodes of the running batch by their share of control steps."""
+            progress(start + int(share * count))
+
         batch = running.run(
             jax.tree.map(lambda x, chosen=chosen: x[chosen], conditions),
             stressed=running.stressable,
+            progress=report,
         )
         rows = grasp_rows(pool.experiment.task, of["constraints"], batch) | of
         yield {name: column[: total - start] for name, column in rows.items()}

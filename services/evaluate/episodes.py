@@ -175,7 +175,13 @@ class Episodes:
         self._worker.replace_objects(objects, None)
         self._measure(objects, field)
 
-    def run(self, conditions: InitialConditions, *, stressed: bool = False) -> Batch:
+    def run(
+        self,
+        conditions: InitialConditions,
+        *,
+        stressed: bool = False,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Batch:
         """Simulates B episodes.
 
         They are collected in chunks, so that the observations of a large batch are not in memory
@@ -184,6 +190,8 @@ class Episodes:
         Args:
           conditions: initial conditions, including the length of the hold.
           stressed: also simulates the stress test after the hold (`actors.stress`).
+          progress: called with the share of simulated control steps: after each step, or after each
+            chunk of an engine that is compiled.
         """
         length = self._task.approach_steps + self._hold
         chunk = self._chunk_steps()
@@ -194,7 +202,13 @@ class Episodes:
         traces: list[Trace] = []
         probed: list[Any] = []
         for step in range(0, length + after, chunk):
-            rollout = self._worker.collect(self._bundle.inference_parameters, chunk)
+
+            def report(done: int, first: int = step) -> None:
+                """Reports `done` steps of the chunk that begins at step `first`."""
+                progress((first + done) / (length + after))
+
+            rollout = self._worker.collect(self._bundle.inference_parameters, chunk, report)
+            report(chunk)
             probed.append(jax.tree.map(np.asarray, rollout.probed))
             if step < length:
                 traces.append(rollout.trace)

@@ -405,13 +405,14 @@ class Experiment:
           running: simulator.
           variation: the row.
           plan: its episodes.
-          progress: called with the number of finished episodes.
+          progress: called with the number of simulated episodes; those of a running batch count by
+            their share of control steps.
           visit: called with each batch, and the number of its episodes that count.
           stressed: least number of episodes that continue after the hold.
         """
         samples: list[Sample] = []
         finished = 0
-        for batch, count in self.batches(running, variation, plan, stressed):
+        for batch, count in self.batches(running, variation, plan, stressed, progress):
             visit(batch, count)
             samples.append(batch.sample.first(count))
             finished += count
@@ -419,7 +420,12 @@ class Experiment:
         return joined(samples)
 
     def batches(
-        self, running: Episodes, variation: Variation, plan: RowPlan, stressed: int
+        self,
+        running: Episodes,
+        variation: Variation,
+        plan: RowPlan,
+        stressed: int,
+        progress: Callable[[int], None] = lambda done: None,
     ) -> Iterator[tuple[Batch, int]]:
         """Simulates the episodes of a row in batches; yields each, and the number of its episodes
         that count.
@@ -430,6 +436,7 @@ class Experiment:
           plan: its episodes.
           stressed: least number of episodes that continue after the hold with lift and pushes;
             batches continue as a whole.
+          progress: see `sample`.
         """
         objects = variation.objects(self.scaled)
         if objects is not running.objects:
@@ -439,8 +446,15 @@ class Experiment:
         to_stress = min(plan.total, stressed) if running.stressable else 0
         finished = 0
         for planned, count in batches(self.hand, task, bank, plan, self.seed, running.batch):
+
+            def report(share: float, finished: int = finished, count: int = count) -> None:
+                """Counts the episodes of the running batch by their share of control steps."""
+                progress(finished + int(share * count))
+
             conditions = variation.episodes(planned, task.control_dt)
-            yield running.run(conditions, stressed=finished < to_stress), count
+            stresses = finished < to_stress
+            batch = running.run(conditions, stressed=stresses, progress=report)
+            yield batch, count
             finished += count
 
     def row(self, variation: Variation, sample: Sample) -> Row:

@@ -1,7 +1,7 @@
 """Episodes to attempt for a request: headings and resting poses that the table leaves room for."""
 
 import dataclasses
-import functools
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -17,14 +17,15 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional
 from congrasp.common.task.sampling.heading_sampler import HeadingOptions, sample_headings
-from congrasp.common.task.sampling.headings import INWARD, max_width
+from congrasp.common.task.sampling.headings import INWARD, Headings, max_width
 from congrasp.common.task.sampling.reach import above, within_reach
 from congrasp.common.task.sampling.table import clear_of_table
 from congrasp.common.task.types import Surface
 
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)
-# M per unit of normal difference: the two sides of a thin wall may belong to different regions
 _ACROSS = 0.02
+"""Metres per unit of normal difference: the two sides of a thin wall may belong to different
+regions."""
 
 
 def to_attempt(
@@ -44,20 +45,23 @@ def to_attempt(
     Raises:
       CongraspError: no approach fits the request, or its reference leads through the table.
     """
-    episodes, path, different = (
-        repeated(hand, task, obj, request, batch),
-        prescribed(request),
-        batch,
-    )
+    episodes = repeated(hand, task, obj, request, batch)
+    path = prescribed(request)
     if path is None:
         position, direction, cross, rests = headings(hand, obj, request, batch, rng)
-        found = {"position": position, "direction": direction, "cross": cross}
-        found = {name: value.astype(np.float32) for name, value in found.items()}
-        episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))
+        goal = episodes.goal.replace(
+            "heading",
+            position=position.astype(np.float32),
+            direction=direction.astype(np.float32),
+            cross=cross.astype(np.float32),
+        )
+        episodes = episodes._replace(goal=goal)
+        distinct = batch
     else:
         valid = valid_rests(hand, obj, *path, request.rest)
-        rests, different = np.resize(valid, batch), min(batch, len(valid))
-    return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
+        rests = np.resize(valid, batch)
+        distinct = min(batch, len(valid))
+    return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, distinct
 
 
 def repeated(
@@ -71,8 +75,8 @@ def repeated(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
         (goal_of(hand, task, request), surface_of(task, obj), rest),
     )
-    asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(task)}
-    return RequestedEpisodes(goal, asked, surface, rest)
+    is_requested = {c.name: np.full(batch, c.name in request.constraints) for c in optional(task)}
+    return RequestedEpisodes(goal, is_requested, surface, rest)
 
 
 def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
@@ -107,67 +111,117 @@ def headings(
     Raises:
       CongraspError: no approach fits the request.
     """
-    direction, position = (
-        request.given("heading", "direction"),
-        request.given("heading", "position"),
-    )
-    restricted = request.avoid is not None
-    own = outline(hand)
-    heading_options = HeadingOptions(
-        inward=hand.object_scale * INWARD,
-        max_width=max_width(own, hand.object_scale),
-        along=direction,
-        at=position,
-    )
-    lenient_options = dataclasses.replace(heading_options, lenient=True)
-    sample = functools.partial(sample_headings, rng=rng, use_affordance=restricted)
-    if restricted:
+    if request.avoid is not None:
         obj = _balanced(obj)
-    found = sample(obj, options=heading_options) or sample(obj, options=lenient_options)
-    if found is None:
-        raise CongraspError(
-            f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
-            _remedy(request, "make the graspable part larger"),
-        )
-    options, weights = [], []
-    for r, (cleared, room) in enumerate(
-        zip(*within_reach(found, obj, obj.rest_poses, own), strict=True)
-    ):
-        if request.rest not in (None, r):
-            continue
-        if request.above:
-            room &= above(cleared, obj.rest_poses[r])
-        for h in np.flatnonzero(room):
-            options.append((r, cleared.position[h], found.direction[h], found.cross[h]))
-        weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
+    candidates = _sampled_headings(hand, obj, request, rng)
+    options = _with_room(hand, obj, request, candidates)
     if not options:
         raise CongraspError(*_no_room(obj, request))
-    free = (
+    likeliest = min(option.rest for option in options)
+    if likeliest > 0 and _is_free(request):
+        raise _too_flat(hand, obj, likeliest)
+    weights = np.array([option.weight for option in options])
+    shares = weights / np.sum(weights)
+    drawn = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
+    chosen = [options[i] for i in drawn]
+    return (
+        np.array([option.position for option in chosen]),
+        np.array([option.direction for option in chosen]),
+        np.array([option.cross for option in chosen]),
+        np.array([option.rest for option in chosen]),
+    )
+
+
+class _Option(NamedTuple):
+    """A heading in a resting pose that leaves room for it."""
+
+    rest: int
+    position: np.ndarray
+    """(3,) m, object frame, clear of the table."""
+    direction: np.ndarray
+    """(3,) unit vector."""
+    cross: np.ndarray
+    """(3,) cross-finger axis."""
+    weight: float
+    """Relative probability."""
+
+
+def _sampled_headings(
+    hand: Hand, obj: GraspObject, request: GraspRequest, rng: np.random.Generator
+) -> Headings:
+    """Headings at an object under a request, whatever its resting pose.
+
+    Raises:
+      CongraspError: no approach reaches the graspable part.
+    """
+    strict = HeadingOptions(
+        inward=hand.object_scale * INWARD,
+        max_width=max_width(outline(hand), hand.object_scale),
+        along=request.given("heading", "direction"),
+        at=request.given("heading", "position"),
+    )
+    for options in (strict, dataclasses.replace(strict, lenient=True)):
+        candidates = sample_headings(
+            obj, options=options, rng=rng, use_affordance=request.avoid is not None
+        )
+        if candidates:
+            return candidates
+    raise CongraspError(
+        f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
+        _remedy(request, "make the graspable part larger"),
+    )
+
+
+def _with_room(
+    hand: Hand, obj: GraspObject, request: GraspRequest, candidates: Headings
+) -> list[_Option]:
+    """Headings in each resting pose that leaves room for them; likelier poses weigh more."""
+    options = []
+    reachable = within_reach(candidates, obj, obj.rest_poses, outline(hand))
+    for rest, (cleared, room) in enumerate(zip(*reachable, strict=True)):
+        if request.rest not in (None, rest):
+            continue
+        if request.above:
+            room &= above(cleared, obj.rest_poses[rest])
+        weight = 1.0 / ((rest + 1) * max(room.sum(), 1))
+        for i in np.flatnonzero(room):
+            option = _Option(
+                rest=rest,
+                position=cleared.position[i],
+                direction=candidates.direction[i],
+                cross=candidates.cross[i],
+                weight=weight,
+            )
+            options.append(option)
+    return options
+
+
+def _is_free(request: GraspRequest) -> bool:
+    """True if a request restricts neither resting pose, heading nor part."""
+    return (
         request.rest is None
         and not request.above
-        and direction is None
-        and position is None
-        and not restricted
+        and request.given("heading", "direction") is None
+        and request.given("heading", "position") is None
+        and request.avoid is None
     )
-    if free and (first := min(r for r, *_ in options)) > 0:
-        height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
-        raise CongraspError(
-            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in "
-            f"its likeliest "
-            "resting pose, which leaves the fingers no room over the table.",
-            f"Set --rest {first + 1} to grasp it in another resting pose.",
-        )
-    shares = np.array(weights) / np.sum(weights)
-    chosen = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
-    rests, positions, directions, crosses = zip(*(options[i] for i in chosen), strict=True)
-    return np.array(positions), np.array(directions), np.array(crosses), np.array(rests)
+
+
+def _too_flat(hand: Hand, obj: GraspObject, rest: int) -> CongraspError:
+    """Error for an object whose likeliest resting pose leaves no room; `rest` is one that does."""
+    height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
+    return CongraspError(
+        f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in "
+        f"its likeliest resting pose, which leaves the fingers no room over the table.",
+        f"Set --rest {rest + 1} to grasp it in another resting pose.",
+    )
 
 
 def _balanced(obj: GraspObject) -> GraspObject:
     """The object with half of its surface points on the graspable region."""
     points, normals, _ = sample_union(obj.pieces, np.random.default_rng(0), DENSE)
-    known = cKDTree(np.hstack([obj.points, _ACROSS * obj.normals]))
-    labels = obj.labels[known.query(np.hstack([points, _ACROSS * normals]))[1]]
+    tree = cKDTree(np.hstack([obj.points, _ACROSS * obj.normals]))
+    labels = obj.labels[tree.query(np.hstack([points, _ACROSS * normals]))[1]]
     graspable = obj.graspable[labels]
     if graspable.all() or not graspable.any():
         return obj
@@ -186,12 +240,10 @@ def _remedy(request: GraspRequest, otherwise: str) -> str:
         "--heading": request.above or request.given("heading", "direction") is not None,
         "--at": request.given("heading", "position") is not None,
     }
-    given = [name for name, is_given in options.items() if is_given]
-    return (
-        f"Leave out {' or '.join(given)}, or {otherwise}."
-        if given
-        else f"{otherwise.capitalize()}."
-    )
+    set_options = [name for name, is_set in options.items() if is_set]
+    if not set_options:
+        return f"{otherwise.capitalize()}."
+    return f"Leave out {' or '.join(set_options)}, or {otherwise}."
 
 
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:

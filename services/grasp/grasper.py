@@ -1,13 +1,8 @@
-"""A grasp motion for one object under constraints: several attempts at once, of which the best is
-kept.
-"""
+"""Simulates several attempts at a grasp in parallel, and makes the best of them a motion."""
 
 import collections
 import dataclasses
 import functools
-import os
-import pathlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,28 +12,24 @@ from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common import mirror
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import LEFT, right_name
+from congrasp.common.hands.left import LEFT
 from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.robot import Infeasible
-from congrasp.services.assets.objects.named import one_object
-from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.client.left_policy import mirrored_request
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
-from congrasp.services.grasp.motion import Grasp, costs
-from congrasp.services.grasp.parse import read_request
+from congrasp.services.grasp.costs import costs, rest_ranks
+from congrasp.services.grasp.motion import Grasp
+from congrasp.services.grasp.progress import Progress, ignore_progress
 from congrasp.services.grasp.reach import NoReachError, with_planned_reach
 
 if TYPE_CHECKING:
@@ -49,19 +40,18 @@ ATTEMPTS = 16
 ROUNDS = 4
 """Maximum number of rounds; another one follows while no attempt holds."""
 _UNLIKELY = 0.5
-"""Cost of an attempt for each resting pose that `_places` prefers to its initial one."""
-_LIGHTER, _SMALLER, _ENOUGH = 0.25, 0.7, 0.25
-"""Factors on mass and size in the search for the cause of failures, and the share of holds that
-confirms it.
-"""
+"""Cost of an attempt for each resting pose that `rest_ranks` prefers to its initial one."""
+_LIGHTER = 0.25
+"""Factor on the mass in the search for the cause of failures."""
+_SMALLER = 0.7
+"""Factor on the size in the search for the cause of failures."""
+_ENOUGH_HOLDS = 0.25
+"""Share of holds that confirms a cause."""
 _TOUCHED = 0.2
 """Share of contacts in the avoid region at and above which an attempt does not count as a hold."""
 
-Progress = Callable[[str, int, int], None]
-"""Called with the current activity, the completed steps and the number of steps."""
 
-
-class _Round(NamedTuple):
+class Round(NamedTuple):
     """Parallel attempts at an object; the first n of B are distinct."""
 
     obj: GraspObject
@@ -79,7 +69,28 @@ class _Round(NamedTuple):
         """(n,) bool: holds that meet the request; a hold by the avoid region does not."""
         if self.request.avoid is None:
             return self.holds
-        return self.holds & (self.outcome.metrics["affordance_ratio"][: len(self.holds)] < _TOUCHED)
+        touched = self.outcome.metrics["affordance_ratio"][: len(self.holds)]
+        return self.holds & (touched < _TOUCHED)
+
+
+class Attempted(NamedTuple):
+    """Rounds of attempts at an object."""
+
+    obj: GraspObject
+    """The object with the regions of the request, mirrored for a left hand."""
+    request: GraspRequest
+    """The request, mirrored for a left hand."""
+    rounds: tuple[Round, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of attempts."""
+        return sum(len(attempts.holds) for attempts in self.rounds)
+
+    @property
+    def held(self) -> int:
+        """Number of attempts that held the object to the end."""
+        return sum(int(attempts.holds.sum()) for attempts in self.rounds)
 
 
 class Grasper:
@@ -116,15 +127,14 @@ class Grasper:
         if seed < 0:
             raise CongraspError(f"The seed is {seed}.", "Use 0 or more.")
         self._arm = arm
-        self._hand, self._left = get_hand(policy.spec.hand), left
+        self._hand = get_hand(policy.spec.hand)
+        self._left = left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
         self.task = policy.task.evaluated()
-        self._policy, self._attempts_count, self._rounds, self._seed = (
-            policy,
-            attempts,
-            rounds,
-            seed,
-        )
+        self._policy = policy
+        self._attempts_count = attempts
+        self._rounds = rounds
+        self._seed = seed
         self._compiled = False
         self._attempts = Attempts(
             self._hand, self.task, policy, threads=threads or cores(), phases=phases
@@ -150,7 +160,7 @@ class Grasper:
         self,
         obj: GraspObject,
         request: GraspRequest | None = None,
-        progress: Progress = lambda what, done, total: None,
+        progress: Progress = ignore_progress,
     ) -> Grasp:
         """Returns the best grasp of several attempts.
 
@@ -166,72 +176,111 @@ class Grasper:
           CongraspError: the table obstructs all attempts, or the arm can execute none that holds
             the object.
         """
-        request = request or GraspRequest()
+        attempted = self.attempt(obj, request or GraspRequest(), progress)
+        return self.motion(attempted, progress)
+
+    @compiling_entry
+    def attempt(
+        self, obj: GraspObject, request: GraspRequest, progress: Progress = ignore_progress
+    ) -> Attempted:
+        """Simulates rounds of attempts until one meets the request.
+
+        Args:
+          obj: the object.
+          request: constraints on the grasp.
+          progress: called with the progress.
+
+        Raises:
+          UnknownConstraintError: the policy does not know one of the constraints.
+          ContradictionError: two of them exclude each other.
+          CongraspError: the table obstructs all attempts.
+        """
         require_known(request.constraints, self.task)
         if self._left:
-            obj, request = obj.mirrored(), mirrored_request(request)
-        obj = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        best: tuple[_Round, np.ndarray] | None = None
-        refused: collections.Counter[str] = collections.Counter()
-        held = attempts = 0
-        for number in range(self._rounds):
-            what = f"Attempting, round {number + 1}" if number else "Attempting"
-            tried = self._attempt(obj, request, (self._seed, number), what, progress)
-            if not tried.outcome.aligned.all():
-                raise ContradictionError(
-                    "The trajectory ends nearer to the avoid region than to the graspable part.",
-                    "Let it end at the graspable part, or leave out --affordance and --avoid.",
-                )
-            cost = self._cost(tried)
-            attempts, held = attempts + len(tried.holds), held + int(tried.holds.sum())
-            if self._arm:
-                found = self._on_arm(self._arm, tried, cost, attempts, held, refused, progress)
-                if found is not None:
-                    return found
-            elif best is None or cost.min() < best[1].min():
-                best = tried, cost
-            if prescribed(request) is not None or (best is not None and tried.meets.any()):
-                break  # another round would repeat these attempts, or is not needed
+            obj = obj.mirrored()
+            request = mirrored_request(request)
+        if request.avoid is not None:
+            obj = with_avoid(obj, request.avoid)
+        attempted = self._next_round(Attempted(obj, request, ()), progress)
+        while not attempted.rounds[-1].meets.any() and self._may_retry(attempted):
+            attempted = self._next_round(attempted, progress)
+        return attempted
+
+    @compiling_entry
+    def motion(self, attempted: Attempted, progress: Progress = ignore_progress) -> Grasp:
+        """Returns the best attempt as a motion; further rounds follow if an arm can execute none.
+
+        Raises:
+          NoReachError: without an arm, no planned approach leads to the grasp.
+          CongraspError: the arm can execute no attempt that holds the object.
+        """
         if self._arm:
-            raise _no_motion(obj, self._arm.name, attempts, refused)
-        assert best is not None
-        found = self._motion(best[0], int(best[1].argmin()), attempts, held)
-        return (
-            found if held else dataclasses.replace(found, cause=self._cause(obj, request, progress))
-        )
+            return self._motion_on_arm(self._arm, attempted, progress)
+        attempts = min(attempted.rounds, key=lambda attempts: self._cost(attempts).min())
+        index = int(self._cost(attempts).argmin())
+        grasp = self._grasp_of(attempts, index, attempted)
+        if attempted.held:
+            return grasp
+        cause = self._cause(attempted.obj, attempted.request, progress)
+        return dataclasses.replace(grasp, cause=cause)
 
     def close(self) -> None:
         """Ends the threads of the physics."""
         self._attempts.close()
+
+    def _may_retry(self, attempted: Attempted) -> bool:
+        """True if another round is left, and would not repeat the same attempts."""
+        if prescribed(attempted.request) is not None:
+            return False
+        return len(attempted.rounds) < self._rounds
+
+    def _next_round(self, attempted: Attempted, progress: Progress) -> Attempted:
+        """Adds a round of attempts.
+
+        Raises:
+          ContradictionError: the trajectory leads to the avoid region.
+        """
+        number = len(attempted.rounds)
+        activity = f"Attempting, round {number + 1}" if number else "Attempting"
+        attempts = self._attempt(
+            attempted.obj, attempted.request, (self._seed, number), activity, progress
+        )
+        if not attempts.outcome.aligned.all():
+            raise ContradictionError(
+                "The trajectory ends nearer to the avoid region than to the graspable part.",
+                "Let it end at the graspable part, or leave out --affordance and --avoid.",
+            )
+        return attempted._replace(rounds=(*attempted.rounds, attempts))
 
     def _attempt(
         self,
         obj: GraspObject,
         request: GraspRequest,
         seed: int | tuple[int, int],
-        what: str,
+        activity: str,
         progress: Progress,
-    ) -> _Round:
-        """Runs a round of attempts; `what` is its name in the progress."""
-        rng, count = np.random.default_rng(seed), self._attempts_count
-        episodes, rests, different = to_attempt(self._hand, self.task, obj, request, count, rng)
-        progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
-        self._compiled = True
-        outcome = self._attempts.run(
-            obj, episodes, lambda step: progress(what, step, self._attempts.steps)
+    ) -> Round:
+        """Runs a round of attempts; `activity` is its name in the progress."""
+        rng = np.random.default_rng(seed)
+        episodes, rests, distinct = to_attempt(
+            self._hand, self.task, obj, request, self._attempts_count, rng
         )
-        holds = outcome.metrics["held"][:different] > 0
-        return _Round(
+        progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 0)
+        self._compiled = True
+        steps = self._attempts.simulated_steps
+        outcome = self._attempts.run(obj, episodes, lambda step: progress(activity, step, steps))
+        holds = outcome.metrics["held"][:distinct] > 0
+        return Round(
             obj=obj, request=request, episodes=episodes, rests=rests, outcome=outcome, holds=holds
         )
 
-    def _cost(self, tried: _Round) -> np.ndarray:
+    def _cost(self, attempts: Round) -> np.ndarray:
         """(n,) cost of each attempt, with that of its resting pose."""
-        removal, lift = self.task.approach_steps - 1, self._attempts.phases.lift
-        cost = costs(tried.outcome, tuple(tried.request.constraints), removal, lift)
-        return (cost + _UNLIKELY * _places(tried.obj, tried.rests, tried.request))[
-            : len(tried.holds)
-        ]
+        removal = self.task.approach_steps - 1
+        lift = self._attempts.phases.lift
+        cost = costs(attempts.outcome, tuple(attempts.request.constraints), removal, lift)
+        cost = cost + _UNLIKELY * rest_ranks(attempts.obj, attempts.rests, attempts.request)
+        return cost[: len(attempts.holds)]
 
     def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
         """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller
@@ -247,161 +296,108 @@ class Grasper:
         if prescribed(request) is None and request.given("heading", "position") is None:
             smaller = obj.scaled(_SMALLER, constant_mass=True)
             trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
-        for changed, cause, how in trials:
-            what = f"Checking whether its {cause} is the cause"
+        for changed, cause, change in trials:
+            activity = f"Checking whether its {cause} is the cause"
             try:
-                holds = self._attempt(changed, request, self._seed, what, progress).holds
+                holds = self._attempt(changed, request, self._seed, activity, progress).holds
             except CongraspError:
                 continue
-            if holds.mean() >= _ENOUGH:
+            if holds.mean() >= _ENOUGH_HOLDS:
                 return (
-                    f"Its {cause} is the cause: with {how} {holds.sum()} of {len(holds)} attempts "
-                    f"hold it."
+                    f"Its {cause} is the cause: with {change} {holds.sum()} of {len(holds)} "
+                    f"attempts hold it."
                 )
         return ""
 
-    def _on_arm(
+    def _motion_on_arm(self, arm: "ArmPlanner", attempted: Attempted, progress: Progress) -> Grasp:
+        """Returns the best attempt that the arm can execute, of the first round that has one.
+
+        Raises:
+          CongraspError: the arm can execute no attempt that holds the object.
+        """
+        refusals: collections.Counter[str] = collections.Counter()
+        first = 0
+        while True:
+            for attempts in attempted.rounds[first:]:
+                grasp = self._planned(arm, attempts, attempted, refusals, progress)
+                if grasp is not None:
+                    return grasp
+            if not self._may_retry(attempted):
+                raise _no_motion(attempted.obj, arm.name, attempted.count, refusals)
+            first = len(attempted.rounds)
+            attempted = self._next_round(attempted, progress)
+
+    def _planned(
         self,
         arm: "ArmPlanner",
-        tried: _Round,
-        cost: np.ndarray,
-        attempts: int,
-        held: int,
-        refused: collections.Counter[str],
+        attempts: Round,
+        attempted: Attempted,
+        refusals: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
-        """Returns the best attempt that the arm can execute; `refused` counts the limits that
-        exclude better ones.
+        """Returns the best attempt of a round that the arm can execute; `refusals` counts the
+        limits that exclude better ones.
         """
-        order = [i for i in cost.argsort().tolist() if tried.meets[i]]
+        order = [i for i in self._cost(attempts).argsort().tolist() if attempts.meets[i]]
         for number, index in enumerate(order):
             progress(f"Moving {arm.name}", number + 1, len(order))
             try:
-                found = self._motion(tried, index, attempts, held)
-                planned = arm.plan(tried.obj, found.motion)
-                episode = planned.moved.recorded(found.episode)
-                return dataclasses.replace(
-                    found, episode=episode, motion=motion_of_episode(episode), arm=planned
-                )
+                grasp = self._grasp_of(attempts, index, attempted)
+                planned = arm.plan(attempts.obj, grasp.motion)
             except Infeasible as limit:
-                refused[str(limit)] += 1
+                refusals[str(limit)] += 1
+                continue
             except NoReachError:
-                refused["contact of every reach"] += 1
+                refusals["contact of every reach"] += 1
+                continue
+            episode = planned.moved.recorded(grasp.episode)
+            return dataclasses.replace(
+                grasp, episode=episode, motion=motion_of_episode(episode), arm=planned
+            )
         return None
 
-    def _motion(self, tried: _Round, index: int, attempts: int, held: int) -> Grasp:
+    def _grasp_of(self, attempts: Round, index: int, attempted: Attempted) -> Grasp:
         """Returns an attempt with its episode, motion and active constraints."""
-        obj, given = tried.obj, tried.request.constraints
+        obj = attempts.obj
         about = {
             "actor": "grasp",
-            "attempts": attempts,
-            "attempts_held": held,
+            "attempts": attempted.count,
+            "attempts_held": attempted.held,
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
         }
-        episode = self._attempts.episode(
-            tried.outcome, index, surface_of(self.task, obj), obj, about
-        )
-        if approach := self._attempts.phases.approach:
+        surface = surface_of(self.task, obj)
+        episode = self._attempts.episode(attempts.outcome, index, surface, obj, about)
+        seconds = self._attempts.phases.approach
+        if seconds:
             side = self._arm.side if self._arm else None
             episode = with_planned_reach(
-                episode, self._hand, obj, approach, self._attempts.speed, side
+                episode, self._hand, obj, seconds, self._attempts.speed, side
             )
         if self._left:
             episode = _mirrored(episode, self.hand)
-        active = explain(tuple(given), bool(tried.outcome.redirected[index]))
-        written = [name for name in given if name != "heading" or "direction" in given[name]]
-        goal = tried.episodes.goal.row(index)
-        against = contradictions(self._hand, obj.points, obj.non_graspable_points, goal, written)
-        active += [found.message for found in against]
-        rest = int(tried.rests[index])
-        return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
+        return Grasp(
+            episode=episode,
+            motion=motion_of_episode(episode),
+            attempts=attempted.count,
+            held=attempted.held,
+            rest=int(attempts.rests[index]),
+            active=self._active(attempts, index),
+        )
 
-
-@compiling_entry
-def open_grasper(
-    policy: pathlib.Path | None,
-    hand: str,
-    attempts: int = ATTEMPTS,
-    seed: int = 0,
-    phases: Phases = PLAIN,
-    arm: ArmOptions = ArmOptions(),  # noqa: B008
-) -> Grasper:
-    """Returns a grasper with a policy file, or with the pretrained policy of a hand.
-
-    Args:
-      policy: the file, or None.
-      hand: name of the hand; `human:left` is the left one of `human`.
-      attempts: grasps simulated in parallel.
-      seed: seed of the attempts.
-      phases: approach, lift and hold.
-      arm: the arm that carries the hand, if it names one.
-
-    Raises:
-      CongraspError: there is no such policy, hand or arm, or the hand on the arm is a left one.
-    """
-    right, left = right_name(hand)
-    if left and arm.arm:
-        raise CongraspError("Arms carry right hands only.", "Leave out --arm or :left.")
-    bundle, planner = bundles.load(policy_file(policy, right)), None
-    if arm.arm:
-        from congrasp.services.arm.planner import ArmPlanner
-
-        planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
-    return Grasper(bundle, attempts=attempts, phases=phases, seed=seed, arm=planner, left=left)
-
-
-@compiling_entry
-def grasp(
-    mesh: str | os.PathLike[str] | GraspObject,
-    *,
-    policy: str | os.PathLike[str] | None = None,
-    hand: str = "human",
-    options: ImportOptions | None = None,
-    attempts: int = ATTEMPTS,
-    seed: int = 0,
-    progress: Progress = lambda what, done, total: None,
-    **constraints: Any,
-) -> Grasp:
-    """Returns the best grasp motion of an object under constraints; compiled programs are kept for
-    the next call.
-
-    Example:
-      import congrasp
-
-      found = congrasp.grasp("mug:7", heading="above", attempts=8)
-      print(found.success, found.held, "of", found.attempts, "attempts hold it")
-
-    Args:
-      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, FAMILY:SEED of the generator, or an object.
-      policy: a policy file; the pretrained policy of the hand by default.
-      hand: name of the hand; `human:left` is the left one of `human`.
-      options: import options of a mesh.
-      attempts: grasps simulated in parallel.
-      seed: seed of the attempts.
-      progress: called with the progress.
-      **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose,
-        trajectory, fingers, …; each is the text that the command line takes, or a sequence of its
-        words or numbers.
-
-    Raises:
-      CongraspError: the object cannot be imported, or a constraint cannot be read or met.
-    """
-    file = policy_file(None if policy is None else pathlib.Path(policy), right_name(hand)[0])
-    grasper = _grasper(file, file.stat().st_mtime_ns if file.exists() else 0, hand, attempts, seed)
-    obj = (
-        mesh
-        if isinstance(mesh, GraspObject)
-        else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
-    )
-    request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
-    return grasper.grasp(obj, request, progress)
-
-
-@functools.lru_cache(maxsize=2)
-def _grasper(file: pathlib.Path, changed: int, hand: str, attempts: int, seed: int) -> Grasper:
-    """The grasper of a policy file, by its time of modification `changed`."""
-    return open_grasper(file, hand, attempts, seed)
+    def _active(self, attempts: Round, index: int) -> tuple[str, ...]:
+        """Active constraints of an attempt and their contradictions, in sentences."""
+        obj = attempts.obj
+        constraints = attempts.request.constraints
+        sentences = explain(tuple(constraints), bool(attempts.outcome.redirected[index]))
+        complete = [
+            name
+            for name in constraints
+            if name != "heading" or "direction" in constraints["heading"]
+        ]
+        goal = attempts.episodes.goal.row(index)
+        conflicts = contradictions(self._hand, obj.points, obj.non_graspable_points, goal, complete)
+        return (*sentences, *(conflict.message for conflict in conflicts))
 
 
 def _mirrored(episode: Message, hand: Hand) -> Message:
@@ -412,28 +408,18 @@ def _mirrored(episode: Message, hand: Hand) -> Message:
 
 
 def _no_motion(
-    obj: GraspObject, arm: str, attempts: int, refused: collections.Counter[str]
+    obj: GraspObject, arm: str, attempts: int, refusals: collections.Counter[str]
 ) -> CongraspError:
     """Error if an arm can execute no attempt that holds the object, with the limits that forbid
     them.
     """
-    if not refused:
+    if not refusals:
         return CongraspError(
             f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts."
         )
-    limits = ", ".join(f"{limit} {count}" for limit, count in refused.most_common())
+    limits = ", ".join(f"{limit} {count}" for limit, count in refusals.most_common())
     return CongraspError(
-        f"{arm} can execute none of the {refused.total()} attempts that hold '{obj.name}'. "
+        f"{arm} can execute none of the {refusals.total()} attempts that hold '{obj.name}'. "
         f"Reasons: {limits}.",
         "Set another --base or --mount, or more --attempts.",
     )
-
-
-def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.ndarray:
-    """(B,) ranks of the resting poses: upright first, then by likelihood; zeros if the request
-    names one.
-    """
-    if request.rest is not None:
-        return np.zeros_like(rests)
-    upright = upright_rest(obj)
-    return rests if upright is None else np.where(rests == upright, 0, rests + (rests < upright))

@@ -1,37 +1,39 @@
 """Grasps of many objects in turn: finished ones are skipped, and a failure does not stop the
 others.
+
+A grasp has five steps: the object is imported, the options become a request, attempts are
+simulated, the best of them becomes a motion, and the motion is written as files.
 """
 
 import dataclasses
-import hashlib
 import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import distinct_names, file_name
 from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
 from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options, size_in_words
-from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
-from congrasp.services.grasp.grasper import Grasper, Progress
+from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, save_grasp
+from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.keys import identity_of_constraints, identity_of_options, key_of
+from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.parse import read_request
+from congrasp.services.grasp.progress import Progress
+from congrasp.services.grasp.result import Result
 from congrasp.services.viz.film import Film
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
-from congrasp.services.viz.sheets import contact_sheet, save_png
+from congrasp.services.viz.sheets import save_png
 from congrasp.services.viz.version import RENDERER_VERSION
 from congrasp.services.viz.views import View
-
-SHEET, SUMMARY = "summary.png", "summary.json"
-_COLUMNS = 6
 
 
 class Settings(NamedTuple):
@@ -51,66 +53,42 @@ class Settings(NamedTuple):
     rest: str = ""
     """Resting pose: `upright` or a number from 1 on; any if empty."""
 
-
-class Result(NamedTuple):
-    """The outcome for one object."""
-
-    name: str
-    facts: dict[str, Any]
-    """Content of the result file; empty if there is an error."""
-    error: str = ""
-    skipped: bool = False
-    """It was finished before."""
-
     @property
-    def held(self) -> bool:
-        """True if the object is held, and its shape is close to that of its file."""
-        return bool(self.facts.get("success")) and self.facts["shape_reliable"]
-
-    def line(self) -> str:
-        """Summary in one line."""
-        if self.error:
-            return self.error
-        facts = self.facts
-        outcome = "held" if facts["success"] else "not held"
-        if not facts["shape_reliable"]:
-            outcome += (
-                ", but its shape is unreliable (see its notes; repair the mesh, or raise "
-                "--max-pieces)"
-            )
-        outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
-        best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
-        errors = [
-            f"{what} {_shown(facts, stem)}"
-            for stem, what in _ERRORS.items()
-            if f"{stem}_m" in facts
-        ]
-        if "affordance_ratio" in facts:
-            errors.append(
-                f"{100 * facts['affordance_ratio']:.0f} % of the contacts in the avoid region"
-            )
-        lying = [facts["cause"].rstrip(".")] if facts.get("cause") else []
-        lying += (
-            [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
-        )
-        return "; ".join(
-            [
-                facts["size"],
-                outcome,
-                *lying,
-                best,
-                *errors,
-                f"strongest link {facts['force_link_max']:.1f} N",
-            ]
-        )
+    def drawn(self) -> list[Any]:
+        """Version of the renderer, style of the video and viewpoint, as result.json has them."""
+        film = list(self.film) if self.film else None
+        view = list(self.view) if self.view else None
+        return [RENDERER_VERSION, film, view]
 
 
-_ERRORS = {"heading": "heading off by", "pose": "pose off by", "trajectory": "trajectory off by"}
+class _Job(NamedTuple):
+    """Grasp of one object, and where its files go."""
+
+    entry: ObjectAt
+    settings: Settings
+    folder: pathlib.Path
+    key: str
+    """Changes with any input of the grasp."""
 
 
-def _shown(facts: dict[str, Any], stem: str) -> str:
-    """Angle and distance of one kind of error."""
-    return f"{np.degrees(facts[f'{stem}_rad']):.0f}° and {1000 * facts[f'{stem}_m']:.0f} mm"
+def grasp_object(
+    entry: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress
+) -> Result:
+    """Grasps one object and writes its folder, unless it is finished already."""
+    try:
+        job = _job(entry, grasper, settings)
+        facts = _facts_before(job)
+        if facts is not None:
+            return Result(entry.name, facts, skipped=True)
+        obj = _object_of(job, progress)
+        request = _request_for(obj, grasper, job)
+        _save_import_picture(job, grasper, obj, request, progress)
+        attempted = grasper.attempt(obj, request, progress)
+        grasp = grasper.motion(attempted, progress)
+        facts = _save(job, obj, grasp, progress)
+    except CongraspError as error:
+        return Result(entry.name, {}, str(error))
+    return Result(entry.name, facts)
 
 
 def find_objects(
@@ -120,81 +98,28 @@ def find_objects(
 
     Objects of the same name are numbered, since each name becomes that of a folder.
     """
-    found: list[ObjectAt] = []
+    entries: list[ObjectAt] = []
     errors: list[Result] = []
     for text in texts:
         try:
-            found += objects_at(located(text, folder))
+            entries += objects_at(located(text, folder))
         except CongraspError as error:
             errors.append(Result(pathlib.Path(text).name, {}, str(error)))
-    return [
-        one._replace(name=name)
-        for one, name in zip(found, distinct_names(one.name for one in found), strict=True)
-    ], errors
+    names = distinct_names(entry.name for entry in entries)
+    return [entry._replace(name=name) for entry, name in zip(entries, names, strict=True)], errors
 
 
-def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:
-    """Grasps one object and writes its folder, unless it is finished already."""
-    try:
-        folder = settings.out / file_name(at.name, "the folder of an object")
-        check_spelling(folder)
-        given = {
-            name: [
-                _identity(part) for part in ([str(text)] if isinstance(text, str | bool) else text)
-            ]
-            for name, text in settings.constraints.items()
-            if text
-        }
-        options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(at.digest(), options, given, grasper.identity, settings.rest)
-        before = None if settings.again else finished(folder, key)
-        drawn = [
-            RENDERER_VERSION,
-            settings.film and [*settings.film],
-            settings.view and [*settings.view],
-        ]
-        filmed = settings.film is None or (
-            before and json.loads(json.dumps(drawn)) == before.get("drawn")
-        )
-        if (
-            before is not None
-            and filmed
-            and (not settings.pictures or (folder / THUMBNAIL).exists())
-        ):
-            return Result(at.name, before, skipped=True)
-        progress("Importing", 0, 1)
-        obj = _load(at, settings.options)
-        request = read_request(
-            obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints
-        )
-        if settings.rest:
-            request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
-        if settings.pictures and at.source:
-            save_png(
-                folder / OBJECT,
-                import_sheet(grasper.hand, obj, mesh_of_file(at.source), request.avoid),
-            )
-        found = grasper.grasp(obj, request, progress)
-        progress("Drawing", 0, 1)
-        about = {
-            "key": key,
-            "file": str(at.path),
-            "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
-            "object_mass": obj.mass,
-            "shape_reliable": obj.shape_reliable,
-            "notes": [
-                *obj.notes,
-                *_notes(at, obj, settings.options),
-                *([found.arm.note()] if found.arm else []),
-            ],
-            "rules": list(found.active),
-            "drawn": drawn,
-        }
-        film, pictures, view = settings.film, settings.pictures, settings.view
-        save_grasp(folder, found, about=about, film=film, pictures=pictures, view=view)
-        return Result(at.name, {**found.facts(), **about})
-    except CongraspError as error:
-        return Result(at.name, {}, str(error))
+def import_object(entry: ObjectAt, options: ImportOptions) -> GraspObject:
+    """Loads an object; only scale and mass of the options apply to object files and generated
+    objects.
+
+    Raises:
+      CongraspError: an option is out of range, or the object cannot be read or imported.
+    """
+    check_options(options)
+    if entry.source:
+        return entry.load(options)
+    return with_mass(entry.load().scaled(options.scale), options.mass, options.material)
 
 
 def rest_pose(obj: GraspObject, text: str) -> int:
@@ -206,7 +131,8 @@ def rest_pose(obj: GraspObject, text: str) -> int:
     """
     count = len(obj.rest_poses)
     if text == "upright":
-        if (upright := upright_rest(obj)) is None:
+        upright = upright_rest(obj)
+        if upright is None:
             raise CongraspError(
                 f"'{obj.name}' does not rest with its z axis up in any of its {count} resting "
                 f"poses.",
@@ -221,66 +147,101 @@ def rest_pose(obj: GraspObject, text: str) -> int:
     return int(text) - 1
 
 
-def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
+def _job(entry: ObjectAt, grasper: Grasper, settings: Settings) -> _Job:
+    """Folder and key of an object's grasp."""
+    folder = settings.out / file_name(entry.name, "the folder of an object")
+    check_spelling(folder)
+    key = key_of(
+        entry.digest(),
+        identity_of_options(settings.options),
+        identity_of_constraints(settings.constraints),
+        grasper.identity,
+        settings.rest,
+    )
+    return _Job(entry=entry, settings=settings, folder=folder, key=key)
+
+
+def _facts_before(job: _Job) -> dict[str, Any] | None:
+    """Facts of a finished grasp that has all requested files; None without one."""
+    settings = job.settings
+    if settings.again:
+        return None
+    facts = finished(job.folder, job.key)
+    if facts is None:
+        return None
+    if settings.film is not None and facts.get("drawn") != json.loads(json.dumps(settings.drawn)):
+        return None
+    if settings.pictures and not (job.folder / THUMBNAIL).exists():
+        return None
+    return facts
+
+
+def _object_of(job: _Job, progress: Progress) -> GraspObject:
+    """Step 1: the object of a job."""
+    progress("Importing", 0, 0)
+    return import_object(job.entry, job.settings.options)
+
+
+def _request_for(obj: GraspObject, grasper: Grasper, job: _Job) -> GraspRequest:
+    """Step 2: the request for an object."""
+    settings = job.settings
+    request = read_request(
+        obj, grasper.hand, grasper.task.trajectory_points, **settings.constraints
+    )
+    if settings.rest:
+        request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
+    return request
+
+
+def _save_import_picture(
+    job: _Job, grasper: Grasper, obj: GraspObject, request: GraspRequest, progress: Progress
+) -> None:
+    """Draws an imported object and its part to avoid, which may explain why a grasp fails."""
+    source = job.entry.source
+    if not source or not job.settings.pictures:
+        return
+    progress("Drawing the object", 0, 0)
+    sheet = import_sheet(grasper.hand, obj, mesh_of_file(source), request.avoid)
+    save_png(job.folder / OBJECT, sheet)
+
+
+def _save(job: _Job, obj: GraspObject, grasp: Grasp, progress: Progress) -> dict[str, Any]:
+    """Step 5: writes the files of a grasp; returns the content of result.json."""
+    settings = job.settings
+    notes = [*obj.notes, *_notes_on_mass(obj, job)]
+    if grasp.arm:
+        notes.append(grasp.arm.note())
+    about = {
+        "key": job.key,
+        "file": str(job.entry.path),
+        "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
+        "object_mass": obj.mass,
+        "shape_reliable": obj.shape_reliable,
+        "notes": notes,
+        "rules": list(grasp.active),
+        "drawn": settings.drawn,
+    }
+    save_grasp(
+        job.folder,
+        grasp,
+        film=settings.film,
+        pictures=settings.pictures,
+        about=about,
+        view=settings.view,
+        progress=progress,
+    )
+    return {**grasp.facts(), **about}
+
+
+def _notes_on_mass(obj: GraspObject, job: _Job) -> list[str]:
     """Notes on the source of a mesh's mass, if the user has not set it."""
-    if not at.source or options.mass is not None:
+    options = job.settings.options
+    if not job.entry.source or options.mass is not None:
         return []
-    basis = f"of {options.material}" if options.material else "by its surface and volume"
     if options.density is not None:
         basis = f"by {options.density:g} kg/m³"
+    elif options.material:
+        basis = f"of {options.material}"
+    else:
+        basis = "by its surface and volume"
     return [f"its mass is {1000 * obj.mass:.0f} g, {basis} (--material or --mass sets another)"]
-
-
-def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """Loads the object; only scale and mass of the options apply to object files and generated
-    objects.
-    """
-    check_options(options)
-    if at.source:
-        return at.load(options)
-    return with_mass(at.load().scaled(options.scale), options.mass, options.material)
-
-
-def _identity(text: str) -> str:
-    """Identity of a constraint: the content of its file, if it names one."""
-    for name, part in ((text, "0"), text.rpartition(":")[::2]):  # a number, or a joint
-        if name and pathlib.Path(name).is_file():
-            return f"{hashlib.sha256(pathlib.Path(name).read_bytes()).hexdigest()}:{part}"
-    return text
-
-
-def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
-    """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
-    held = sum(result.held for result in results)
-    rows = [
-        {"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts}
-        for r in results
-    ]
-    summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}
-    write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
-    drawn = [
-        result
-        for result in results
-        if (out / result.name / THUMBNAIL).exists() and not result.error
-    ]
-    if drawn:
-        images = [
-            np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn
-        ]
-        labels = [
-            f"{result.name}: {_verdict(result)}, {result.facts['attempts_held']} of "
-            f"{result.facts['attempts']}"
-            for result in drawn
-        ]
-        title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
-        save_png(
-            out / SHEET,
-            contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title),
-        )
-
-
-def _verdict(result: Result) -> str:
-    """Outcome in the label of a picture."""
-    if not result.facts["shape_reliable"]:
-        return "SHAPE UNRELIABLE"
-    return "held" if result.held else "NOT HELD"

@@ -1,31 +1,17 @@
-"""The best of several attempts: the costs that choose it, its motion, and its facts."""
+"""A grasp: the best of several attempts as a motion, and its facts."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from congrasp.actors.attempts import Outcome
-from congrasp.actors.stress import ASSESSED, SURVIVAL
-from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.actors.stress import ASSESSED
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.grasp.costs import errors_of
 
 if TYPE_CHECKING:
     from congrasp.services.arm.planner import ArmMotion
-
-_SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
-_SCALES |= {
-    "moved_at_removal": 0.01,
-    "force_link_max": 10.0,
-    "slip": 0.02,
-    "posture_rad": 0.1,
-}
-"""Scales that make costs of grasps that hold comparable: errors, displacement of the object before
-table removal (m), force of the strongest link (N), displacement after removal (m), and deviation
-from natural postures (rad)."""
-_FIRM = ("clean", *SURVIVAL)
-"""Metrics that add a cost of 1 where they are zero."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,55 +62,27 @@ class Grasp:
 
     def facts(self) -> dict[str, Any]:
         """Result, attempts and errors, for tables and files."""
-        return {
+        metrics = self.motion.metrics
+        facts: dict[str, Any] = {
             "object": self.motion.object,
             "hand": self.motion.hand,
             "success": self.success,
             "held_quarter_second": self.motion.success,
             "attempts": self.attempts,
             "attempts_held": self.held,
-            **({"cause": self.cause} if self.cause else {}),
+        }
+        if self.cause:
+            facts["cause"] = self.cause
+        facts |= {
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
             "sink_mm": 1e3 * self.sink,
             "shove_mm": 1e3 * self.shove,
-            "links_at_removal": self.motion.metrics["links_at_removal"],
-            **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
-            **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
-            **(self.arm.facts() if self.arm else {}),
+            "links_at_removal": metrics["links_at_removal"],
         }
-
-
-def _errors_of(constraints: tuple[str, ...]) -> list[str]:
-    """Names of the metrics that count under these constraints."""
-    names = [
-        spec.name
-        for c in CONSTRAINTS
-        if not c.optional or c.name in constraints
-        for spec in c.errors
-    ]
-    return [*names, "moved_at_removal", "force_link_max"]
-
-
-def costs(
-    outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float = 0.0
-) -> np.ndarray:
-    """(B,) cost of each attempt: held to the end first, then held for a quarter of a second, then
-    everything else.
-
-    Args:
-      outcome: outcome of the attempts.
-      constraints: names of the requested constraints.
-      removal: the last control step of the approach.
-      lift: height by which the hand rises after the approach, m.
-    """
-    place = outcome.trace.object_position
-    way = place[-1] - place[removal] - [0.0, 0.0, lift]
-    values = {**outcome.metrics, "slip": np.linalg.norm(way, axis=-1)}
-    cost = sum(
-        np.minimum(values[name] / _SCALES[name], 10.0)
-        for name in [*_errors_of(constraints), "slip", "posture_rad"]
-    )
-    cost += sum(values[name] == 0 for name in _FIRM)
-    return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
+        facts |= {name: value for name, value in metrics.items() if name in ASSESSED}
+        facts |= {name: metrics[name] for name in errors_of(self.motion.constraints)}
+        if self.arm:
+            facts |= self.arm.facts()
+        return facts

@@ -26,34 +26,47 @@ from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import EPISODE
 from congrasp.services.viz.hand_shapes import link_frames, upright
 
-SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
-"""Limits of the wrist: m/s, m/s^2 and rad/s."""
+SPEED = 1.0
+"""Limit of the wrist's speed, m/s."""
+ACCELERATION = 15.0
+"""Limit of the wrist's acceleration, m/s^2."""
+TURNING = 5.0
+"""Limit of the wrist's angular speed, rad/s."""
 CLEARANCE = 0.01
 """Least clearance of the hand from object and table, m; near the end of the curve, that of the
 start of the grasp if that is smaller."""
-_NEAR_END = (
-    0.8  # share of the curve beyond which the clearance may be that of the start of the grasp
-)
-# Initial distance of wrist and object's centre, and of hand and table, m
-_BESIDE, _ABOVE = (
-    0.45,
-    0.04,
-)
-# Least horizontal distance by which the wrist starts further from the object than the grasp does,
-# m
+_NEAR_END = 0.8
+"""Share of the curve beyond which the clearance may be that of the start of the grasp."""
+_BESIDE = 0.45
+"""Initial distance of wrist and object's centre, m."""
+_ABOVE = 0.04
+"""Initial distance of hand and table, m."""
 _WAY = 0.22
-_BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
-"""The first two for a hand whose arm needs room above the table, m, and the angle by which its
-fingers point down.
-"""
-_RELAXED = 0.15  # initial share of the fingers' way from the open to the closed pose
-_CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
+"""Least horizontal distance by which the wrist starts further from the object than the grasp does,
+m."""
+_BESIDE_WITH_ARM = 0.12
+"""Initial distance of wrist and object's centre for a hand whose arm needs room, m."""
+_ABOVE_WITH_ARM = 0.2
+"""Initial distance of hand and table for a hand whose arm needs room, m."""
+_DOWN_WITH_ARM = math.radians(60.0)
+"""Angle by which the fingers of a hand on an arm point down."""
+_RELAXED = 0.15
+"""Initial share of the fingers' way from the open to the closed pose."""
+_CHECKED = 25
+"""Number of poses of the curve that are checked."""
+_ALONG = 5
+"""Number of points on a capsule's axis."""
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
-_FINE = 401  # points of the curve
-_MOST_STRETCH = 50.0  # largest factor on the requested duration
-_BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
-_UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
-_TOLERANCE = 1e-3  # m
+_FINE = 401
+"""Number of points of the curve."""
+_MAX_STRETCH = 50.0
+"""Largest factor on the requested duration."""
+_BACK = (0.08, 0.15, 0.22)
+"""Distances of the curve's middle point from its end, against the heading, m."""
+_UP = (0.0, 0.10, 0.20, 0.32)
+"""Distances of the curve's middle point above its end, m."""
+_TOLERANCE = 1e-3
+"""Tolerance of the clearance, m."""
 _BEGIN = (
     "object_position",
     "object_quaternion",
@@ -157,10 +170,10 @@ def plan_reach(  # noqa: PLR0913
     ).min()
     for curve in _curves(hand, rest, heading, first, fingers, -float(lowest), side):
         steps = math.ceil(_duration(curve, seconds, speed) / dt)
-        found = clearances(hand, field, rest, axes, curve.at(x, steps * dt, speed))
+        clearance = clearances(hand, field, rest, axes, curve.at(x, steps * dt, speed))
         far = curve.way(x, steps * dt, speed) <= _NEAR_END
         needed = np.where(far, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
-        if (found >= needed).all():
+        if (clearance >= needed).all():
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
     raise NoReachError(
         f"Every planned approach to a grasp of '{obj.name}' touches the object or the table.",
@@ -210,9 +223,9 @@ def _first_turn(hand: Hand, forward: np.ndarray, side: float | None) -> Rotation
     """
     # `upright` has the fingers up and the palm towards +x.
     across = np.cross(forward, [0.0, 0.0, -1.0])
-    lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], across, forward], -1))
+    palm_down = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], across, forward], -1))
     down = 0.0 if side is None else _DOWN_WITH_ARM
-    return Rotation.from_rotvec(down * across) * lying * upright(hand)
+    return Rotation.from_rotvec(down * across) * palm_down * upright(hand)
 
 
 def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:
@@ -223,15 +236,16 @@ def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:
     # (C, _ALONG, 3)
     along = hand.capsules[:, :1] + share * (hand.capsules[:, 1:] - hand.capsules[:, :1])
     origins = np.array([link_origin(link) for link in hand.links])
-    local, links = along - origins[hand.capsule_links][:, None], hand.capsule_links
-    found = []
+    links = hand.capsule_links
+    local = along - origins[links][:, None]
+    axes = []
     for angles in q:
         position, quaternion = mujoco_link_poses(hand, angles)
         matrices = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()[links]
-        found.append(
+        axes.append(
             (np.einsum("cij,cpj->cpi", matrices, local) + position[links][:, None]).reshape(-1, 3)
         )
-    return np.array(found)
+    return np.array(axes)
 
 
 def clearances(
@@ -270,15 +284,16 @@ def _duration(curve: _Curve, seconds: float, speed: float) -> float:
     to its limits.
     """
     x = np.linspace(0, 1, _FINE)
-    for found in seconds * np.geomspace(1.0, _MOST_STRETCH, 100):
-        poses, h = curve.at(x, found, speed), found * x[1]
+    for duration in seconds * np.geomspace(1.0, _MAX_STRETCH, 100):
+        poses = curve.at(x, duration, speed)
+        h = duration * x[1]
         velocity = np.diff(poses.position, axis=0) / h
         fastest = np.linalg.norm(velocity, axis=1).max() / SPEED
         hardest = np.linalg.norm(np.diff(velocity, axis=0) / h, axis=1).max() / ACCELERATION
         turning = (poses.rotation[:-1].inv() * poses.rotation[1:]).magnitude().max() / h / TURNING
         if max(fastest, hardest, turning) <= 1.0:
             break
-    return float(found)
+    return float(duration)
 
 
 def with_planned_reach(
@@ -313,7 +328,8 @@ def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
     During the approach the object rests, there is no contact, and errors are those of the first
     step.
     """
-    arrays, steps = episode.arrays, len(reach.q)
+    arrays = episode.arrays
+    steps = len(reach.q)
     moving = [
         name for name in arrays if name in _OF_STEPS or f"{name.partition('/')[0]}/*" in _OF_STEPS
     ]

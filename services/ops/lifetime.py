@@ -109,9 +109,7 @@ def _default_grace(interrupt: bool) -> float:
     return GRACE_ALONE if interrupt and not has_children else GRACE
 
 
-def _watch_signals(
-    reader: socket.socket, stop: Stop, grace: float | None, interrupt: bool
-) -> None:
+def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, interrupt: bool) -> None:
     """Sets `stop` at the first signal, and ends the process after some seconds or at the second
     signal.
 

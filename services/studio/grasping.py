@@ -28,7 +28,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.pictures import cause
 from congrasp.services.grasp.approaches import repeated, surface_of
-from congrasp.services.grasp.motion import costs
+from congrasp.services.grasp.costs import costs
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source, follow_file, follow_run
 from congrasp.services.studio.state import tool_of
@@ -40,7 +40,7 @@ _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
 _COMPILING = 60
 """Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
-"""Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.motion`."""
+"""Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.costs`."""
 SECONDS = "{seconds}"
 """Placeholder in the text of a job for its elapsed seconds."""
 Progress = Callable[[str, float], None]
@@ -166,7 +166,7 @@ class PolicyGrasping:
         m.
         """
         episodes, aside = _episodes(self.hand, self.task, obj, request)
-        steps = self._attempts.steps
+        steps = self._attempts.simulated_steps
         return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
 
 

@@ -17,7 +17,9 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
-from congrasp.services.grasp.jobs import Result, Settings, find_objects, grasp_object
+from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object
+from congrasp.services.grasp.progress import ignore_progress
+from congrasp.services.grasp.result import Result
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.viz.film import Film, film_frames
 from congrasp.services.viz.render import render_episode_frames
@@ -36,10 +38,13 @@ python -m tests.benchmarks gallery --scans object_sim    # these grasps, picture
 
 Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are MyoSuite's
 (Apache-2.0, `simhive/object_sim`). `runs/gallery` holds the grasps; two of them serve as references of others.
+The policies are {policies}.
 
 | grasp | command, attempts that hold the object |
 |---|---|
 """
+_DIGITS = 16
+"""Digits of a policy's hash on the page."""
 
 
 class Shown(NamedTuple):
@@ -154,7 +159,7 @@ def _results(
             again=False,
             rest=shown.rest,
         )
-        result = grasp_object(at, graspers[shown.hand], settings, lambda what, done, total: None)
+        result = grasp_object(at, graspers[shown.hand], settings, ignore_progress)
         yield result._replace(name=shown.name)
         if result.error:
             continue
@@ -167,11 +172,21 @@ def _results(
             film = out / f"{shown.name}.gif"
             save_film(film, episode)
             provenance.write(film, origin)
-        held = f"{result.facts['attempts_held']} of {result.facts['attempts']}"
-        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{command_of(shown)}`<br>{held} |\n")
-    (out / "index.md").write_text(_HEAD + "".join(rows))
+        claim = (
+            f"{result.facts['attempts_held']} of {result.facts['attempts']}, "
+            f"resting pose {result.facts['rest']}"
+        )
+        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{command_of(shown)}`<br>{claim} |\n")
+    (out / "index.md").write_text(_HEAD.format(policies=_policies()) + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
+
+
+def _policies() -> str:
+    """Hands and hashes of the policies that ship, for the page."""
+    hands = dict.fromkeys(shown.hand for shown in SHOWN)
+    hashes = {hand: bundles.load(policy_file(None, hand)).actor_sha256 for hand in hands}
+    return ", ".join(f"`{hand}` {digest[:_DIGITS]}" for hand, digest in hashes.items())
 
 
 def _given(value: Any, work: pathlib.Path) -> Any:

@@ -21,7 +21,7 @@ from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
-from congrasp.services.grasp import wrist_paths
+from congrasp.services.grasp import bvh, wrist_paths
 from congrasp.services.record.reader import (
     metrics_of,
     pick_episode,
@@ -435,14 +435,15 @@ def test_json_is_of_bounded_size_and_depth(tmp_path):
 def test_a_bvh_that_is_none_is_one_line(tmp_path, before, after):
     path = tmp_path / "x.bvh"
     path.write_text(BVH)
-    assert wrist_paths.read_bvh(path, "RightHand")[0].shape == (2, 3)
+    assert bvh.read_bvh(path, "RightHand")[0].shape == (2, 3)
     assert before in BVH
     path.write_text(BVH.replace(before, after))
-    refused(lambda path: wrist_paths.read_bvh(path, "RightHand"), path, "cannot be read as BVH")
+    refused(lambda path: bvh.read_bvh(path, "RightHand"), path, "cannot be read as BVH")
 
 
 def test_motions_of_others_are_of_bounded_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(wrist_paths, "_LARGEST", 100)
+    monkeypatch.setattr(bvh, "_MAX_BYTES", 100)
+    monkeypatch.setattr(wrist_paths, "_MAX_CSV_BYTES", 100)
     for name in ("x.bvh", "x.csv"):
         (tmp_path / name).write_text("0,0,0,1,0,0,0\n" * 20)
         refused(wrist_paths.read_wrist_path, tmp_path / name, "bytes; the limit is 100")

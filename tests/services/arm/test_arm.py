@@ -25,7 +25,7 @@ from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, pick_motion, robot_joints
-from congrasp.services.grasp.files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
+from congrasp.services.grasp.arm_files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
 from tests.services.conftest import quick_imports
 
 LINKS = [

@@ -182,8 +182,8 @@ def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass)
 
 
 def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
-    """Objects and initial conditions are those of the first level but for its change; progress is
-    that of all.
+    """Objects and initial conditions are those of the first level but for its change; progress
+    counts the episodes of a running batch, too.
     """
     seen, told, variations = [], [], [*NOISE, *SENSING, *PEERS]
 
@@ -199,8 +199,9 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
         def replace_objects(self, objects, field):
             self.objects = objects
 
-        def run(self, begun, stressed):
+        def run(self, begun, stressed, progress):
             assert stressed
+            progress(0.5)
             seen.append((jax.device_get(begun), [obj.mass for obj in self.objects]))
             return mock.Mock()
 
@@ -215,7 +216,8 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
         variations
     )
     assert [result.row.group for result in results] == [variation.label for variation in variations]
-    assert told == [4 * (i + 1) for i in range(len(variations))]  # one of each object
+    # Half of a batch with one episode of each object, then all of it
+    assert told == [2 * (i + 1) for i in range(2 * len(variations))]
     first = {}
     for variation, (begun, masses) in zip(variations, seen, strict=True):
         same = ("object_index", "object_position", "object_quaternion", "mass_scale")

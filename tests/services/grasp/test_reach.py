@@ -16,9 +16,8 @@ from congrasp.common.objects import procedural
 from congrasp.common.rotations import rotate
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.export.motion_file import motion_of_episode
-from congrasp.services.grasp.files import _steps_to_draw
+from congrasp.services.grasp.files import steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose
-from congrasp.services.grasp.parse import grasp_part
 from congrasp.services.grasp.reach import (
     ACCELERATION,
     CLEARANCE,
@@ -28,6 +27,7 @@ from congrasp.services.grasp.reach import (
     plan_reach,
     with_reach,
 )
+from congrasp.services.grasp.reference_files import grasp_part
 from congrasp.services.viz.render import grasp_steps
 from tests.episodes import CONTROL_DT, episode
 
@@ -181,7 +181,7 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
         assert 0 <= first <= end < len(motion.time)
         longer.meta["phases"] = odd
         assert 0 <= grasp_steps(longer)[0] <= grasp_steps(longer)[1] <= len(motion.time)
-    drawn = _steps_to_draw(100, 150, 400)
+    drawn = steps_to_draw(100, 150, 400)
     assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
+from congrasp.services.grasp.bvh import read_bvh
+from congrasp.services.grasp.wrist_paths import read_wrist_path
 
 FRAMES = 12
 T = np.linspace(0, 1, FRAMES)

@@ -21,7 +21,7 @@ from congrasp.services.assets.objects.options import (
     metres_per_unit,
     sizes_by_unit,
 )
-from congrasp.services.grasp.jobs import _load
+from congrasp.services.grasp.jobs import import_object
 from congrasp.services.studio.catalogue import Importer
 
 
@@ -161,11 +161,12 @@ def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_ma
 
 def test_options_weigh_objects_of_the_generator_too():
     at, before = ObjectAt("mug_7", pathlib.Path("mug:7"), None), generate(7, "mug")
-    heavy = _load(at, ImportOptions(mass=0.4))
+    heavy = import_object(at, ImportOptions(mass=0.4))
     assert heavy.mass == 0.4
     np.testing.assert_allclose(heavy.inertia, before.inertia * 0.4 / before.mass)
     steel, wood = (
-        _load(at, ImportOptions(material=name)).mass for name in ("body=wood,handle=steel", "wood")
+        import_object(at, ImportOptions(material=name)).mass
+        for name in ("body=wood,handle=steel", "wood")
     )
     assert steel > 1.2 * wood
-    assert _load(at, ImportOptions()).mass == before.mass
+    assert import_object(at, ImportOptions()).mass == before.mass

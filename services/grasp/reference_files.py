@@ -1,0 +1,231 @@
+"""Reference poses and wrist paths from files: motions, constraint sets, CSV, BVH and JSON."""
+
+import pathlib
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Hand
+from congrasp.common.io.inputs import read_json
+from congrasp.common.rotations import continuous
+from congrasp.common.task.sampling import set_file
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.approach import approach
+from congrasp.services.assets.captures.references import followed
+from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.captures.surface import Surface
+from congrasp.services.assets.objects.options import size_in_words
+from congrasp.services.export.motion_file import GraspMotion, load_motion
+from congrasp.services.grasp.csv_paths import HUGE, read_csv
+from congrasp.services.grasp.target import Target, unit_vector
+from congrasp.services.grasp.wrist_paths import read_wrist_path
+from congrasp.services.record.episode import grasp_span
+
+_MAX_BYTES = 4 << 20
+"""Of a JSON or CSV file."""
+
+
+def read_pose(text: str, target: Target) -> dict[str, np.ndarray]:
+    """A reference pose from a motion, a constraint set, or JSON."""
+    path, index = _numbered(text)
+    if path.suffix == ".npz":
+        motion = _motion(path, target.hand, index)
+        last = grasp_part(motion)[1]
+        position, quaternion = _wrist_on_object(motion, last)
+        return {
+            "q": motion.joint_position[last],
+            "position": position[last],
+            "quaternion": quaternion[last],
+        }
+    if path.name.endswith(set_file.SUFFIX):
+        arrays = _set_of(path, target, index).arrays
+        return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
+    content = _json(path, ("joints", "position", "quaternion"))
+    q = _finger_angles(content["joints"], target.hand, path)
+    position = target.placed(_floats(content["position"], (3,), f"'position' of {path}"))
+    target.check_near(position, f"the wrist of {path}")
+    quaternion = _floats(content["quaternion"], (4,), f"'quaternion' of {path}")
+    turn = unit_vector(quaternion, "the quaternion")
+    return {"q": q, "position": position, "quaternion": target.turned(turn)}
+
+
+def _finger_angles(joints: Any, hand: Hand, path: pathlib.Path) -> np.ndarray:
+    """(F,) finger angles within the hand's limits, from a list or by names of joints, rad."""
+    names = [joint.name for joint in hand.joints]
+    if isinstance(joints, dict):
+        unknown = sorted(set(joints) - set(names))
+        if unknown:
+            raise CongraspError(
+                f"the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}."
+            )
+        joints = [joints.get(name, 0.0) for name in names]
+    q = _floats(joints, (len(names),), f"'joints' of {path}")
+    largest = np.abs(q).max()
+    if largest > 2 * np.pi:
+        raise CongraspError(f"a joint of {path} is at {largest:.4g}.", "Angles are in radians.")
+    return coupled(hand, np.clip(q, hand.lower, hand.upper))
+
+
+def read_path(text: str, target: Target) -> dict[str, np.ndarray]:
+    """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
+    path, index = _numbered(text)
+    file, _, joint = text.partition(":")
+    if file.lower().endswith(".bvh"):
+        return _recorded(pathlib.Path(file), joint or "RightHand", target)
+    if path.suffix == ".npz":
+        motion = _motion(path, target.hand, index)
+        first, last = grasp_part(motion)
+        position, quaternion = _wrist_on_object(motion, first)
+        grasp = slice(first, last + 1)
+        return _resampled(position[grasp], quaternion[grasp], target.waypoints, path)
+    if path.name.endswith(set_file.SUFFIX):
+        arrays = _set_of(path, target, index).arrays
+        position = arrays["trajectory/position"][0, index]
+        quaternion = arrays["trajectory/quaternion"][0, index]
+        return _resampled(position, quaternion, target.waypoints, path)
+    if path.suffix.lower() == ".csv":
+        position, quaternion = read_csv(path, _MAX_BYTES)
+    else:
+        content = _json(path, ("position", "quaternion"))
+        count = len(content["position"]) if isinstance(content["position"], list) else 0
+        position = _floats(content["position"], (count, 3), f"'position' of {path}")
+        quaternion = _floats(content["quaternion"], (count, 4), f"'quaternion' of {path}")
+    position = target.placed(position)
+    target.check_near(position[-1], f"the end of {path}")
+    return _resampled(position, target.turned(quaternion), target.waypoints, path)
+
+
+def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
+    """The path of a BVH joint to the frame nearest to the object, cut like captured paths."""
+    recorded = read_wrist_path(path, joint=joint)
+    position, rotation = followed(target.hand, recorded.position, recorded.rotation)
+    position = position + target.obj.origin  # both are upright
+    distances = Surface(target.obj).distance(position)
+    frame = int(distances.argmin())
+    target.check_near(position[frame], f"the joint '{joint}' of {path}")
+    is_valid = np.ones(len(distances), bool)
+    try:
+        _, places, turns = approach(
+            path.stem, position, rotation.as_matrix(), distances, is_valid, frame, target.waypoints
+        )
+    except Dropped as dropped:
+        raise CongraspError(
+            f"{path}: {dropped.reason}.", "Move the skeleton, or name another joint."
+        ) from None
+    return {"position": places, "quaternion": turns}
+
+
+def _numbered(text: str) -> tuple[pathlib.Path, int]:
+    """The file and the number in FILE or FILE:NUMBER; the number is 0 by default."""
+    name, colon, number = text.rpartition(":")
+    if colon and number.isdecimal() and len(number) < 10:
+        return pathlib.Path(name), int(number)
+    return pathlib.Path(text), 0
+
+
+def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
+    """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
+    if index:
+        raise CongraspError(
+            f"{path} is one motion and has no number {index}.", "Leave the number out."
+        )
+    motion = load_motion(path)
+    if motion.hand != hand.name:
+        raise CongraspError(f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.")
+    return motion
+
+
+def grasp_part(motion: GraspMotion) -> tuple[int, int]:
+    """The first frame of the grasp itself, and the last one before the lift or the table's
+    removal.
+    """
+    first, end = grasp_span(motion.about, motion.control_dt, motion.table)
+    last = max(end - 1, 0)
+    return min(first, last), last
+
+
+def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """The wrist (T, 3), (T, 4) in the object frame of one frame of the motion."""
+    turn = Rotation.from_quat(motion.object_quaternion[frame], scalar_first=True).inv()
+    wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
+    position = turn.apply(motion.wrist_position - motion.object_position[frame])
+    return position, (turn * wrist).as_quat(scalar_first=True)
+
+
+def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
+    """The constraint set in a file; raises a CongraspError for another hand or object, or without
+    this number.
+    """
+    constraints = set_file.load(path)
+    hand = target.hand
+    obj = target.obj
+    if constraints.meta["hand"] != hand.name:
+        raise CongraspError(
+            f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'."
+        )
+    size = np.ptp(obj.visual_vertices, axis=0)
+    size_in_set = np.ptp(constraints.arrays["visual/vertices"], axis=0)
+    if not np.allclose(size, size_in_set, rtol=0.02, atol=1e-3):
+        scale = float(constraints.meta["object_scale"])
+        remedy = "Name the set of this object."
+        if scale != 1.0:
+            remedy = (
+                f"The {hand.name} hand is trained on objects {scale:g} times as large: add --scale "
+                f"{scale:g}."
+            )
+        raise CongraspError(
+            f"{path} is for an object of {size_in_words(size_in_set)}; '{obj.name}' has "
+            f"{size_in_words(size)}.",
+            remedy,
+        )
+    count = constraints.arrays["pose/q"].shape[1]
+    if index >= count:
+        raise CongraspError(
+            f"{path} has no number {index}.", f"Its poses and trajectories are 0 to {count - 1}."
+        )
+    return constraints
+
+
+def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
+    """A JSON file that has these keys."""
+    remedy = (
+        f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
+    )
+    content = read_json(path, _MAX_BYTES, remedy)
+    for key in keys:
+        if not isinstance(content, dict) or key not in content:
+            raise CongraspError(f"{path} lacks '{key}'.", remedy)
+    return content
+
+
+def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """(*shape) numbers below `HUGE`; raises a CongraspError for others."""
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError, OverflowError):
+        array = np.zeros(0)
+    if array.shape != shape or 0 in shape or not (np.abs(array) < HUGE).all():
+        raise CongraspError(f"{what} must be {' x '.join(map(str, shape))} finite numbers.")
+    return array
+
+
+def _resampled(
+    position: np.ndarray, quaternion: np.ndarray, waypoints: int, path: pathlib.Path
+) -> dict[str, np.ndarray]:
+    """`waypoints` poses evenly spread along a path (n, 3), (n, 4)."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
+    moves = np.concatenate([[True], np.diff(along) > 1e-6])
+    if moves.sum() < 2:
+        raise CongraspError(
+            f"the wrist does not move in {path}.", "Give two different waypoints or more."
+        )
+    if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
+        raise CongraspError(f"{path} has a quaternion of length zero.")
+    along = along[moves]
+    samples = np.linspace(0.0, along[-1], waypoints)
+    places = np.stack([np.interp(samples, along, column) for column in position[moves].T], -1)
+    turns = Slerp(along, Rotation.from_quat(quaternion[moves], scalar_first=True))(samples)
+    return {"position": places, "quaternion": continuous(turns.as_quat(scalar_first=True))}
