@@ -142,7 +142,7 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     launch_file = option_value("--launch", arguments)
     if not launch_file:
         return {}
-    from congrasp.actors.harvest import references_file
+    from congrasp.actors.references_file import references_file
     from congrasp.services.train.launch import read_launch
 
     path = pathlib.Path(launch_file)

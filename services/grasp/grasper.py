@@ -83,14 +83,14 @@ class Attempted(NamedTuple):
     rounds: tuple[Round, ...]
 
     @property
-    def count(self) -> int:
+    def attempts(self) -> int:
         """Number of attempts."""
-        return sum(len(attempts.holds) for attempts in self.rounds)
+        return sum(len(one_round.holds) for one_round in self.rounds)
 
     @property
     def held(self) -> int:
         """Number of attempts that held the object to the end."""
-        return sum(int(attempts.holds.sum()) for attempts in self.rounds)
+        return sum(int(one_round.holds.sum()) for one_round in self.rounds)
 
 
 class Grasper:
@@ -323,7 +323,7 @@ class Grasper:
                 if grasp is not None:
                     return grasp
             if not self._may_retry(attempted):
-                raise _no_motion(attempted.obj, arm.name, attempted.count, refusals)
+                raise _no_motion(attempted.obj, arm.name, attempted.attempts, refusals)
             first = len(attempted.rounds)
             attempted = self._next_round(attempted, progress)
 
@@ -361,7 +361,7 @@ class Grasper:
         obj = attempts.obj
         about = {
             "actor": "grasp",
-            "attempts": attempted.count,
+            "attempts": attempted.attempts,
             "attempts_held": attempted.held,
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
@@ -379,7 +379,7 @@ class Grasper:
         return Grasp(
             episode=episode,
             motion=motion_of_episode(episode),
-            attempts=attempted.count,
+            attempts=attempted.attempts,
             held=attempted.held,
             rest=int(attempts.rests[index]),
             active=self._active(attempts, index),

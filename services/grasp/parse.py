@@ -41,7 +41,7 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       CongraspError: an option is unknown, cannot be read or does not fit the object; the message
         names it.
     """
-    options = {}
+    options: dict[str, Option] = {}
     for constraint in CONSTRAINTS:
         options |= {option.name: option for option in constraint.options}
     unknown = sorted(set(texts) - set(options))
