@@ -1,7 +1,6 @@
 """One control step of B environments, as input of observation, reward and errors."""
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +10,9 @@ from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.readings import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Features, Goal, SceneState, Surface
+
+_NOTHING_MEASURED: Mapping[str, Array] = {}
+"""A dictionary, since JAX knows no read-only one."""
 
 
 class Scene(NamedTuple):
@@ -26,7 +28,7 @@ class Scene(NamedTuple):
     camera's cloud, world frame."""
     readings: Readings | None = None
     """Last control steps, if the policy observes them."""
-    measured: Mapping[str, Array] = MappingProxyType({})
+    measured: Mapping[str, Array] = _NOTHING_MEASURED
     """Further measurements (B, ...) of the policy's sensor (`common.task.sensors.base`)."""
     load: ObjectLoad | None = None
     """Weight and friction of the objects, for the reward; None where they are not recorded."""

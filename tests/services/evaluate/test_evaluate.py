@@ -38,7 +38,7 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setattr(bank_cache, "LEAST_OBJECTS", 1)
-        patch.setattr(references, "_ATTEMPTS", 2)
+        patch.setattr(references, "_MAX_ATTEMPTS", 2)
         patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=8)})
         yield
 

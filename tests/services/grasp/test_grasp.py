@@ -114,9 +114,9 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
 
 
 def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
-    begun, given = [], attempts._given
+    begun, given = [], attempts._requested
     monkeypatch.setattr(
-        attempts, "_given", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
+        attempts, "_requested", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
     )
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
