@@ -52,7 +52,8 @@ TOUCH = 0.05
 """Least force of a link in contact, N."""
 _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
 _CONSTRAINT_WEIGHTS = itertools.chain.from_iterable(c.weights for c in CONSTRAINTS)
-MEANINGS = {term.name: term.meaning for term in (*GRASP, *_CONSTRAINT_WEIGHTS)}
+MEANINGS = {term.name: term.meaning for term in GRASP}
+MEANINGS |= {weight.name: weight.meaning for weight in _CONSTRAINT_WEIGHTS}
 """Descriptions of the reward terms by name."""
 _PLAYED = (
     "link_position",
