@@ -53,7 +53,7 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     import psutil
 
     from congrasp.common.policy import bundle as bundles
-    from congrasp.services.serve.load import example_episode, measure, serving
+    from congrasp.services.serve.load import Load, Target, example_episode, measure, serving
     from congrasp.services.train.command import untrained
 
     with tempfile.TemporaryDirectory() as folder:
@@ -65,7 +65,8 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
                 client.metadata()
             process = psutil.Process(server)
             before = process.cpu_times()
-            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
+            target = Target(endpoint, "policy", timeout=5.0)
+            result = measure(target, episode, Load(repeat, concurrency, states))
             after = process.cpu_times()
             # Of user and system
             result["server_cpu_ms"] = 1e3 * (sum(after[:2]) - sum(before[:2])) / repeat / states

@@ -53,7 +53,7 @@ def query(  # noqa: PLR0913
             found = client.health()
         print(json_module.dumps(found))
         return 0 if found["ready"] else TransportError.exit_code
-    from congrasp.services.serve.load import example_episode, measure, one_answer
+    from congrasp.services.serve.load import Load, Target, example_episode, measure, one_answer
 
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed, str(client.health()["hand"]))
@@ -61,7 +61,8 @@ def query(  # noqa: PLR0913
         if repeat == states == 1 and not json:
             print(one_answer(client, episode))
             return 0
-    result = measure(connect, name, episode, repeat, concurrency, timeout, certs, states, rate)
+    target = Target(connect, name, timeout, certs)
+    result = measure(target, episode, Load(repeat, concurrency, states, rate))
     if json:
         print(json_module.dumps(result))
     else:

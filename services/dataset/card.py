@@ -76,8 +76,8 @@ def _readme(card: Mapping[str, Any]) -> str:
         rates = [percent(counts[name] / episodes) for name in VERDICTS]
         rows.append([constraints, f"{episodes:,}", f"{counts['kept']:,}", *rates])
     table = Table("", ("constraints", "episodes", "kept", *VERDICTS), rows)
-    kept = sum(counts["kept"] for counts in card["counts"].values())
-    part = card["shards"]
+    total_kept = sum(counts["kept"] for counts in card["counts"].values())
+    shards = card["shards"]
     return f"""---
 license: {card["licence"].lower()}
 tags: [robotics, grasping, dexterous-hand]
@@ -87,7 +87,7 @@ configs:
 - config_name: objects
   data_files: objects/*.parquet
 ---
-# {kept:,} grasps of the {card["hand"]} hand
+# {total_kept:,} grasps of the {card["hand"]} hand
 
 Episodes of a policy under sampled constraints, each simulated to its end: the hand approaches, grasps, the table is
 removed for two seconds, the object is carried upwards and pushed. {_kept(card["keep"])} The rates are of all episodes.
@@ -97,7 +97,7 @@ removed for two seconds, the object is carried upwards and pushed. {_kept(card["
 {chr(10).join(f"* `{name}`: {meaning}" for name, meaning in VERDICTS.items())}
 
 * Objects: {card["objects"]:,}, of which {len(card["left_out"]):,} were left out (see `card.json`); shards here: \
-{part["finished"]} of {part["of"]}.
+{shards["finished"]} of {shards["of"]}.
 * Policy: SHA-256 `{card["policy_sha256"]}`.
 * congrasp {card["version"]}, engine `{card["physics"]}`, seed {card["seed"]}.
 * Command: `{card["command"]}`, on {card["machine"]}.
@@ -109,8 +109,6 @@ Columns, with shapes, units and frames, are in `card.json` and in the schema of 
 
 def _kept(keep: list[str]) -> str:
     """Sentence on the episodes in the files."""
-    return (
-        f"The files hold those that are {' and '.join(keep)}."
-        if keep
-        else "The files hold all of them."
-    )
+    if not keep:
+        return "The files hold all of them."
+    return f"The files hold those that are {' and '.join(keep)}."

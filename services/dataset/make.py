@@ -12,7 +12,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -39,8 +39,14 @@ from congrasp.services.evaluate.plan import batches, plan_row
 from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, prepared
 
 FORMAT = 1
-_EPISODES, _OBJECTS = 8192, 128
-"""Limits of a shard's episodes and objects, for the default number of objects."""
+_T = TypeVar("_T")
+_MAX_SHARD_EPISODES = 8192
+"""Limit of a shard's episodes, for the default number of objects."""
+_MAX_SHARD_OBJECTS = 128
+"""Limit of a shard's objects, for the same."""
+
+_Counts = dict[str, collections.Counter[str]]
+"""Numbers of episodes by outcome, under each set of constraints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +74,10 @@ class Recipe:
     def shares(self) -> dict[str, int]:
         """Episodes of an object under each set of constraints."""
         each, more = divmod(self.per_object, len(self.constraints))
-        return {asked: each + (i < more) for i, asked in enumerate(self.constraints)}
+        shares: dict[str, int] = {}
+        for index, constraints in enumerate(self.constraints):
+            shares[constraints] = each + 1 if index < more else each
+        return shares
 
     @functools.cached_property
     def template(self) -> Experiment:
@@ -87,12 +96,9 @@ class Recipe:
         """Description of the dataset in every shard, as JSON; equal for datasets with equal
         contents.
         """
-        contents = json.dumps(
-            [
-                dataclasses.asdict(dataclasses.replace(self.options, cache_dir="")),
-                [at.digest() for at in self.objects],
-            ]
-        )
+        options = dataclasses.asdict(dataclasses.replace(self.options, cache_dir=""))
+        digests = [source.digest() for source in self.objects]
+        contents = json.dumps([options, digests])
         return {
             "format": FORMAT,
             "version": congrasp.__version__,
@@ -112,7 +118,7 @@ class Recipe:
 
 def shard_objects(per_object: int) -> int:
     """Default of the largest number of objects in a shard; the same for every engine and batch."""
-    return max(1, min(_EPISODES // per_object, _OBJECTS))
+    return max(1, min(_MAX_SHARD_EPISODES // per_object, _MAX_SHARD_OBJECTS))
 
 
 def pools_of(recipe: Recipe) -> Pools:
@@ -124,7 +130,7 @@ def make(
     recipe: Recipe,
     shards: Shards,
     pools: Pools,
-    wanted: Sequence[int],
+    numbers: Sequence[int],
     progress: Callable[[int], None] = lambda episodes: None,
 ) -> None:
     """Makes and writes shards.
@@ -133,42 +139,59 @@ def make(
       recipe: contents of the dataset.
       shards: locations of the shards.
       pools: result of `pools_of` for the recipe.
-      wanted: numbers of the shards to make.
+      numbers: numbers of the shards to make.
       progress: called with the number of simulated episodes; those of a running batch count by
         their share of control steps.
     """
     done = 0
-    with contextlib.ExitStack() as stack, prepared(recipe.template, pools, wanted) as ready:
+    with (
+        contextlib.ExitStack() as stack,
+        prepared(recipe.template, pools, numbers) as prepared_pools,
+    ):
         running: Episodes | None = None
-        for pool in ready:
-            own = pool.experiment
-            columns = grasp_columns(own.hand, own.task)
-            counts: dict[str, collections.Counter[str]] = collections.defaultdict(
-                collections.Counter
-            )
-            rows: list[dict[str, np.ndarray]] = [
-                {c.name: np.zeros((0, *c.shape), c.kind) for c in columns}
-            ]
+        for pool in prepared_pools:
+            experiment = pool.experiment
+            columns = grasp_columns(experiment.hand, experiment.task)
+            counts: _Counts = collections.defaultdict(collections.Counter)
+            parts = [_no_rows(columns)]
             if pool.real:
                 if running:
-                    running.replace_objects(own.scaled, own.field)
+                    running.replace_objects(experiment.scaled, experiment.field)
                 else:
-                    running = stack.enter_context(own.simulator())
+                    running = stack.enter_context(experiment.simulator())
 
                 def report(episodes: int, before: int = done) -> None:
                     """Reports the pool's episodes with those of earlier pools."""
                     progress(before + episodes)
 
-                for part in _episodes(running, pool, recipe.shares, report):
-                    rows.append(_counted(part, recipe.keep, counts))
-                    done += len(part["episode"])
-            said = {**recipe.about, "shard": own.pool, "counts": counts, "left_out": pool.left_out}
-            found = {name: np.concatenate([part[name] for part in rows]) for name in rows[0]}
-            of_objects = table(object_columns(), object_rows(own.scaled[: pool.real]), said)
-            shards.write(own.pool, table(columns, found, said), of_objects)
+                for rows in _episodes(running, pool, recipe.shares, report):
+                    parts.append(_counted(rows, recipe.keep, counts))
+                    done += len(rows["episode"])
+            about = {
+                **recipe.about,
+                "shard": experiment.pool,
+                "counts": counts,
+                "left_out": pool.left_out,
+            }
+            grasps = table(columns, _joined(parts), about)
+            objects = table(object_columns(), object_rows(experiment.scaled[: pool.real]), about)
+            shards.write(experiment.pool, grasps, objects)
 
 
-def _begun(
+def _no_rows(columns: Sequence[Column]) -> dict[str, np.ndarray]:
+    """Columns without rows."""
+    return {column.name: np.zeros((0, *column.shape), column.kind) for column in columns}
+
+
+def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Columns of the rows of all parts."""
+    columns: dict[str, np.ndarray] = {}
+    for name in parts[0]:
+        columns[name] = np.concatenate([part[name] for part in parts])
+    return columns
+
+
+def _initial_conditions(
     pool: Pool, shares: Mapping[str, int]
 ) -> tuple[list[InitialConditions], dict[str, np.ndarray]]:
     """Initial conditions of the real objects' episodes under each set of constraints, and columns
@@ -176,25 +199,39 @@ def _begun(
 
     Each object has its share of episodes of the constraints that it allows.
     """
-    own, begun = pool.experiment, list[InitialConditions]()
-    names = np.array([obj.name for obj in own.scaled])
-    columns: dict[str, list[np.ndarray]] = {"constraints": [], "object": [], "episode": []}
-    for asked, share in shares.items():
-        bank = own.bank_for(asked)
+    experiment = pool.experiment
+    conditions: list[InitialConditions] = []
+    names = np.array([obj.name for obj in experiment.scaled])
+    parts: list[dict[str, np.ndarray]] = []
+    for constraints, share in shares.items():
+        bank = experiment.bank_for(constraints)
+        total = share * len(experiment.scaled)
         try:
-            plan = plan_row(own.task, bank, own.scaled, asked, share * len(own.scaled))
+            plan = plan_row(experiment.task, bank, experiment.scaled, constraints, total)
         except CongraspError:
             continue  # no object allows them
-        kept = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
-        plan = plan._replace(episodes=jax.tree.map(lambda x, kept=kept: x[kept], plan.episodes))
-        for conditions, count in batches(
-            own.hand, own.task, bank, plan, own.seed, share * len(own.scaled)
+        is_real = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
+        plan = plan._replace(episodes=_selected(plan.episodes, is_real))
+        for batch, count in batches(
+            experiment.hand, experiment.task, bank, plan, experiment.seed, total
         ):
-            begun.append(jax.tree.map(lambda x, count=count: x[:count], conditions))
-        columns["constraints"].append(np.full(plan.total, asked))
-        columns["object"].append(names[plan.episodes.objects])
-        columns["episode"].append(plan.episodes.numbers)
-    return begun, {name: np.concatenate(parts) for name, parts in columns.items() if parts}
+            conditions.append(_selected(batch, slice(count)))
+        parts.append(
+            {
+                "constraints": np.full(plan.total, constraints),
+                "object": names[plan.episodes.objects],
+                "episode": plan.episodes.numbers,
+            }
+        )
+    if not parts:
+        return conditions, {}
+    return conditions, _joined(parts)
+
+
+def _selected(tree: _T, rows: Any) -> _T:
+    """Some rows of every array of a tree."""
+    selected: _T = jax.tree.map(lambda array: array[rows], tree)
+    return selected
 
 
 def _episodes(
@@ -209,27 +246,28 @@ def _episodes(
       shares: episodes of each object, by constraints.
       progress: called with the number of simulated episodes of the pool.
     """
-    begun, known = _begun(pool, shares)
-    if not begun:
+    parts, columns = _initial_conditions(pool, shares)
+    if not parts:
         return
-    conditions = jax.tree.map(lambda *parts: jnp.concatenate(parts), *begun)
-    total = len(known["episode"])
+    conditions = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+    total = len(columns["episode"])
     for start in range(0, total, running.batch):
-        chosen = np.arange(start, start + running.batch).clip(max=total - 1)
-        of = {name: column[chosen] for name, column in known.items()}
         count = min(running.batch, total - start)
+        # The last batch is filled with its last episode
+        indices = np.arange(start, start + running.batch).clip(max=total - 1)
 
         def report(share: float, start: int = start, count: int = count) -> None:
             """Counts the episodes of the running batch by their share of control steps."""
             progress(start + int(share * count))
 
         batch = running.run(
-            jax.tree.map(lambda x, chosen=chosen: x[chosen], conditions),
+            _selected(conditions, indices),
             stressed=running.stressable,
             progress=report,
         )
-        rows = grasp_rows(pool.experiment.task, of["constraints"], batch) | of
-        yield {name: column[: total - start] for name, column in rows.items()}
+        planned = {name: column[indices] for name, column in columns.items()}
+        rows = grasp_rows(pool.experiment.task, planned["constraints"], batch) | planned
+        yield {name: column[:count] for name, column in rows.items()}
 
 
 def _counted(
@@ -238,9 +276,13 @@ def _counted(
     counts: Mapping[str, collections.Counter[str]],
 ) -> dict[str, np.ndarray]:
     """Counts all rows by their constraints and outcomes; returns those to keep."""
-    kept = np.all([np.ones(len(rows["episode"]), bool), *(rows[name] for name in keep)], 0)
-    for asked in dict.fromkeys(rows["constraints"].tolist()):
-        of = rows["constraints"] == asked
-        outcomes = {name: int(rows[name][of].sum()) for name in VERDICTS}
-        counts[asked].update(episodes=int(of.sum()), kept=int(kept[of].sum()), **outcomes)
-    return {name: column[kept] for name, column in rows.items()}
+    is_kept = np.ones(len(rows["episode"]), bool)
+    for verdict in keep:
+        is_kept &= rows[verdict]
+    for constraints in dict.fromkeys(rows["constraints"].tolist()):
+        is_under = rows["constraints"] == constraints
+        numbers = {"episodes": int(is_under.sum()), "kept": int(is_kept[is_under].sum())}
+        for verdict in VERDICTS:
+            numbers[verdict] = int(rows[verdict][is_under].sum())
+        counts[constraints].update(numbers)
+    return {name: column[is_kept] for name, column in rows.items()}

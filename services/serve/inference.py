@@ -109,9 +109,14 @@ class PolicyFunction:
         answers: list[Inference | Exception] = []
         for query, end in zip(queries, ends, strict=True):
             rows = slice(end - len(query.vectors), end)
-            own = _Outputs(*(values[rows] for values in outputs))
-            error = None if is_faultless else self._find_error(query, own)
-            answers.append(error or _inference(query, own))
+            query_outputs = _Outputs(
+                vectors=outputs.vectors[rows],
+                redirected=outputs.redirected[rows],
+                aligned=outputs.aligned[rows],
+                checks=outputs.checks[rows],
+            )
+            error = None if is_faultless else self._find_error(query, query_outputs)
+            answers.append(error or _inference(query, query_outputs))
         return answers
 
     def _outputs(self, values: np.ndarray) -> _Outputs:
@@ -144,21 +149,23 @@ class PolicyFunction:
         if not outputs.aligned.all():
             return ContradictionError(
                 "The constraints contradict each other: the trajectory ends nearer to the avoid "
-                "region than to the "
-                "graspable region of the affordance.",
+                "region than to the graspable region of the affordance.",
                 "Change the trajectory or the affordance.",
             )
         return None
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`, as JSON."""
-        hand, task = self.layout.hand, self.layout.task
-        alone = len(hand.motors) == len(hand.joints)
+        hand = self.layout.hand
+        task = self.layout.task
+        limits = None
+        if len(hand.motors) == len(hand.joints):
+            limits = JointLimits.of_hand(hand, task.control).as_lists()
         return {
             "hand": hand.name,
             "joints": [joint.name for joint in hand.joints],
             "open_pose": hand.q_open.tolist(),
-            "limits": JointLimits.of_hand(hand, task.control).as_lists() if alone else None,
+            "limits": limits,
             "period": task.control_dt,
             "approach_steps": task.approach_steps,
             "observation": task.observation,
@@ -171,8 +178,10 @@ class PolicyFunction:
 
 def _inference(query: Query, outputs: _Outputs) -> Inference:
     """Answer to one query without an error."""
-    flags = outputs.redirected.tolist()
-    return Inference(outputs.vectors, [list(_reasons(query.asked, flag > 0)) for flag in flags])
+    active = []
+    for redirected in outputs.redirected.tolist():
+        active.append(list(_reasons(query.asked, redirected > 0)))
+    return Inference(outputs.vectors, active)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -184,22 +193,29 @@ def _reasons(asked: tuple[str, ...], redirected: bool) -> tuple[str, ...]:
 @functools.lru_cache(maxsize=8)
 def _compiled(hand: Hand, task: TaskConfig) -> Any:
     """Returns the program of the policies of a hand and task, which they share in a process."""
-    # Waking other threads costs more CPU time than they save here.
-    alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
-    return jax.jit(functools.partial(_infer, Layout(hand, task)), compiler_options=alone)
+    options = None
+    if jax.default_backend() == "cpu":
+        # Waking other threads costs more CPU time than they save here.
+        options = {"xla_cpu_multi_thread_eigen": False}
+    return jax.jit(functools.partial(_infer, Layout(hand, task)), compiler_options=options)
 
 
 def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
     """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), as one
     array (B, ...).
     """
-    hand, task = layout.hand, layout.task
+    hand = layout.hand
+    task = layout.task
     fields, checks = layout.complete(vectors)
-    asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(layout.known) if c.optional}
+    requested: dict[str, jax.Array] = {}
+    for index, constraint in enumerate(layout.known):
+        if constraint.optional:
+            requested[constraint.name] = fields["asked"][:, index] > 0.5
     surface = layout.surface(fields)
-    resolution = resolve(hand, surface, layout.goal(fields), asked)
+    resolution = resolve(hand, surface, layout.goal(fields), requested)
     state = SceneState(**{name: fields[name] for name in SceneState._fields})
-    if (readings := layout.readings(fields)) is not None:
+    readings = layout.readings(fields)
+    if readings is not None:
         state = get_sensor(task).seen(task, state, readings)
     scene = scene_of(hand, task, state, surface, resolution.goal, readings)
     scene = scene._replace(measured=layout.measured(fields))
@@ -239,9 +255,8 @@ class LocalPolicy(EpisodePolicy):
                 raise answer
         except CongraspError as error:
             raise error_of(error.code, str(error)) from None
-        return answer.reply(
-            {"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)}
-        )
+        total_ms = 1e3 * (time.perf_counter() - began)
+        return answer.reply({"version": self._bundle.version, "total_ms": total_ms})
 
 
 @compiling_entry
@@ -256,5 +271,5 @@ def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
       CongraspError: there is no such file or hand, or the file is damaged.
     """
     right, left = right_name(str(policy))
-    found = LocalPolicy(bundles.load(named_policy(right)))
-    return LeftPolicy(found) if left else found
+    local = LocalPolicy(bundles.load(named_policy(right)))
+    return LeftPolicy(local) if left else local

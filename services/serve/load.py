@@ -31,10 +31,10 @@ def serving(
       certs: folder of a server's certificate.
     """
     endpoint = local_url()
-    shared = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # a GPU's memory, with this process
-    server = Child(
-        "server", command("serve", policy=policy, listen=endpoint, certs=certs), log, shared
-    )
+    arguments = command("serve", policy=policy, listen=endpoint, certs=certs)
+    # This process and the server share the memory of a GPU
+    environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    server = Child("server", arguments, log, environment)
     try:
         yield endpoint, server.start()
     finally:
@@ -67,90 +67,151 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     from congrasp.common.task.types import Surface
     from congrasp.services.grasp.approaches import headings
 
-    task, found = TaskConfig(hand=hand, constraints=("heading",)), get_hand(hand)
-    (obj,) = scale_objects(found, task, [procedural.generate(seed)])
-    *frame, (rest,) = headings(found, obj, GraspRequest(), 1, np.random.default_rng(seed))
-    position, direction, cross = (axis[0].astype(np.float32) for axis in frame)
-    goals = {"heading": {"position": position, "direction": direction, "cross": cross}}
-    points, pose = (
-        np.asarray(x, np.float32) for x in (obj.points[: task.surface_points], obj.rest_poses[rest])
+    task = TaskConfig(hand=hand, constraints=("heading",))
+    spec = get_hand(hand)
+    rng = np.random.default_rng(seed)
+    (obj,) = scale_objects(spec, task, [procedural.generate(seed)])
+    positions, directions, crosses, (rest,) = headings(spec, obj, GraspRequest(), 1, rng)
+    goals = {
+        "heading": {
+            "position": positions[0].astype(np.float32),
+            "direction": directions[0].astype(np.float32),
+            "cross": crosses[0].astype(np.float32),
+        }
+    }
+    points = np.asarray(obj.points[: task.surface_points], np.float32)
+    pose = np.asarray(obj.rest_poses[rest], np.float32)
+    goal = goal_of(spec, task, GraspRequest(goals))
+    surface = Surface(points, np.zeros(len(points), bool))
+    batch_of_one = jax.tree.map(lambda x: x[None], (goal, surface, pose))
+    start = jax.jit(initial_hand, static_argnums=(0, 1))(spec, task, *batch_of_one)
+    q, wrist_position, wrist_quaternion = (np.asarray(value)[0] for value in start)
+    request = GraspRequest(
+        goals,
+        surface=points,
+        q=q,
+        wrist=(wrist_position, wrist_quaternion),
+        object_pose=(pose[:3], pose[3:]),
     )
-    asked = (
-        goal_of(found, task, GraspRequest(goals)),
-        Surface(points, np.zeros(len(points), bool)),
-        pose,
-    )
-    begin = jax.jit(initial_hand, static_argnums=(0, 1))
-    q, *wrist = (
-        np.asarray(value)[0]
-        for value in begin(found, task, *jax.tree.map(lambda x: x[None], asked))
-    )
-    world = tuple(wrist), (pose[:3], pose[3:])
-    request = GraspRequest(goals, surface=points, q=q, wrist=world[0], object_pose=world[1])
     state = {"q": q, "u": np.zeros(6), "object_position": pose[:3], "object_quaternion": pose[3:]}
-    return Example(found.name, obj.name, request, state)
+    return Example(spec.name, obj.name, request, state)
 
 
-def measure(  # noqa: PLR0913
-    connect: str,
-    name: str,
-    episode: Example,
-    repeat: int,
-    concurrency: int,
-    timeout: float,
-    certs: pathlib.Path | None = None,
-    states: int = 1,
-    rate: float = 0.0,
-) -> dict[str, float]:
-    """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is
-    not counted.
+class Target(NamedTuple):
+    """A policy server and how clients connect to it."""
 
-    With `states` > 1 each query holds that many, and each state counts as an answer. Each client
-    sends `rate` queries a second, spread over the second, or its next query after the answer if
-    that is 0. The measurement begins when all clients have had their first answer.
+    connect: str
+    """Endpoint of the server."""
+    name: str
+    """Name of the served run."""
+    timeout: float
+    """Deadline of one query, s."""
+    certs: pathlib.Path | None = None
+    """Folder of a client's certificate."""
+
+
+class Load(NamedTuple):
+    """Queries of a latency test."""
+
+    repeat: int
+    """Total number of queries."""
+    concurrency: int
+    """Number of clients, each with a separate connection."""
+    states: int = 1
+    """States in one query; each counts as an answer."""
+    rate: float = 0.0
+    """Queries a second of each client, spread over the second; 0 sends the next after each
+    answer.
     """
-    share = max(1, repeat // concurrency)
 
-    def connected(_: int) -> PolicyClient:
-        client = stack.enter_context(
-            PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs)
-        )
-        client.reset(episode.request)
-        client.act(episode.state)
-        return client
 
-    def ask(index: int, client: PolicyClient) -> tuple[list[float], int, int]:
-        times, failed, overloaded, state = [], 0, 0, episode.state
-        for number in range(share):
-            if rate:
-                time.sleep(
-                    max(0.0, began + (number + index / concurrency) / rate - time.perf_counter())
-                )
-            try:
-                answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
-                times.append(answer.round_trip_ms)
-            except OverloadedError:
-                overloaded += 1
-            except TransportError:
-                failed += 1
-        return times, failed, overloaded
+class _Outcomes(NamedTuple):
+    """Results of one client's queries."""
 
+    times: list[float]
+    """Round trips of the answers, ms."""
+    failed: int
+    overloaded: int
+
+
+def measure(target: Target, episode: Example, load: Load) -> dict[str, float]:
+    """Measures the latencies of queries from concurrent clients.
+
+    The measurement begins when all clients have had their first answer, which is not counted.
+    """
     with (
         contextlib.ExitStack() as stack,
-        concurrent.futures.ThreadPoolExecutor(concurrency) as pool,
+        concurrent.futures.ThreadPoolExecutor(load.concurrency) as pool,
     ):
-        clients = list(pool.map(connected, range(concurrency)))
+
+        def connected(_: int) -> PolicyClient:
+            """Client with its first answer."""
+            client = PolicyClient(
+                target.connect,
+                target.name,
+                hand=episode.hand,
+                timeout=target.timeout,
+                certs=target.certs,
+            )
+            stack.enter_context(client)
+            client.reset(episode.request)
+            client.act(episode.state)
+            return client
+
+        clients = list(pool.map(connected, range(load.concurrency)))
         began = time.perf_counter()
-        results = list(pool.map(ask, range(concurrency), clients))
-        spent = time.perf_counter() - began
-    times = np.concatenate([np.array(part) for part, _, _ in results])
+
+        def outcomes(index: int, client: PolicyClient) -> _Outcomes:
+            """Results of a client, which sends its share of the queries."""
+            return _query_repeatedly(client, index, episode, load, began)
+
+        results = list(pool.map(outcomes, range(load.concurrency), clients))
+        duration = time.perf_counter() - began
+    times = np.concatenate([np.array(result.times) for result in results])
+    p50 = float("nan")
+    p99 = float("nan")
+    if len(times):
+        p50 = float(np.percentile(times, 50))
+        p99 = float(np.percentile(times, 99))
     return {
-        "p50_ms": float(np.percentile(times, 50)) if len(times) else float("nan"),
-        "p99_ms": float(np.percentile(times, 99)) if len(times) else float("nan"),
-        "answers_per_s": states * len(times) / spent,
-        "failed": sum(failed for _, failed, _ in results),
-        "overloaded": sum(overloaded for _, _, overloaded in results),
+        "p50_ms": p50,
+        "p99_ms": p99,
+        "answers_per_s": load.states * len(times) / duration,
+        "failed": sum(result.failed for result in results),
+        "overloaded": sum(result.overloaded for result in results),
     }
+
+
+def _query_repeatedly(
+    client: PolicyClient, index: int, episode: Example, load: Load, began: float
+) -> _Outcomes:
+    """Sends one client's share of the queries.
+
+    Args:
+      client: the client, after its first answer.
+      index: its number, which determines its offset within a second.
+      episode: the episode whose initial state it sends.
+      load: all queries.
+      began: start of the measurement (`time.perf_counter`).
+    """
+    times: list[float] = []
+    failed = 0
+    overloaded = 0
+    for number in range(max(1, load.repeat // load.concurrency)):
+        if load.rate:
+            due = began + (number + index / load.concurrency) / load.rate
+            time.sleep(max(0.0, due - time.perf_counter()))
+        try:
+            if load.states == 1:
+                answer = client.act(episode.state)
+            else:
+                answer = client.act_each([episode.state] * load.states)[0]
+            times.append(answer.round_trip_ms)
+        except OverloadedError:
+            overloaded += 1
+        except TransportError:
+            failed += 1
+    return _Outcomes(times, failed, overloaded)
 
 
 def one_answer(policy: Policy, episode: Example) -> str:

@@ -40,7 +40,8 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import known, require_known
+from congrasp.common.task.constraints import Constraint, known, require_known
+from congrasp.common.task.constraints.specs import GoalArray
 from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.readings import Readings
 from congrasp.common.task.sensors import get_sensor
@@ -53,6 +54,8 @@ from congrasp.services.client.packer import PACKED
 STATES_LIMIT = 64
 """Most states in one query."""
 _UNIT_TOLERANCE = 0.02
+_IDENTITY = np.array((1, 0, 0, 0), np.float32)
+_UP = np.array((0, 0, 1), np.float32)
 
 
 class Query(NamedTuple):
@@ -62,6 +65,13 @@ class Query(NamedTuple):
     """(n, S) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
     asked: tuple[str, ...]
     """Names of the requested constraints."""
+
+
+class _GoalField(NamedTuple):
+    """A field of the query that holds a goal array."""
+
+    constraint: Constraint
+    array: GoalArray
 
 
 class Layout:
@@ -75,68 +85,68 @@ class Layout:
     """
 
     def __init__(self, hand: Hand, task: TaskConfig):
-        fingers, links, points = len(hand.joints), len(hand.links), task.surface_points
-        contacts = (links, CONTACTS_PER_LINK)
-        special: dict[str, tuple[int, ...]] = {
-            **dict.fromkeys(("q", "q_velocity", "q_target", "q_initial"), (fingers,)),
-            **dict.fromkeys(("u", "u_velocity", "u_target", "wrist_load"), (6,)),
-            **dict.fromkeys(("contact_force", "contact_position"), (*contacts, 3)),
-            **dict.fromkeys(("time", "table"), ()),
-            "contact_found": contacts,
-        }
         self.hand = hand
         self.task = task
         self.known = known(task)
-        self._arrays = {
-            f"{c.name}_{name}": (c, name, array)
-            for c in self.known
-            for name, array in c.arrays.items()
-        }
-        self._neutral = {
-            f"{c.name}_{name}": value
-            for c in self.known
-            for name, value in c.neutral(hand, task)._asdict().items()
-        }
+        self._goal_fields: dict[str, _GoalField] = {}
+        self._neutral: dict[str, np.ndarray] = {}
+        for constraint in self.known:
+            for name, array in constraint.arrays.items():
+                self._goal_fields[f"{constraint.name}_{name}"] = _GoalField(constraint, array)
+            for name, value in constraint.neutral(hand, task)._asdict().items():
+                self._neutral[f"{constraint.name}_{name}"] = value
         self._sensor = get_sensor(task)
         self.points = self._sensor.points
-        self._state = [
-            n for n in SceneState._fields if self._sensor.shows_pose or not n.startswith("object_")
-        ]
-        self.shapes = {
-            name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in self._state
-        }
-        self._past = (
-            [f"past_{n}" for n in Readings._fields if n in self._state]
-            if not self._sensor.privileged
-            else []
-        )
-        steps = (task.history - 1,)
-        self.shapes |= {
-            name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past
-        }
-        self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
-        self.shapes |= {self.points: (points, 3), "surface_avoid": (points,)}
-        if task.surface_normals:
-            self.shapes[NORMALS] = (points, 3)
         self._measured = self._sensor.query(hand, task)
-        self.shapes |= self._measured
-        self.shapes["asked"] = (len(self.known),)
-        self.offsets = {}
+        self._state = self._state_fields()
+        self._past = self._past_fields()
+        self.shapes = self._field_shapes()
+        self.offsets: dict[str, int] = {}
         self.size = 0
         for name, shape in self.shapes.items():
             self.offsets[name] = self.size
             self.size += math.prod(shape)
-        own = [
-            name
-            for name, (_, _, array) in self._arrays.items()
-            if array.kind in ("direction", "quaternion")
-        ]
-        self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
-        past = [name for name in self._past if "quaternion" in name]
-        self._directions = [*(name for name in self._state if "quaternion" in name), *past, *own]
-        self._unit = [*self._directions, *([NORMALS] if NORMALS in self.shapes else [])]
-        described = json.dumps([hand.name, self.description()])
-        self.digest = hashlib.sha256(described.encode()).hexdigest()[:16]
+        self._flags = self._goal_fields_of_kinds("flag")
+        self._directions = [name for name in (*self._state, *self._past) if "quaternion" in name]
+        self._directions += self._goal_fields_of_kinds("direction", "quaternion")
+        self._unit = list(self._directions)
+        if NORMALS in self.shapes:
+            self._unit.append(NORMALS)
+        contents = json.dumps([hand.name, self.description()])
+        self.digest = hashlib.sha256(contents.encode()).hexdigest()[:16]
+
+    def _state_fields(self) -> list[str]:
+        """Names of the fields of `SceneState` that a query has."""
+        if self._sensor.shows_pose:
+            return list(SceneState._fields)
+        return [name for name in SceneState._fields if not name.startswith("object_")]
+
+    def _past_fields(self) -> list[str]:
+        """Names of the fields of earlier control steps; empty if the policy observes none."""
+        if self._sensor.privileged:
+            return []
+        return [f"past_{name}" for name in Readings._fields if name in self._state]
+
+    def _field_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of all fields, in the order of the vector."""
+        state_shapes = _state_shapes(self.hand)
+        shapes = {name: state_shapes[name] for name in self._state}
+        for name in self._past:
+            shapes[name] = (self.task.history - 1, *shapes[name.removeprefix("past_")])
+        for name, value in self._neutral.items():
+            shapes[name] = np.shape(value)
+        points = self.task.surface_points
+        shapes[self.points] = (points, 3)
+        shapes["surface_avoid"] = (points,)
+        if self.task.surface_normals:
+            shapes[NORMALS] = (points, 3)
+        shapes |= self._measured
+        shapes["asked"] = (len(self.known),)
+        return shapes
+
+    def _goal_fields_of_kinds(self, *kinds: str) -> list[str]:
+        """Names of the goal fields of some kinds (see `GoalArray`)."""
+        return [name for name, field in self._goal_fields.items() if field.array.kind in kinds]
 
     def description(self) -> dict[str, Any]:
         """Layout for clients, as JSON.
@@ -145,20 +155,16 @@ class Layout:
           `size` of the vector; `fields`, offset and shape of each; `constraints`, the fields that
           each one needs; `states`, the most in one query; `settle`, m, see `SensingConfig`.
         """
-        needs = {
-            c.name: [
-                *(f"{c.name}_{name}" for name, array in c.arrays.items() if array.required),
-                *c.needs,
-            ]
-            for c in self.known
-        }
+        needs: dict[str, list[str]] = {}
+        for constraint in self.known:
+            required = [name for name, array in constraint.arrays.items() if array.required]
+            goal_fields = [f"{constraint.name}_{name}" for name in required]
+            needs[constraint.name] = [*goal_fields, *constraint.needs]
+        fields = {name: [self.offsets[name], *shape] for name, shape in self.shapes.items()}
+        del fields["asked"]  # `parse` sets it
         return {
             "size": self.size,
-            "fields": {
-                name: [self.offsets[name], *shape]
-                for name, shape in self.shapes.items()
-                if name != "asked"
-            },
+            "fields": fields,
             "constraints": needs,
             "states": STATES_LIMIT,
             "settle": self.task.sensing.settle,
@@ -177,7 +183,8 @@ class Layout:
 
     def _places(self, name: str) -> slice:
         """Slice of a field in a vector."""
-        return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
+        start = self.offsets[name]
+        return slice(start, start + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
         """Returns a query, whose values `complete` checks.
@@ -202,10 +209,12 @@ class Layout:
             raise CongraspError(
                 f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time."
             )
-        asked = self._asked(message.meta.get("constraints", ["heading"]))
+        requested = self._requested(message.meta.get("constraints", ["heading"]))
         vectors = np.array(vectors, np.float32)
-        vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
-        return Query(vectors, asked)
+        vectors[:, self._places("asked")] = [
+            constraint.name in requested for constraint in self.known
+        ]
+        return Query(vectors, requested)
 
     def complete(self, vectors: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         """Normalises quaternions and directions of queries, and fills in omitted fields; traced
@@ -220,40 +229,54 @@ class Layout:
         """
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
-        asked = fields["asked"] > 0.5
+        requested = fields["asked"] > 0.5
         for name in ("contact_found", "table", "surface_avoid", *self._flags):
             fields[name] = fields[name] > 0.5
+        always = jnp.ones_like(finite)
         lengths = []
         for name in self._directions:
-            constraint = self._arrays[name][0] if name in self._arrays else None
-            wanted = (
-                jnp.ones_like(finite)
-                if constraint is None
-                else asked[:, self.known.index(constraint)]
-            )
-            default = self._neutral.get(name, np.array((1, 0, 0, 0), np.float32))
-            fields[name], length = _unit(fields[name], wanted, default)
+            needed = always
+            if name in self._goal_fields:
+                needed = requested[:, self.known.index(self._goal_fields[name].constraint)]
+            default = self._neutral.get(name, _IDENTITY)
+            fields[name], length = _unit(fields[name], needed, default)
             lengths.append(length)
-        frame, still = world_pose(len(vectors)), jnp.zeros((len(vectors), 3))
-        for name in (
-            name for name in SceneState._fields if name not in self._state
-        ):  # the object frame is the world's
-            fields[name] = frame[:, 3:] if "quaternion" in name else still
-            if name in Readings._fields:
-                fields[f"past_{name}"] = jnp.repeat(fields[name][:, None], self.task.history - 1, 1)
-        start = rotations.conjugate(fields["object_quaternion_initial"]), fields["base_quaternion"]
-        held = rotations.rotate(rotations.multiply(*start), jnp.array(grasp_frame(self.hand).cross))
-        fields["heading_cross"] = _orthogonal(
-            fields["heading_cross"], fields["heading_direction"], held
-        )
+        self._add_object_frame(fields)
+        self._make_cross_orthogonal(fields)
         if NORMALS in fields:
-            fields[NORMALS], length = _unit(
-                fields[NORMALS], jnp.ones_like(finite), np.array((0, 0, 1), np.float32)
-            )
+            fields[NORMALS], length = _unit(fields[NORMALS], always, _UP)
             lengths.append(length)
-        surface, goal = self.surface(fields), self.goal(fields)
-        fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
+        surface = self.surface(fields)
+        goal = self.goal(fields)
+        fitting = []
+        for index, constraint in enumerate(self.known):
+            is_valid = constraint.valid(surface, goal[constraint.name])
+            fitting.append(~requested[:, index] | is_valid)
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
+
+    def _add_object_frame(self, fields: dict[str, jax.Array]) -> None:
+        """Adds the object's pose and velocity to the fields of a policy that does not observe them:
+        the object frame is the world frame, at rest.
+        """
+        states = len(fields["asked"])
+        pose = world_pose(states)
+        velocity = jnp.zeros((states, 3))
+        for name in SceneState._fields:
+            if name in self._state:
+                continue
+            fields[name] = pose[:, 3:] if "quaternion" in name else velocity
+            if name in Readings._fields:
+                now = fields[name][:, None]
+                fields[f"past_{name}"] = jnp.repeat(now, self.task.history - 1, 1)
+
+    def _make_cross_orthogonal(self, fields: dict[str, jax.Array]) -> None:
+        """Makes the heading's cross-finger direction orthogonal to the heading (`_orthogonal`)."""
+        to_object = rotations.conjugate(fields["object_quaternion_initial"])
+        wrist = rotations.multiply(to_object, fields["base_quaternion"])
+        at_start = rotations.rotate(wrist, jnp.array(grasp_frame(self.hand).cross))
+        fields["heading_cross"] = _orthogonal(
+            fields["heading_cross"], fields["heading_direction"], at_start
+        )
 
     def surface(self, fields: Mapping[str, Any]) -> Surface:
         """Returns the labelled surface points, or the cloud, of completed fields."""
@@ -267,23 +290,21 @@ class Layout:
         """
         if NORMALS not in self.shapes:
             return
-        own = self._places(NORMALS)
-        for index in np.flatnonzero(~vectors[:, own].any(1)):
+        normals = self._places(NORMALS)
+        for index in np.flatnonzero(~vectors[:, normals].any(1)):
             row = vectors[index]
-            eye = self._field(row, CAMERA) if CAMERA in self.shapes else np.zeros(0, np.float32)
-            row[own] = _estimated(
-                self._field(row, self.points).tobytes(), eye.tobytes() if eye.any() else b""
-            )
+            eye = b""
+            if CAMERA in self.shapes and self._field(row, CAMERA).any():
+                eye = self._field(row, CAMERA).tobytes()
+            row[normals] = _estimated(self._field(row, self.points).tobytes(), eye)
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """Returns the goal arrays of completed fields, before the priority rules."""
-        return Goal(
-            {
-                c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays})
-                for c in self.known
-            },
-            {},
-        )
+        goals = {}
+        for constraint in self.known:
+            arrays = {name: fields[f"{constraint.name}_{name}"] for name in constraint.arrays}
+            goals[constraint.name] = constraint.goal(**arrays)
+        return Goal(goals, {})
 
     def measured(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the further measurements (B, ...) of the policy's sensor (`Sensor.query`)."""
@@ -293,12 +314,11 @@ class Layout:
         """Returns the earlier control steps of completed fields, if the policy observes them."""
         if not self._past:
             return None
-        return Readings(
-            *(
-                jnp.concatenate([fields[name][:, None], fields[f"past_{name}"]], 1)
-                for name in Readings._fields
-            )
-        )
+        steps = {}
+        for name in Readings._fields:
+            now = fields[name][:, None]
+            steps[name] = jnp.concatenate([now, fields[f"past_{name}"]], 1)
+        return Readings(**steps)
 
     def pass_all(self, checks: np.ndarray) -> bool:
         """True if no state of a batch fails a check (n, C) of `complete`."""
@@ -308,28 +328,29 @@ class Layout:
         """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`;
         None without one.
         """
-        wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
-        if not wrong.any():
+        passed = np.abs(checks - 1.0) <= _UNIT_TOLERANCE
+        if passed.all():
             return None
-        state = int(wrong.any(1).argmax())
+        state = int((~passed).any(1).argmax())
         which = f" of state {state}" if len(checks) > 1 else ""
-        finite, rest = not wrong[state, 0], ~wrong[state, 1:]
-        fitting, lengths = rest[: len(self.known)].tolist(), rest[len(self.known) :].tolist()
+        finite = passed[state, 0]
         if not finite:
             fields = self.unpack(query.vectors[state, None])
-            bad = next(name for name, value in fields.items() if not np.isfinite(value).all())
-            return CongraspError(f"The field '{bad}'{which} is not finite.")
+            field = next(name for name, value in fields.items() if not np.isfinite(value).all())
+            return CongraspError(f"The field '{field}'{which} is not finite.")
+        first_length = 1 + len(self.known)
+        fitting = passed[state, 1:first_length].tolist()
         if not all(fitting):
             return CongraspError(*self.known[fitting.index(False)].invalid)
-        bad = lengths.index(False)
-        name, length = self._unit[bad], checks[state, 1 + len(self.known) + bad]
-        return CongraspError(f"The field '{name}'{which} has length {length:.3f}, not 1.")
+        index = passed[state, first_length:].tolist().index(False)
+        length = checks[state, first_length + index]
+        return CongraspError(
+            f"The field '{self._unit[index]}'{which} has length {length:.3f}, not 1."
+        )
 
-    def _asked(self, names: Any) -> tuple[str, ...]:
+    def _requested(self, names: Any) -> tuple[str, ...]:
         """Names of the requested constraints of a query, weakest first."""
-        if not isinstance(names, list) or not all(
-            isinstance(n, str) and len(n) <= LONGEST_NAME for n in names
-        ):
+        if not isinstance(names, list) or not all(map(_is_name, names)):
             raise CongraspError("The query's 'constraints' must be a list of names.")
         require_known(names, self.task)
         leading = [constraint.name for constraint in self.known if constraint.guides]
@@ -341,39 +362,59 @@ class Layout:
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
 
+def _state_shapes(hand: Hand) -> dict[str, tuple[int, ...]]:
+    """Shapes of the fields of `SceneState`, without batch axis."""
+    fingers = len(hand.joints)
+    contacts = (len(hand.links), CONTACTS_PER_LINK)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name in SceneState._fields:
+        shapes[name] = (4,) if "quaternion" in name else (3,)
+    shapes |= dict.fromkeys(("q", "q_velocity", "q_target", "q_initial"), (fingers,))
+    shapes |= dict.fromkeys(("u", "u_velocity", "u_target", "wrist_load"), (6,))
+    shapes |= dict.fromkeys(("contact_force", "contact_position"), (*contacts, 3))
+    shapes |= dict.fromkeys(("time", "table"), ())
+    shapes["contact_found"] = contacts
+    return shapes
+
+
+def _is_name(value: Any) -> bool:
+    """True for a string that is short enough for the name of a constraint."""
+    return isinstance(value, str) and len(value) <= LONGEST_NAME
+
+
 @functools.lru_cache(maxsize=1024)
 def _estimated(points: bytes, eye: bytes) -> np.ndarray:
-    """Normals (3 N) at points (N, 3), float32, toward an eye if there is one."""
-    cloud, *camera = (
-        np.frombuffer(data, np.float32).reshape(1, -1, 3) for data in (points, eye) if data
-    )
-    return np.asarray(estimated_normals(cloud, *(position[:, 0] for position in camera))).reshape(
-        -1
-    )
+    """Normals (3 N) at points (N, 3), float32, toward an eye (3,) unless that is empty."""
+    cloud = np.frombuffer(points, np.float32).reshape(1, -1, 3)
+    if not eye:
+        return np.asarray(estimated_normals(cloud)).reshape(-1)
+    camera_position = np.frombuffer(eye, np.float32).reshape(1, 3)
+    return np.asarray(estimated_normals(cloud, camera_position)).reshape(-1)
 
 
 def _unit(
-    vectors: jax.Array, wanted: jax.Array, default: np.ndarray
+    vectors: jax.Array, needed: jax.Array, default: np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
-    """Normalises vectors (B, ..., n) where wanted (B,) and replaces others by the default.
+    """Normalises vectors (B, ..., n) where needed (B,) and replaces others by the default.
 
     Returns:
-      The vectors, and the norm (B,) farthest from 1 among the wanted ones, else 1.
+      The vectors, and the norm (B,) farthest from 1 among the needed ones, else 1.
     """
     lengths = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
-    usable = wanted.reshape(-1, *[1] * (vectors.ndim - 1)) & (lengths > 0.5)
-    every = lengths.reshape(len(vectors), -1)
-    worst = jnp.where(every.max(1) - 1.0 > 1.0 - every.min(1), every.max(1), every.min(1))
-    return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(
-        wanted, worst, 1.0
-    )
+    usable = needed.reshape(-1, *[1] * (vectors.ndim - 1)) & (lengths > 0.5)
+    units = jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default)
+    lengths_by_state = lengths.reshape(len(vectors), -1)
+    longest = lengths_by_state.max(1)
+    shortest = lengths_by_state.min(1)
+    worst = jnp.where(longest - 1.0 > 1.0 - shortest, longest, shortest)
+    return units, jnp.where(needed, worst, 1.0)
 
 
-def _orthogonal(cross: jax.Array, direction: jax.Array, held: jax.Array) -> jax.Array:
+def _orthogonal(cross: jax.Array, direction: jax.Array, at_start: jax.Array) -> jax.Array:
     """Unit cross-finger directions (B, 3) orthogonal to the heading.
 
-    If absent or parallel to it, that of the hand at the start, `held`, so that the hand does not
-    roll; if that is parallel as well, an arbitrary one.
+    If `cross` is absent or parallel to the heading, the hand's direction `at_start` replaces it, so
+    that the hand does not roll; if that is parallel as well, an arbitrary one.
     """
 
     def across(vector: jax.Array) -> jax.Array:
@@ -381,11 +422,17 @@ def _orthogonal(cross: jax.Array, direction: jax.Array, held: jax.Array) -> jax.
         return vector - jnp.sum(vector * direction, -1, keepdims=True) * direction
 
     def unit(vector: jax.Array) -> jax.Array:
+        """Vector of length 1."""
         return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
 
-    rest = across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
-    for wanted, least in ((held, 0.3), (cross, 1e-3)):
-        wanted = across(wanted)
-        rest = jnp.where(jnp.linalg.norm(wanted, axis=-1, keepdims=True) < least, rest, wanted)
+    def preferred(vector: jax.Array, shortest: float, otherwise: jax.Array) -> jax.Array:
+        """Orthogonal component of a vector, or `otherwise` where it is too short."""
+        component = across(vector)
+        length = jnp.linalg.norm(component, axis=-1, keepdims=True)
+        return jnp.where(length < shortest, otherwise, component)
+
+    arbitrary = across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
+    start_component = preferred(at_start, 0.3, arbitrary)
+    result = preferred(cross, 1e-3, start_component)
     # Repeated, because a nearly parallel one leaves mostly rounding error
-    return unit(across(unit(rest)))
+    return unit(across(unit(result)))

@@ -41,7 +41,9 @@ SHARE = 16
 """Limit of queued queries of one peer."""
 SHARED = BATCH_SIZES[1:]
 """Limits of a batch's states while several peers share it, by their number."""
-_TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
+_TIMEOUT_S = 1.0
+"""Deadline of a query by default."""
+_MAX_TIMEOUT_S = 60.0
 _FOLLOW_SECONDS = 0.5
 
 
@@ -53,8 +55,13 @@ class _Held(NamedTuple):
     inference_parameters: InferenceParameters
 
 
-_Answered = tuple[Inference, _Held, float, float]
-"""An answer, its policy, and its queueing and inference times in seconds."""
+class Answer(NamedTuple):
+    """An answer with its policy and times."""
+
+    inference: Inference
+    policy: _Held
+    queue_s: float
+    infer_s: float
 
 
 class PolicyServer:
@@ -90,7 +97,8 @@ class PolicyServer:
                 "Start the server after the run has published one.",
             )
         self._source = source
-        self._on_answer, self._on_batch = on_answer, on_batch
+        self._on_answer = on_answer
+        self._on_batch = on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
         self._seconds: dict[int, float] = {}
@@ -99,7 +107,7 @@ class PolicyServer:
         self._closed = threading.Event()
         self._ready = threading.Event()
         self._began = time.monotonic()
-        self._batcher: Batcher[Query, _Answered] = Batcher(
+        self._batcher: Batcher[Query, Answer] = Batcher(
             self._infer,
             weigh=lambda query: len(query.vectors),
             size=BATCH_SIZES[-1],
@@ -134,6 +142,7 @@ class PolicyServer:
         if not self._ready.is_set():
             return {"ready": False, "state": f"compiling, {time.monotonic() - self._began:.0f} s"}
         held = self._held
+        rates = [size / seconds for size, seconds in self._seconds.items()]
         return {
             "ready": True,
             "version": held.bundle.version,
@@ -144,9 +153,7 @@ class PolicyServer:
             "queue": len(self._batcher),
             "queue_limit": DEPTH,
             "peer_limit": SHARE,
-            "states_per_second": round(
-                max(size / seconds for size, seconds in self._seconds.items())
-            ),
+            "states_per_second": round(max(rates)),
             "answered": self._answered,
             "trouble": self._trouble,
         }
@@ -184,7 +191,7 @@ class PolicyServer:
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            timeout = self._deadline(request.meta.get("timeout", _TIMEOUT))
+            timeout = self._deadline(request.meta.get("timeout", _TIMEOUT_S))
             future = self._batcher.submit(query, timeout, peer=sender(key))
         except CongraspError as error:
             self._count(error, began)
@@ -193,7 +200,7 @@ class PolicyServer:
         future.add_done_callback(functools.partial(self._finish, began, answer))
         return answer
 
-    def _finish(self, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
+    def _finish(self, began: float, answer: "Future[Message]", done: "Future[Answer]") -> None:
         """Resolves a query with the outcome of its batch."""
         error = done.exception()
         self._count(error, began)
@@ -204,43 +211,54 @@ class PolicyServer:
 
     def _count(self, error: BaseException | None, began: float) -> None:
         """Counts the outcome of a query."""
-        lost = error.code if isinstance(error, OverloadedError | LateError) else "refused"
-        self._answered += error is None
-        self._on_answer("answered" if error is None else lost, time.monotonic() - began)
+        if error is None:
+            self._answered += 1
+            outcome = "answered"
+        elif isinstance(error, OverloadedError | LateError):
+            outcome = error.code
+        else:
+            outcome = "refused"
+        self._on_answer(outcome, time.monotonic() - began)
 
     @staticmethod
     def _deadline(seconds: Any) -> float:
         """Validates the deadline of a query in seconds."""
-        if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
+        if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT_S:
             raise CongraspError(
                 f"The query's 'timeout' is {ascii(seconds)[:40]}.",
-                f"It must be seconds, at most {_MAX_TIMEOUT:g}.",
+                f"It must be seconds, at most {_MAX_TIMEOUT_S:g}.",
             )
         return float(seconds)
 
-    def _infer(
-        self, queries: Sequence[Query], queued: Sequence[float]
-    ) -> list[_Answered | Exception]:
+    def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[Answer | Exception]:
         """Answers a batch."""
-        held, began = self._held, time.monotonic()
+        held = self._held
+        began = time.monotonic()
         self._on_batch(sum(len(query.vectors) for query in queries))
-        answers = self._function(held.inference_parameters, queries)
-        spent = time.monotonic() - began
-        return [
-            answer if isinstance(answer, Exception) else (answer, held, waited, spent)
-            for answer, waited in zip(answers, queued, strict=True)
-        ]
+        replies = self._function(held.inference_parameters, queries)
+        infer_s = time.monotonic() - began
+        answers: list[Answer | Exception] = []
+        for reply, queue_s in zip(replies, queued, strict=True):
+            if isinstance(reply, Exception):
+                answers.append(reply)
+            else:
+                answers.append(Answer(reply, held, queue_s, infer_s))
+        return answers
 
-    def _join(self, query: Query, answers: list[_Answered]) -> _Answered | Exception:
+    def _join(self, query: Query, answers: list[Answer]) -> Answer | Exception:
         """Joins the parts of a query; repeats it if the policy was swapped, so that one policy
         answers all.
         """
-        inferences, held, queued, inferred = zip(*answers, strict=True)
-        if any(one is not held[-1] for one in held):
-            return self._infer([query], queued[:1])[0]
-        vectors = np.concatenate([inference.vectors for inference in inferences])
-        active = [reasons for inference in inferences for reasons in inference.active]
-        return Inference(vectors, active), held[-1], queued[0], sum(inferred)
+        first = answers[0]
+        last = answers[-1]
+        if any(answer.policy is not last.policy for answer in answers):
+            return self._infer([query], [first.queue_s])[0]
+        vectors = np.concatenate([answer.inference.vectors for answer in answers])
+        active: list[list[str]] = []
+        for answer in answers:
+            active += answer.inference.active
+        infer_s = sum(answer.infer_s for answer in answers)
+        return Answer(Inference(vectors, active), last.policy, first.queue_s, infer_s)
 
     def _follow(self) -> None:
         """Swaps in newer policies; one that does not match is refused, and the current one
@@ -270,12 +288,18 @@ class PolicyServer:
         self._trouble = ""
 
 
-def _message(answered: _Answered, seconds: float) -> Message:
+def _message(answer: Answer, seconds: float) -> Message:
     """Returns the reply: targets, version, times."""
-    answer, held, queued, inferred = answered
-    times = {"queue_ms": queued, "infer_ms": inferred, "total_ms": seconds}
-    meta = {"version": held.bundle.version, "hash": held.hash}
-    return answer.reply({**meta, **{name: round(1e3 * spent, 3) for name, spent in times.items()}})
+    bundle = answer.policy.bundle
+    times = {
+        "queue_ms": answer.queue_s,
+        "infer_ms": answer.infer_s,
+        "total_ms": seconds,
+    }
+    meta: dict[str, Any] = {"version": bundle.version, "hash": answer.policy.hash}
+    for name, duration in times.items():
+        meta[name] = round(1e3 * duration, 3)
+    return answer.inference.reply(meta)
 
 
 def _cut(query: Query, first: int, end: int) -> Query:
@@ -290,18 +314,20 @@ def _hold(bundle: PolicyBundle) -> _Held:
 
 def follow_file(path: pathlib.Path) -> Source:
     """Returns a source that rereads a policy file whenever it changes."""
-    seen: list[float] = []
+    loaded_at: float | None = None
+    """Time of the file's last change when it was read."""
 
     def read(version: int) -> PolicyBundle | None:
+        nonlocal loaded_at
         try:
             changed = path.stat().st_mtime
         except OSError:
             raise CongraspError(
                 f"The policy {path} cannot be read.", "Pass a file created by 'congrasp train'."
             ) from None
-        if version >= 0 and seen and seen[-1] == changed:
+        if version >= 0 and loaded_at == changed:
             return None
-        seen[:] = [changed]
+        loaded_at = changed
         return bundles.load(path)
 
     return read

@@ -2,9 +2,9 @@
 
 `state` holds the constraints that the user sets with the arrow and the paint of `drawing`, and
 undoes changes. `page` makes the page's content of them, of hands and of motions, which it also
-keeps and saves. `grasping` grasps with a policy. `catalogue` holds the objects, and `training` a
-run with its recorded episodes. None of them depends on a browser. `session` connects them and opens
-the page, `server` serves a session to each browser over HTTP, and `static/` is the page.
-`static/vendor/` has three.js 0.185.1 (MIT licence): `build/three.{module,core}.min.js` of its npm
-package.
+keeps and saves. `grasping` grasps with a policy. `catalogue` holds the objects, `training` the
+state of a run, and `recordings` its recorded episodes. None of them depends on a browser. `session`
+connects them, runs the `jobs` and opens the page. `server` serves a session to each browser over
+HTTP. `static/` is the page. `static/vendor/` has three.js 0.185.1 (MIT licence):
+`build/three.{module,core}.min.js` of its npm package.
 """

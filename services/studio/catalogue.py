@@ -26,8 +26,8 @@ from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of
 
 _FIRST = "mug"  # family of the initial object, unless the user names objects
-_LONGEST_NAME = 255  # bytes, of Linux
-_SIZE = (150, 112)  # pixels of a thumbnail
+_MAX_NAME_BYTES = 255  # of Linux
+_THUMBNAIL_PIXELS = (150, 112)
 
 
 class Importer:
@@ -50,7 +50,7 @@ class Catalogue:
     def __init__(self, makers: Mapping[str, Callable[[], GraspObject]]):
         """Takes the makers of the objects by name; a studio begins with the first."""
         self._makers = dict(makers)
-        self._made: dict[str, GraspObject] = {}
+        self._objects: dict[str, GraspObject] = {}
 
     @property
     def names(self) -> list[str]:
@@ -59,24 +59,26 @@ class Catalogue:
 
     def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
         """Adds an object; returns its name, which has a number if `name` is taken."""
-        free = next(
-            n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers
-        )
-        self._makers[free] = maker
-        return free
+        free_name = name
+        number = 2
+        while free_name in self._makers:
+            free_name = f"{name} ({number})"
+            number += 1
+        self._makers[free_name] = maker
+        return free_name
 
     def drop(self, name: str) -> None:
         """Removes an object, if there is one of this name."""
         self._makers.pop(name, None)
-        self._made.pop(name, None)
+        self._objects.pop(name, None)
 
     def get(self, name: str) -> GraspObject:
         """The object; a CongraspError if there is none or it cannot be imported."""
         if name not in self._makers:
             raise CongraspError(f"There is no object '{name[:60]}'.", "Choose one of the list.")
-        if name not in self._made:
-            self._made[name] = self._makers[name]()
-        return self._made[name]
+        if name not in self._objects:
+            self._objects[name] = self._makers[name]()
+        return self._objects[name]
 
 
 def offered(folder: pathlib.Path | None) -> Catalogue:
@@ -87,13 +89,12 @@ def offered(folder: pathlib.Path | None) -> Catalogue:
     """
     makers: dict[str, Callable[[], GraspObject]] = {}
     if folder is not None:
-        guess = ImportOptions(unit="guess")
-        makers |= {found.name: functools.partial(found.load, guess) for found in objects_at(folder)}
-    families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
-    return Catalogue(
-        makers
-        | {name: functools.partial(procedural.generate, HELD_OUT_SEED, name) for name in families}
-    )
+        options = ImportOptions(unit="guess")
+        for source in objects_at(folder):
+            makers[source.name] = functools.partial(source.load, options)
+    for name in sorted(procedural.FAMILIES, key=lambda family: family != _FIRST):
+        makers[name] = functools.partial(procedural.generate, HELD_OUT_SEED, name)
+    return Catalogue(makers)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,13 +127,15 @@ class Uploads:
 
     def __init__(self, folder: pathlib.Path, catalogue: Catalogue, importer: Importer):
         """Begins without uploads; each file gets a separate folder in the given one."""
-        self._folder, self._catalogue, self._importer = folder, catalogue, importer
-        self._known: dict[str, Upload] = {}
+        self._folder = folder
+        self._catalogue = catalogue
+        self._importer = importer
+        self._uploads: dict[str, Upload] = {}
         self.pending: Upload | None = None
 
     def of(self, name: str) -> Upload | None:
         """The upload that waits for its unit, else that of an object, else None."""
-        return self.pending or self._known.get(name)
+        return self.pending or self._uploads.get(name)
 
     def take(self, name: str, body: bytes) -> Upload:
         """Stores the file of a mesh and guesses its unit.
@@ -143,7 +146,7 @@ class Uploads:
             unit.
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
-        if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
+        if name == ".." or not name.isprintable() or len(name.encode()) > _MAX_NAME_BYTES:
             raise BadRequest(f"{ascii(name)[:60]} is not a file name.")
         if not body:
             raise CongraspError(f"{name} is empty (0 bytes).", "Export or download it again.")
@@ -170,11 +173,11 @@ class Uploads:
             obj, notes = self._importer.load(upload.path, unit)
         except CongraspError as error:
             raise self._without_path(error, upload.path) from None
-        if replaces in self._known:
+        if replaces in self._uploads:
             self._catalogue.drop(replaces)
-            del self._known[replaces]
+            del self._uploads[replaces]
         name = self._catalogue.add(obj.name, lambda: obj)
-        self._known[name] = dataclasses.replace(upload, unit=unit, notes=tuple(notes))
+        self._uploads[name] = dataclasses.replace(upload, unit=unit, notes=tuple(notes))
         self.pending = None
         return name
 
@@ -200,7 +203,8 @@ class Thumbnails:
             raise CongraspError(f"The object '{obj.name}' has no resting pose {rest + 1}.")
         with self._lock:
             if self._object is not obj:
-                self._object, self._drawn = obj, {}
+                self._object = obj
+                self._drawn = {}
             if rest not in self._drawn:
-                self._drawn[rest] = Picture(png_of(rest_picture(obj, rest, _SIZE)))
+                self._drawn[rest] = Picture(png_of(rest_picture(obj, rest, _THUMBNAIL_PIXELS)))
             return self._drawn[rest]

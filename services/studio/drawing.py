@@ -18,9 +18,9 @@ LARGEST = 1e6
 """Bound on each number of a position (m) or direction from a page; its square is finite in single
 precision.
 """
-_ROUND = 1e-6  # rad
-_LOWEST = 0.012  # m above the table of a target from above
-_MOST = 2000  # points of a stroke
+_ROUNDING = 1e-6  # rad
+_LOWEST_TARGET_M = 0.012  # above the table, of a target from above
+_MAX_STROKE_POINTS = 2000
 _versions = itertools.count(1)
 
 
@@ -45,14 +45,13 @@ class Arrow(NamedTuple):
         other = np.cross(self.direction, level)
         angle = float(np.arctan2(self.cross @ other, self.cross @ level))
         # -π and π are one angle, whose sign rounding would decide
-        return angle if angle > _ROUND - np.pi else np.pi
+        return angle if angle > _ROUNDING - np.pi else np.pi
 
     def with_roll(self, angle: float, up: np.ndarray) -> "Arrow":
         """The arrow with a roll of `angle` rad; see `roll`."""
         level = _level(self.direction, up)
-        return self._replace(
-            cross=np.cos(angle) * level + np.sin(angle) * np.cross(self.direction, level)
-        )
+        other = np.cross(self.direction, level)
+        return self._replace(cross=np.cos(angle) * level + np.sin(angle) * other)
 
 
 def arrow_through(surface: Any, direction: Any, cross: np.ndarray) -> Arrow:
@@ -66,7 +65,8 @@ def arrow_through(surface: Any, direction: Any, cross: np.ndarray) -> Arrow:
     Raises:
       CongraspError: a value is not three numbers within `LARGEST`, or the direction is zero.
     """
-    surface, direction = vector("arrow's point", surface), vector("arrow's direction", direction)
+    surface = vector("arrow's point", surface)
+    direction = vector("arrow's direction", direction)
     length = np.linalg.norm(direction)
     if length < 1e-6:
         raise CongraspError("The arrow has no direction.", "Drag its tail away from its tip.")
@@ -80,11 +80,12 @@ def from_above(obj: GraspObject, rest: int) -> Arrow:
     """
     turn = matrix(obj.rest_poses[rest][3:])
     world = obj.points @ turn.T
-    near = np.linalg.norm(world[:, :2] - (world[:, :2].max(0) + world[:, :2].min(0)) / 2, axis=-1)
-    top = world[near.argsort()[: len(world) // 8], 2].max()
+    center = (world[:, :2].max(0) + world[:, :2].min(0)) / 2
+    from_center = np.linalg.norm(world[:, :2] - center, axis=-1)
+    top = world[from_center.argsort()[: len(world) // 8], 2].max()
     middle = (world.max(0) + world.min(0)) / 2
     narrow = np.eye(3)[int(np.ptp(world[:, :2], axis=0).argmin())]
-    height = max(top - INWARD, world[:, 2].min() + _LOWEST)
+    height = max(top - INWARD, world[:, 2].min() + _LOWEST_TARGET_M)
     target = np.array([middle[0], middle[1], height])
     return Arrow(target @ turn, np.array([0.0, 0.0, -1.0]) @ turn, narrow @ turn)
 
@@ -95,16 +96,16 @@ def _level(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
     """
     level = np.cross(up, direction)
     length = np.linalg.norm(level)
-    return (
-        level / length if length > 1e-3 else _orthogonal(np.eye(3)[np.abs(up).argmin()], direction)
-    )
+    if length > 1e-3:
+        return level / length
+    return _orthogonal(np.eye(3)[np.abs(up).argmin()], direction)
 
 
-def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(3,) unit, the part of a vector that is orthogonal to a direction; any orthogonal one if that
+def _orthogonal(axis: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(3,) unit, the part of an axis that is orthogonal to a direction; any orthogonal one if that
     part vanishes.
     """
-    cross = wanted - wanted @ direction * direction
+    cross = axis - axis @ direction * direction
     if np.linalg.norm(cross) < 1e-3:
         cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     return cross / np.linalg.norm(cross)
@@ -172,7 +173,8 @@ class Canvas:
     def take_parts(self) -> None:
         """Paints the object's non-graspable parts, and nothing else."""
         avoid = self._obj.non_graspable_points
-        self._set(avoid, avoid[cKDTree(self._obj.points).query(self.vertices)[1]])
+        _, nearest = cKDTree(self._obj.points).query(self.vertices)
+        self._set(avoid, avoid[nearest])
 
     def _set(self, avoid: np.ndarray, shown: np.ndarray) -> None:
         """Sets the paint, with a new version."""
@@ -182,28 +184,30 @@ class Canvas:
 def vector(what: str, value: Any) -> np.ndarray:
     """(3,) finite numbers within `LARGEST`; raises a CongraspError for others."""
     try:
-        found = np.asarray(value, float)
+        numbers = np.asarray(value, float)
     except (TypeError, ValueError):
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
+        numbers = np.zeros(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise CongraspError(f"The {what} must be three numbers, not {ascii(value)[:60]}.")
-    if np.abs(found).max() > LARGEST:
+    if np.abs(numbers).max() > LARGEST:
         raise CongraspError(f"The {what} must be within {LARGEST:g} of zero.")
-    return found
+    return numbers
 
 
 def stroke(what: str, points: Any) -> np.ndarray:
     """(N, 3) points of a stroke of the mouse; raises a CongraspError unless they are at most 2000
     within `LARGEST`.
     """
-    found = np.asarray(points, float)
+    positions = np.asarray(points, float)
     if (
-        found.ndim != 2
-        or found.shape[1:] != (3,)
-        or len(found) > _MOST
-        or not np.isfinite(found).all()
+        positions.ndim != 2
+        or positions.shape[1:] != (3,)
+        or len(positions) > _MAX_STROKE_POINTS
+        or not np.isfinite(positions).all()
     ):
-        raise CongraspError(f"A {what} must be at most {_MOST} points of three numbers.")
-    if np.abs(found).max(initial=0.0) > LARGEST:
+        raise CongraspError(
+            f"A {what} must be at most {_MAX_STROKE_POINTS} points of three numbers."
+        )
+    if np.abs(positions).max(initial=0.0) > LARGEST:
         raise CongraspError(f"A {what} must be within {LARGEST:g} m of the object.")
-    return found
+    return positions

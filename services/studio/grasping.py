@@ -35,11 +35,15 @@ from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
 """Number of parallel grasps: the drawn one, and variations of it."""
-_ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
-"""Standard deviations of the variations: m per axis, rad, rad."""
-_COMPILING = 60
-"""Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
-_OTHER = 2.0
+_SHIFT_SIGMA_M = 0.006
+"""Standard deviation of a variation's position per axis."""
+_TILT_SIGMA = np.radians(6.0)
+"""Standard deviation of its tilt, rad."""
+_ROLL_SIGMA = np.radians(10.0)
+"""Standard deviation of its roll, rad."""
+_COMPILING_S = 60
+"""Time of the first grasp on two cores of a laptop, with an empty compilation cache."""
+_VARIATION_COST = 2.0
 """Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.costs`."""
 SECONDS = "{seconds}"
 """Placeholder in the text of a job for its elapsed seconds."""
@@ -70,12 +74,15 @@ class PolicyGrasping:
                 f"There is no policy of {name} yet.",
                 "Start the studio when the run has published one.",
             )
-        self._source, self._name, self._policy = source, name, first
+        self._source = source
+        self._name = name
+        self._policy = first
         self._trouble = ""
         self.hand = get_hand(first.spec.hand)
         self.task = first.task.evaluated()
         self._attempts = Attempts(self.hand, self.task, first, threads=cores())
-        self._compiled, self._free = False, threading.Lock()
+        self._compiled = False
+        self._free = threading.Lock()
 
     def newest(self) -> dict[str, Any]:
         """Source and version; `trouble` is the reason why newer weights were not taken, or
@@ -120,19 +127,17 @@ class PolicyGrasping:
     ) -> Message:
         """Does the work of `grasp`; the caller holds the lock."""
         self._attempts.phases = phases
-        first_time = not self._compiled
-        progress(
-            f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights",
-            0.02,
-        )
+        activity = "newest weights"
+        if not self._compiled:
+            activity = f"compiling, {SECONDS} s of about {_COMPILING_S}"
+        progress(activity, 0.02)
         self.refresh()
         require_known(request.constraints, self.task)
-        outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
+        outcome, distances = self._attempt(obj, request, lambda share: progress("grasping", share))
         self._compiled = True
-        index = _best(
-            outcome, tuple(request.constraints), self.task.approach_steps - 1, phases.lift
-        )
-        about = {"actor": "studio", "note": _note(outcome, index, aside)}
+        removal = self.task.approach_steps - 1
+        index = _best(outcome, tuple(request.constraints), removal, phases.lift)
+        about = {"actor": "studio", "note": _note(outcome, index, distances)}
         episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
         if phases.approach:
             progress("reach", 1.0)
@@ -145,14 +150,15 @@ class PolicyGrasping:
         def held(weaker: GraspRequest, without: str) -> int:
             """Returns the number of attempts that hold under a weaker request."""
             text = f"nothing held; without the {get_constraint(without).title}"
-            found, _ = self._attempt(obj, weaker, lambda share: progress(text, share))
-            return int((found.metrics["held"] > 0).sum())
+            weaker_outcome, _ = self._attempt(obj, weaker, lambda share: progress(text, share))
+            return int((weaker_outcome.metrics["held"] > 0).sum())
 
-        asked = tuple(name for name in request.constraints if get_constraint(name).optional)
+        requested = tuple(name for name in request.constraints if get_constraint(name).optional)
+        explanation = explain(requested, bool(outcome.redirected[index]))
         note = why_nothing_held(
             episode,
             request,
-            explain(asked, bool(outcome.redirected[index])),
+            explanation,
             held,
             attempts=ATTEMPTS,
             drop_height=self.task.drop_height,
@@ -165,19 +171,19 @@ class PolicyGrasping:
         """Outcome of a request and its variations, and the distance (B,) of each from the request,
         m.
         """
-        episodes, aside = _episodes(self.hand, self.task, obj, request)
+        episodes, distances = _episodes(self.hand, self.task, obj, request)
         steps = self._attempts.simulated_steps
-        return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
+        outcome = self._attempts.run(obj, episodes, lambda step: progress(step / steps))
+        return outcome, distances
 
 
 def pretrained() -> Loaders:
     """The pretrained and custom policies, by the names of their hands."""
-    return {
-        name: functools.partial(
-            PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy"
-        )
-        for name in hands_with_policy()
-    }
+    loaders: dict[str, Callable[[], PolicyGrasping]] = {}
+    for name in hands_with_policy():
+        source = follow_file(policy_file(None, name))
+        loaders[name] = functools.partial(PolicyGrasping, source, "pretrained policy")
+    return loaders
 
 
 def of_file(path: pathlib.Path) -> Loaders:
@@ -187,11 +193,8 @@ def of_file(path: pathlib.Path) -> Loaders:
 
 def of_run(transport: Transport, run: str, name: str) -> Loaders:
     """The newest policy of a run, pulled from its learner under this process's name on the wire."""
-    return {
-        "of the run": functools.partial(
-            PolicyGrasping, follow_run(transport, run, name), f"the run '{run}'"
-        )
-    }
+    source = follow_run(transport, run, name)
+    return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{run}'")}
 
 
 def _episodes(
@@ -201,25 +204,29 @@ def _episodes(
     rng = np.random.default_rng(0)
     drawn = repeated(hand, task, obj, request, ATTEMPTS)
     goal = drawn.goal
-    others = np.arange(ATTEMPTS) > 0
-    shift = (rng.normal(0.0, _ASIDE, (ATTEMPTS, 3)) * others[:, None]).astype(np.float32)
-    tilt, roll = (rng.normal(0.0, sigma, ATTEMPTS) * others for sigma in (_TILT, _ROLL))
-    direction, cross = goal["heading"].direction, goal["heading"].cross
+    is_variation = np.arange(ATTEMPTS) > 0
+    shift = rng.normal(0.0, _SHIFT_SIGMA_M, (ATTEMPTS, 3)) * is_variation[:, None]
+    shift = shift.astype(np.float32)
+    tilt = rng.normal(0.0, _TILT_SIGMA, ATTEMPTS) * is_variation
+    roll = rng.normal(0.0, _ROLL_SIGMA, ATTEMPTS) * is_variation
+    direction = goal["heading"].direction
+    cross = goal["heading"].cross
     third = np.cross(direction, cross)
-    way = rng.uniform(0.0, 2 * np.pi, ATTEMPTS)
-    axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
-    turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
-    turned = {
-        "direction": turn.apply(direction).astype(np.float32),
-        "cross": turn.apply(cross).astype(np.float32),
-    }
-    goal = goal.replace("heading", **turned)
+    azimuth = rng.uniform(0.0, 2 * np.pi, ATTEMPTS)
+    tilt_axis = np.cos(azimuth)[:, None] * cross + np.sin(azimuth)[:, None] * third
+    turn = Rotation.from_rotvec(tilt[:, None] * tilt_axis + roll[:, None] * direction)
+    goal = goal.replace(
+        "heading",
+        direction=turn.apply(direction).astype(np.float32),
+        cross=turn.apply(cross).astype(np.float32),
+    )
     for constraint in known(task):
-        if "position" in constraint.arrays:
-            place = goal[constraint.name].position
-            goal = goal.replace(
-                constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3)
-            )
+        if "position" not in constraint.arrays:
+            continue
+        position = goal[constraint.name].position
+        along_path = [1] * (position.ndim - 2)
+        shifted = position + shift.reshape(-1, *along_path, 3)
+        goal = goal.replace(constraint.name, position=shifted)
     return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
@@ -227,21 +234,20 @@ def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
     """Index of the drawn grasp, or of a variation that clearly holds or meets the constraints
     better.
     """
-    return int(
-        np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0))
-    )
+    penalty = _VARIATION_COST * (np.arange(ATTEMPTS) > 0)
+    return int(np.argmin(costs(outcome, constraints, removal, lift) + penalty))
 
 
-def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
+def _note(outcome: Outcome, index: int, distances: np.ndarray) -> str:
     """Reason why a variation is shown; empty if the drawn grasp is shown, or none held."""
     held = outcome.metrics["held"] > 0
-    if held.any() and index:
-        why = "is better than the drawn grasp" if held[0] else "holds; the drawn grasp does not"
-        return (
-            f"This variation, the best of {ATTEMPTS - 1}, {why}: it is {1000 * aside[index]:.0f} "
-            f"mm away."
-        )
-    return ""
+    if index == 0 or not held.any():
+        return ""
+    why = "is better than the drawn grasp" if held[0] else "holds; the drawn grasp does not"
+    return (
+        f"This variation, the best of {ATTEMPTS - 1}, {why}: it is {1000 * distances[index]:.0f} "
+        f"mm away."
+    )
 
 
 def why_nothing_held(
@@ -264,26 +270,25 @@ def why_nothing_held(
       drop_height: drop at which the object counts as fallen, m.
     """
     text = f"None of {attempts} attempts held. The one shown: {cause(episode, drop_height)}."
-    found = {name: held(weaker, name) for name, weaker in _weaker(request)}
-    best = max(found, key=lambda name: found[name], default="")
-    if best and found[best]:
+    held_without = {name: held(weaker, name) for name, weaker in _weaker(request)}
+    best = max(held_without, key=lambda name: held_without[name], default="")
+    if best and held_without[best]:
         title = get_constraint(best).title
-        return f"{text} The {title} decided: without it {found[best]} of {attempts} hold."
+        return f"{text} The {title} decided: without it {held_without[best]} of {attempts} hold."
     guides = [name for name in request.constraints if "heading" in get_constraint(name).overrides]
-    advice = (
-        f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
-    )
-    return (
-        f"{text} Leaving out any one constraint does not help. {advice}"
-        if found
-        else f"{text} {advice}"
-    )
+    guide = guides[-1] if guides else "heading"
+    advice = f"{explanation[0]} Try another {get_constraint(guide).title}."
+    if not held_without:
+        return f"{text} {advice}"
+    return f"{text} Leaving out any one constraint does not help. {advice}"
 
 
 def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:
     """The request without one of its optional constraints, for each of them."""
     for name in request.constraints:
-        if get_constraint(name).optional:
-            kept = {other: fields for other, fields in request.constraints.items() if other != name}
-            avoid = None if tool_of(get_constraint(name)) == "paint" else request.avoid
-            yield name, dataclasses.replace(request, constraints=kept, avoid=avoid)
+        constraint = get_constraint(name)
+        if constraint.optional:
+            others = dict(request.constraints)
+            del others[name]
+            avoid = None if tool_of(constraint) == "paint" else request.avoid
+            yield name, dataclasses.replace(request, constraints=others, avoid=avoid)

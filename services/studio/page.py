@@ -4,10 +4,11 @@ The newest motions are kept here, and are offered as files for download.
 """
 
 import functools
+import itertools
 import pathlib
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -50,9 +51,9 @@ from congrasp.services.viz.sheets import png_of
 TOUCH = 0.05
 """Least force of a link in contact, N."""
 _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
-MEANINGS = {term.name: term.meaning for term in GRASP} | {
-    weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
-}
+_CONSTRAINT_WEIGHTS = itertools.chain.from_iterable(c.weights for c in CONSTRAINTS)
+MEANINGS = {term.name: term.meaning for term in GRASP}
+MEANINGS |= {weight.name: weight.meaning for weight in _CONSTRAINT_WEIGHTS}
 """Descriptions of the reward terms by name."""
 _PLAYED = (
     "link_position",
@@ -74,7 +75,8 @@ DATA = ("npz", "mcap", *FORMATS)
 """Formats in which a motion is saved without a job."""
 DRAWN = ("mp4", "png")
 """Formats that a job renders."""
-_PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
+_PICTURE_PIXELS = (1280, 720)
+_VIDEO_PIXELS = (854, 480)
 
 
 def describe(studio: Studio) -> dict[str, Any]:
@@ -83,16 +85,21 @@ def describe(studio: Studio) -> dict[str, Any]:
     """
     resolution = studio.resolution
     goal = resolution.goal
-    obj, hand, rest = studio.obj, studio.hand, studio.obj.rest_poses[studio.rest]
-    asked = [constraint for constraint in known(studio.task) if constraint.name in studio.asked]
-    shown = (marker for c in asked for marker in c.markers(studio.goal[c.name], c.blocks))
+    obj = studio.obj
+    hand = studio.hand
+    rest = obj.rest_poses[studio.rest]
+    requested = [constraint for constraint in known(studio.task) if constraint.name in studio.asked]
+    sides = np.ptp(obj.visual_vertices, axis=0)
+    start = _start(hand, studio.task, *_batch_of_one(studio, goal))
+    markers_of_request: list[Marker] = []
+    for constraint in requested:
+        markers_of_request += constraint.markers(studio.goal[constraint.name], constraint.blocks)
+    heading_overridden = any("heading" in constraint.overrides for constraint in requested)
     return {
         "hand": hand.name,
         "object": {
             "name": obj.name,
-            "size_cm": [
-                round(100 * float(side), 1) for side in np.ptp(obj.visual_vertices, axis=0)
-            ],
+            "size_cm": [round(100 * float(side), 1) for side in sides],
             "mass_g": round(1000 * obj.mass),
             "faces": len(studio.canvas.faces),
             "tilts_deg": np.degrees(rest_tilts(obj)).round().tolist(),
@@ -109,13 +116,14 @@ def describe(studio: Studio) -> dict[str, Any]:
         "active": {
             "masks": {block: bool(on) for block, on in goal.active.items()},
             **_lists(goal["heading"]._asdict()),
-            "overruled": bool(resolution.redirected)
-            or any("heading" in constraint.overrides for constraint in asked),
+            "overruled": bool(resolution.redirected) or heading_overridden,
         },
         "explanation": studio.explanation,
         "trouble": studio.trouble,
-        "start": _lists(_frames(hand, *_start(hand, studio.task, *_batch_of_one(studio, goal)))),
-        "markers": [{"kind": kind, **_lists(fields)} for kind, fields in _shapes(hand, shown)],
+        "start": _lists(_frames(hand, *start)),
+        "markers": [
+            {"kind": kind, **_lists(fields)} for kind, fields in _shapes(hand, markers_of_request)
+        ],
         "painted": studio.canvas.paint.version,
         "avoid_share": round(float(studio.canvas.avoid.mean()), 3),
     }
@@ -125,10 +133,9 @@ def _rows(studio: Studio) -> Iterator[dict[str, Any]]:
     """Name, title, drawing tool and labelled flags of each constraint of the policy."""
     for constraint in known(studio.task):
         fields = studio.fields.get(constraint.name, {})
-        flags = {
-            field: dict(zip(labels, fields[field].tolist(), strict=True))
-            for field, labels in constraint.labels(studio.hand).items()
-        }
+        flags: dict[str, dict[str, bool]] = {}
+        for field, labels in constraint.labels(studio.hand).items():
+            flags[field] = dict(zip(labels, fields[field].tolist(), strict=True))
         yield {
             "name": constraint.name,
             "title": constraint.title,
@@ -145,9 +152,8 @@ def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray]:
     """The goal, the object's surface and its resting pose (7,), with a batch axis."""
     rest = np.asarray(studio.obj.rest_poses[studio.rest], np.float32)
-    return jax.tree.map(
-        lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest)
-    )
+    surface = surface_of(studio.task, studio.obj)
+    return jax.tree.map(lambda array: np.asarray(array)[None], (goal, surface, rest))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -164,20 +170,15 @@ def _frames(hand: Hand, q: Any, position: Any, quaternion: Any) -> dict[str, np.
     that pose's frame.
     """
     wrist = Rotation.from_quat(quaternion, scalar_first=True)
-    return dict(
-        zip(
-            ("position", "quaternion"),
-            link_frames(hand, np.asarray(q, float), position, wrist),
-            strict=True,
-        )
-    )
+    positions, quaternions = link_frames(hand, np.asarray(q, float), position, wrist)
+    return {"position": positions, "quaternion": quaternions}
 
 
-def _shapes(hand: Hand, shown: Iterator[Marker]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _shapes(hand: Hand, markers: Iterable[Marker]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Kind and fields of each marker, object frame; a ghost of a whole hand has its link frames as
     fields.
     """
-    for marker in shown:
+    for marker in markers:
         if not isinstance(marker, Ghost):
             yield type(marker).__name__.lower(), marker._asdict()
         elif marker.q is not None:
@@ -222,70 +223,82 @@ def lanes(episode: Message) -> dict[str, Lane]:
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
     table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
     links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
-    found = {
-        "contact": Lane(
-            links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)}
-        )
-    }
-    active, blocks = active_constraints(arrays), active_blocks(arrays)
+    contact = Lane(
+        links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)}
+    )
+    lane_of = {"contact": contact}
+    active = active_constraints(arrays)
+    blocks = active_blocks(arrays)
     for constraint in CONSTRAINTS:
+        if constraint.name not in active:
+            continue
         errors = [spec for spec in constraint.errors if not spec.block or blocks.get(spec.block)]
-        if constraint.name in active and all(f"error/{spec.name}" in arrays for spec in errors):
-            found[constraint.name] = _lane(errors, arrays, table)
-    return found
+        if all(f"error/{spec.name}" in arrays for spec in errors):
+            lane_of[constraint.name] = _lane(errors, arrays, table)
+    return lane_of
 
 
 def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
     """The lane of one constraint from its recorded errors (T,)."""
-    values = {spec: arrays[f"error/{spec.name}"] for spec in errors}
-    met = np.all([value <= spec.tolerance for spec, value in values.items()], 0)
-    counts = table if errors[0].window == "approach" else ~table
-    parts = []
+    within: list[np.ndarray] = []
+    parts: list[str] = []
+    errors_by_unit: dict[str, np.ndarray] = {}
     for spec in errors:
+        values = arrays[f"error/{spec.name}"]
+        within.append(values <= spec.tolerance)
         factor, unit = _UNITS[spec.unit]
         parts.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
-    return Lane(
-        met,
-        counts,
-        "; ".join(parts),
-        {spec.unit or "share": value for spec, value in values.items()},
-    )
+        errors_by_unit[spec.unit or "share"] = values
+    counts = table if errors[0].window == "approach" else ~table
+    return Lane(np.all(within, 0), counts, "; ".join(parts), errors_by_unit)
 
 
 def for_page(episode: Message) -> Message:
     """The episode for the page's player: poses, forces, rewards, object, lanes, and markers
     `KIND/CONSTRAINT/FIELD`.
     """
-    found = lanes(episode)
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in _PLAYED}
-    if "colour_values" in episode.arrays:
-        own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
-        mesh = painted(arrays["visual_vertices"], arrays["visual_faces"], own)
-        arrays |= dict(
-            zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True)
-        )
+    arrays |= _colours(episode)
     rewards = {name: value for name, value in episode.arrays.items() if name.startswith("reward/")}
     arrays |= rewards
-    for name, lane in found.items():
-        arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
-        arrays |= {
-            f"lane/{name}/{unit}": np.asarray(value, np.float32)
-            for unit, value in lane.errors.items()
-        }
-    for name, marker in markers(episode.arrays):
-        for kind, fields in _shapes(known_hand(episode.meta["hand"]), iter([marker])):
-            fields = {"avoid": episode.arrays["surface_avoid"]} if kind == "paint" else fields
-            arrays |= {
-                f"{kind}/{name}/{field}": np.asarray(value, np.float32)
-                for field, value in fields.items()
-            }
-    terms = {
-        name: MEANINGS.get(name, "") for name in (key.removeprefix("reward/") for key in rewards)
-    }
-    return Message(
-        arrays,
-        {**episode.meta, "lanes": {n: lane.legend for n, lane in found.items()}, "terms": terms},
+    legends: dict[str, str] = {}
+    for name, lane in lanes(episode).items():
+        legends[name] = lane.legend
+        arrays[f"lane/{name}/met"] = lane.met
+        arrays[f"lane/{name}/counts"] = lane.counts
+        for unit, value in lane.errors.items():
+            arrays[f"lane/{name}/{unit}"] = np.asarray(value, np.float32)
+    arrays |= _marker_arrays(episode)
+    terms: dict[str, str] = {}
+    for key in rewards:
+        term = key.removeprefix("reward/")
+        terms[term] = MEANINGS.get(term, "")
+    return Message(arrays, {**episode.meta, "lanes": legends, "terms": terms})
+
+
+def _colours(episode: Message) -> dict[str, np.ndarray]:
+    """The object's mesh with colours, if it has some."""
+    if "colour_values" not in episode.arrays:
+        return {}
+    colours = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
+    vertices, faces, vertex_colours = painted(
+        episode.arrays["visual_vertices"], episode.arrays["visual_faces"], colours
     )
+    return {"visual_vertices": vertices, "visual_faces": faces, "visual_colours": vertex_colours}
+
+
+def _marker_arrays(episode: Message) -> dict[str, np.ndarray]:
+    """Fields of the markers of an episode by `KIND/CONSTRAINT/FIELD`."""
+    hand = known_hand(episode.meta["hand"])
+    arrays: dict[str, np.ndarray] = {}
+    for name, marker in markers(episode.arrays):
+        for kind, marker_fields in _shapes(hand, [marker]):
+            fields = marker_fields
+            if kind == "paint":
+                fields = {"avoid": episode.arrays["surface_avoid"]}
+            for field, value in fields.items():
+                arrays[f"{kind}/{name}/{field}"] = np.asarray(value, np.float32)
+    return arrays
 
 
 class Motions:
@@ -293,48 +306,55 @@ class Motions:
 
     def __init__(self) -> None:
         """Begins without motions."""
-        self._kept: dict[str, Message] = {}
+        self._episodes: dict[str, Message] = {}
         self._number = 0
 
     def keep(self, episode: Message) -> str:
         """Keeps a motion; returns its number."""
         self._number += 1
-        self._kept[str(self._number)] = episode
-        while len(self._kept) > MOST:
-            del self._kept[next(iter(self._kept))]
+        self._episodes[str(self._number)] = episode
+        while len(self._episodes) > MOST:
+            del self._episodes[next(iter(self._episodes))]
         return str(self._number)
 
     def get(self, key: str) -> Message:
         """A motion by its number; a CongraspError if there is none."""
-        if key not in self._kept:
+        if key not in self._episodes:
             raise CongraspError(
                 f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list."
             )
-        return self._kept[key]
+        return self._episodes[key]
 
     def delete(self, key: str) -> None:
         """Deletes a motion, if there is one of this number."""
-        self._kept.pop(key, None)
+        self._episodes.pop(key, None)
 
     def view(self) -> list[dict[str, Any]]:
         """List entries of the motions, the newest first."""
-        return [_described(key, episode) for key, episode in self._kept.items()][::-1]
+        return [_described(key, episode) for key, episode in reversed(self._episodes.items())]
 
 
 def _asked(episode: Message) -> str:
     """Request of a motion in words: its constraints, and the direction of the approach, world
     frame.
     """
-    arrays, names = episode.arrays, active_constraints(episode.arrays)[1:]
+    arrays = episode.arrays
     turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
     down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])
-    way = "from above" if down > _ABOVE else "from below" if down < -_ABOVE else "from the side"
-    return ", ".join([*(get_constraint(name).title for name in names), way])
+    if down > _ABOVE:
+        approach = "from above"
+    elif down < -_ABOVE:
+        approach = "from below"
+    else:
+        approach = "from the side"
+    titles = [get_constraint(name).title for name in active_constraints(arrays)[1:]]
+    return ", ".join([*titles, approach])
 
 
 def _described(key: str, episode: Message) -> dict[str, Any]:
     """List entry of a motion."""
-    meta, metrics = episode.meta, episode.meta.get("metrics", {})
+    meta = episode.meta
+    metrics = meta.get("metrics", {})
     return {
         "id": key,
         "object": meta["object"],
@@ -371,9 +391,10 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
             raise CongraspError(
                 f"This needs the package '{error.name}'.", "Run: pip install 'congrasp[export]'"
             ) from None
+        suffix = path.suffix
         if path.is_dir():
             path = pathlib.Path(shutil.make_archive(str(path), "zip", path))
-        suffix = f".{kind}" if kind in ("npz", "mcap") else FORMATS[kind] or f"-{kind}.zip"
+            suffix = f"-{kind}.zip"
         return Download(_name(episode, key, suffix), path.read_bytes())
 
 
@@ -407,11 +428,11 @@ def drawing(
     if kind == "png":
         if not isinstance(frame, int) or not 0 <= frame < len(episode.arrays["table"]):
             raise CongraspError(f"The motion has no frame {ascii(frame)[:20]}.")
-        (image,) = render_episode_frames(episode, [frame], _PICTURE, camera)
+        (image,) = render_episode_frames(episode, [frame], _PICTURE_PIXELS, camera)
         return Download(_name(episode, key, f"-{frame}.png"), png_of(image))
     with tempfile.TemporaryDirectory(prefix="congrasp-video-") as folder:
         path = pathlib.Path(folder) / "motion.mp4"
-        save_episode_video(path, episode, Film(_VIDEO, overlays=True), camera, progress)
+        save_episode_video(path, episode, Film(_VIDEO_PIXELS, overlays=True), camera, progress)
         return Download(_name(episode, key, ".mp4"), path.read_bytes())
 
 
@@ -419,9 +440,8 @@ def _camera(view: Mapping[str, Any]) -> Camera:
     """The page's camera."""
     if not isinstance(view, Mapping):
         raise CongraspError("The camera must have a position, a target and a field of view.")
-    position, target = (
-        vector(f"camera's {name}", view.get(name)) for name in ("position", "target")
-    )
+    position = vector("camera's position", view.get("position"))
+    target = vector("camera's target", view.get("target"))
     angle = float(vector("camera's field of view", [view.get("field_of_view"), 0.0, 0.0])[0])
     if np.linalg.norm((target - position)[:2]) < 1e-6 or not 1 <= angle <= 120:
         raise CongraspError(

@@ -44,17 +44,19 @@ _POLICY = (
 )
 _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
+_PAGE_PATH = re.compile("/(api|static(/vendor)?)/[^/]*$")
+"""End of a path that belongs to the page, after the prefix of a proxy."""
 _TOKEN = re.compile("[0-9a-f]{32}")
-_TIMEOUT = 30.0  # seconds that a connection may be silent, and a request's head may take
+_TIMEOUT_S = 30.0
+"""Time that a connection may be silent, and that a request's head may take."""
 _CONNECTIONS = 256  # at a time, shared by addresses; a browser opens six
-# Bytes read of a refused body, so that the answer arrives before the close
-_DRAINED, _DRAIN_SECONDS = (
-    64 << 10,
-    1.0,
-)
-
-
+_DRAINED_BYTES = 64 << 10
+"""Bytes read of a refused body, so that the answer arrives before the close."""
+_DRAIN_TIMEOUT_S = 1.0
+_MAX_LENGTH_DIGITS = 19
+"""Digits of a Content-Length."""
+_BODY_TYPES = ("application/json", "application/octet-stream")
+"""Types of a request's body; a form of another site cannot send them."""
 _FULL = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nRetry-After: 5\r\n"
     b"Connection: close\r\n\r\n"
@@ -113,7 +115,8 @@ class Sessions:
         Raises:
           CongraspError: `new` failed.
         """
-        self._new, self._spare = new, [new()]
+        self._new = new
+        self._spare = [new()]
         self._open: collections.OrderedDict[str, tuple[Session, float]] = collections.OrderedDict()
         self._lock = threading.Lock()
 
@@ -136,14 +139,17 @@ class Sessions:
                     )
                 self._open.popitem(last=False)
                 oldest.close()
-            session = session or (self._spare.pop() if self._spare else self._new())
-            self._open[browser] = session, now
+            if session is None:
+                session = self._spare.pop() if self._spare else self._new()
+            self._open[browser] = (session, now)
             return session.routes
 
     def close(self) -> None:
         """Closes all sessions."""
         with self._lock:
-            for session in (*self._spare, *(session for session, _ in self._open.values())):
+            for session in self._spare:
+                session.close()
+            for session, _ in self._open.values():
                 session.close()
 
 
@@ -169,8 +175,10 @@ class PageServer:
         remedy = "Choose another --port, or end the process that uses it."
         with os_errors_as(f"The page cannot be offered at {host}:{port}", remedy, PORT_ERRORS):
             self._server = _Server((host, port), _Handler)
-        self.routes, self._server.page = routes, self
-        self.host, self.port = host, int(self._server.server_address[1])
+        self._server.page = self
+        self.routes = routes
+        self.host = host
+        self.port = int(self._server.server_address[1])
         self._named = set(names)
         self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
         self._thread = threading.Thread(
@@ -181,8 +189,12 @@ class PageServer:
     @property
     def url(self) -> str:
         """URL of the page for a browser on this machine."""
-        host = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
+        host = self.host
+        if host in ("0.0.0.0", "::", ""):
+            host = "127.0.0.1"
+        elif ":" in host:
+            host = f"[{host}]"
+        return f"http://{host}:{self.port}/"
 
     def close(self) -> None:
         """Stops the server."""
@@ -197,27 +209,41 @@ class PageServer:
         machine (DNS rebinding), so the Host header must name this machine, or a proxy set by the
         user. Ports differ behind a tunnel.
         """
-        host = request.headers.get("Host", "").strip()
-        origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
+        return self._host_fault(request) or self._origin_fault(request)
+
+    def _host_fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
+        """Reason why the Host header is refused; empty if it names this page."""
+        host = _host_of(request)
         name = re.sub(r":\d*$", "", host).strip("[]")
-        if not host or (self._names is not None and not {host, name} & self._names):
-            shown = ascii(name)[:60]
-            return (
-                f"The page is not offered as {shown}. Open {self.url} or start it with "
-                f"--allow-host {shown}."
-            )
+        if host and (self._names is None or {host, name} & self._names):
+            return ""
+        shown_name = ascii(name)[:60]
+        return (
+            f"The page is not offered as {shown_name}. Open {self.url} or start it with "
+            f"--allow-host {shown_name}."
+        )
+
+    def _origin_fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
+        """Reason why the sender of a request is refused; empty if it is this page."""
+        host = _host_of(request)
+        origin = request.headers.get("Origin")
+        site = request.headers.get("Sec-Fetch-Site")
         sender = re.sub(r"^https?://|:\d*$", "", origin or "").strip("[]")
         # A proxy may put this server's address as Host, and leave the browser's Origin.
-        ours = origin in (None, f"http://{host}", f"https://{host}") or sender in self._named
-        if not ours or site not in (None, "none", "same-origin"):
-            shown = ascii(sender)[:60]
+        is_page = origin in (None, f"http://{host}", f"https://{host}") or sender in self._named
+        if is_page and site in (None, "none", "same-origin"):
+            return ""
+        proxy = ""
+        if sender:
             proxy = (
-                f" If that is a proxy of yours, start it with --allow-host {shown}."
-                if sender
-                else ""
+                f" If that is a proxy of yours, start it with --allow-host {ascii(sender)[:60]}."
             )
-            return f"Another site sent this request. Open the page itself, at {self.url}.{proxy}"
-        return ""
+        return f"Another site sent this request. Open the page itself, at {self.url}.{proxy}"
+
+
+def _host_of(request: http.server.BaseHTTPRequestHandler) -> str:
+    """Host header of a request; empty without one."""
+    return request.headers.get("Host", "").strip()
 
 
 def _disconnect(connection: socket.socket) -> None:
@@ -268,12 +294,12 @@ class _Server(http.server.ThreadingHTTPServer):
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = _TIMEOUT
+    timeout = _TIMEOUT_S
     server: _Server
 
     def handle_one_request(self) -> None:
-        """Serves one request, whose head must arrive within `_TIMEOUT`, however slowly it comes."""
-        timer = threading.Timer(_TIMEOUT, self._give_up)
+        """Serves one request, whose head must arrive within `_TIMEOUT_S`, at whatever speed."""
+        timer = threading.Timer(_TIMEOUT_S, self._give_up)
         timer.daemon = True
         self._head_timer = timer
         timer.start()
@@ -298,43 +324,60 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         path, query = self._route()
         if self._refused():
             return
+        if path == "/":
+            self._file("index.html")
+            return
         if not path.startswith(_ROUTES):
-            self._file("index.html" if path == "/" else path.removeprefix("/static/"))
-        elif (routes := self._routes()) and (route := routes.gets.get(path)):
-            self._answer(lambda: route(query))
-        elif routes:
+            self._file(path.removeprefix("/static/"))
+            return
+        routes = self._routes()
+        if routes is None:
+            return
+        route = routes.gets.get(path)
+        if route is None:
             self._send(404, "text/plain", b"There is no such page.")
+            return
+        self._answer(lambda: route(query))
 
     def do_POST(self) -> None:
         """Answers by a route; a request is refused by its headers, before its body is read."""
         path, query = self._route()
-        # A form of another site cannot send these types.
-        kind = (self.headers.get("Content-Type") or "").partition(";")[0]
-        given = self.headers.get("Content-Length") or ""
-        length = int(given) if given.isdecimal() and len(given) < 20 else -1
-        fault = (
-            ""
-            if kind in ("application/json", "application/octet-stream")
-            else "The page sends no such content."
-        )
+        length = self._body_length()
+        route = self._post_route(path, length)
+        if route is None:
+            self._drain(length)
+            return
+        body = self.rfile.read(length)
+        self._answer(lambda: route(query, body))
+
+    def _body_length(self) -> int:
+        """Bytes of the request's body; -1 without a valid Content-Length."""
+        digits = self.headers.get("Content-Length") or ""
+        if not digits.isdecimal() or len(digits) > _MAX_LENGTH_DIGITS:
+            return -1
+        return int(digits)
+
+    def _post_route(self, path: str, length: int) -> Post | None:
+        """Route of a POST request; None if the request was refused, which is answered."""
+        fault = ""
+        media_type = (self.headers.get("Content-Type") or "").partition(";")[0]
+        if media_type not in _BODY_TYPES:
+            fault = "The page sends no such content."
         if self._refused(fault):
-            self._drain(length)
-        elif not 0 <= length <= MOST_BYTES:
-            message = (
-                "The request has no length."
-                if length < 0
-                else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            )
-            self._error(413, message)
-            self._drain(length)
-        elif (routes := self._routes()) is None:
-            self._drain(length)
-        elif (route := routes.posts.get(path)) is None:
+            return None
+        if length < 0:
+            self._error(413, "The request has no length.")
+            return None
+        if length > MOST_BYTES:
+            self._error(413, f"At most {MOST_BYTES >> 20} MiB can be sent.")
+            return None
+        routes = self._routes()
+        if routes is None:
+            return None
+        route = routes.posts.get(path)
+        if route is None:
             self._error(404, "There is no such action.")
-            self._drain(length)
-        else:
-            body = self.rfile.read(length)
-            self._answer(lambda: route(query, body))
+        return route
 
     def _routes(self) -> Routes | None:
         """Routes of this browser; None if there is no room for it, which is answered."""
@@ -352,8 +395,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _browser(self) -> str:
         """The token in the browser's cookie; empty without one."""
         with contextlib.suppress(http.cookies.CookieError):
-            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self._cookie)
-            return found.value if found and _TOKEN.fullmatch(found.value) else ""
+            cookie = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self._cookie)
+            if cookie is not None and _TOKEN.fullmatch(cookie.value):
+                return cookie.value
         return ""
 
     def log_message(self, format: str, *args: Any) -> None:
@@ -367,38 +411,41 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             parts = urllib.parse.urlsplit(self.path)
         except ValueError:
             return "", {}
-        own = _OWN.search(parts.path)
-        path = own[0] if own else "/" if parts.path.endswith("/") else parts.path
+        path = parts.path
+        page_path = _PAGE_PATH.search(path)
+        if page_path is not None:
+            path = page_path[0]
+        elif path.endswith("/"):
+            path = "/"
         return path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, fault: str = "") -> bool:
         """Sends a refusal if the request is not allowed, or has another fault; returns True if it
         did.
         """
-        if fault := self.server.page.fault(self) or fault:
+        fault = self.server.page.fault(self) or fault
+        if fault:
             self._error(403, fault)
         return bool(fault)
 
     def _drain(self, length: int) -> None:
         """Ends the connection of a request that was answered without its body."""
         self.close_connection = True
-        self.connection.settimeout(_DRAIN_SECONDS)
+        self.connection.settimeout(_DRAIN_TIMEOUT_S)
         with contextlib.suppress(OSError):
-            self.rfile.read(min(max(0, length), _DRAINED))
+            self.rfile.read(min(max(0, length), _DRAINED_BYTES))
 
     def _file(self, name: str) -> None:
         """Sends a file of the page."""
-        files = (file for file in STATIC.rglob("*") if file.suffix in _TYPES)
-        file = next((file for file in files if file.relative_to(STATIC).as_posix() == name), None)
+        file = _static_file(name)
         if file is None:
             self._send(404, "text/plain", b"There is no such page.")
             return
-        new = {}
+        headers: dict[str, str] = {}
         if file.suffix == ".html" and not self._browser():
-            new = {
-                "Set-Cookie": f"{self._cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"
-            }
-        self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
+            token = secrets.token_hex(16)
+            headers["Set-Cookie"] = f"{self._cookie}={token}; HttpOnly; SameSite=Strict"
+        self._send(200, _TYPES[file.suffix], file.read_bytes(), headers)
 
     def _answer(self, work: Callable[[], Answer]) -> None:
         """Sends what `work` returns, or its error."""
@@ -441,17 +488,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(data)
 
 
-def _content(found: Answer) -> tuple[str, bytes, Mapping[str, str]]:
+def _static_file(name: str) -> pathlib.Path | None:
+    """File of the page by its path below `STATIC`; None if there is none."""
+    for file in STATIC.rglob("*"):
+        if file.suffix in _TYPES and file.relative_to(STATIC).as_posix() == name:
+            return file
+    return None
+
+
+def _content(answer: Answer) -> tuple[str, bytes, Mapping[str, str]]:
     """Media type, bytes and further headers of an answer."""
-    if isinstance(found, Message):
-        return "application/octet-stream", encode(found), {}
-    if isinstance(found, Download):
-        name = urllib.parse.quote(found.name)
-        return (
-            "application/octet-stream",
-            found.data,
-            {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"},
-        )
-    if isinstance(found, Picture):
-        return "image/png", found.png, {}
-    return "application/json", json.dumps(found, allow_nan=False).encode(), {}
+    if isinstance(answer, Message):
+        return "application/octet-stream", encode(answer), {}
+    if isinstance(answer, Download):
+        name = urllib.parse.quote(answer.name)
+        headers = {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
+        return "application/octet-stream", answer.data, headers
+    if isinstance(answer, Picture):
+        return "image/png", answer.png, {}
+    return "application/json", json.dumps(answer, allow_nan=False).encode(), {}

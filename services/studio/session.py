@@ -1,5 +1,5 @@
-"""The session of a browser: studio, policy, objects, motions, training window, background job,
-routes; and the page.
+"""The session of a browser: studio, policy, objects, motions, training window and routes; and the
+page.
 """
 
 import contextlib
@@ -9,9 +9,7 @@ import math
 import pathlib
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from congrasp.actors.attempts import PLAIN, Phases
@@ -21,9 +19,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.options import METRES
-from congrasp.services.ops.logs import log
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
-from congrasp.services.studio.grasping import SECONDS, Loaders, PolicyGrasping, Progress
+from congrasp.services.studio.grasping import Loaders, PolicyGrasping, Progress
+from congrasp.services.studio.jobs import Jobs
 from congrasp.services.studio.page import (
     DATA,
     DRAWN,
@@ -47,14 +45,18 @@ from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow
 
 _T = TypeVar("_T")
-LIGHTEST_G, HEAVIEST_G = 1, 5000
+LIGHTEST_G = 1
+HEAVIEST_G = 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
-_OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
+_UNCHANGED_WEIGHT = {"mass_g": 0.0, "material": ""}
 """Leaves the mass of the object unchanged."""
 _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
+_MAX_INDEX_DIGITS = 5
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
+_MIN_SEARCH_S = 0.1
+_MAX_SEARCH_S = 3600.0
 
 
 class Session:
@@ -75,18 +77,28 @@ class Session:
           importer: makes objects from uploaded meshes.
           window: state of a run, or None.
         """
-        self._hands, self._objects, self._window = hands, objects, window
+        self._hands = hands
+        self._objects = objects
+        self._window = window
         self._folder = tempfile.TemporaryDirectory(prefix="congrasp-view-")
         self._uploads = Uploads(pathlib.Path(self._folder.name), objects, importer)
         self._lock = threading.RLock()
-        self._jobs, self._motions, self._thumbnails = Jobs(), Motions(), Thumbnails()
+        self._jobs = Jobs()
+        self._motions = Motions()
+        self._thumbnails = Thumbnails()
         self._drawn: Download | None = None
-        self._weight, self._phases = dict(_OWN_WEIGHT), PLAIN
+        self._weight = dict(_UNCHANGED_WEIGHT)
+        self._phases = PLAIN
         self._hand = next(iter(hands))
-        self._object, self._shown = objects.names[0], 0
+        self._object = objects.names[0]
+        self._shown = 0
         self._take_hand(hands[self._hand](), objects.get(self._object))
         describe(self._studio)  # compiles the rules
-        gets: dict[str, Get] = {
+        self.routes = Routes(self._gets(), {"/api/do": self._do, "/api/upload": self._upload})
+
+    def _gets(self) -> dict[str, Get]:
+        """Handlers of GET requests, by path."""
+        return {
             "/api/state": lambda query: self.state(),
             "/api/job": lambda query: self._jobs.state(),
             "/api/hand": lambda query: self.hand(query.get("name", "")),
@@ -101,7 +113,6 @@ class Session:
                 query.get("time", ""), query.get("seconds", "")
             ),
         }
-        self.routes = Routes(gets, {"/api/do": self._do, "/api/upload": self._upload})
 
     def close(self) -> None:
         """Rejects further jobs, and removes uploaded meshes."""
@@ -112,6 +123,11 @@ class Session:
         """State of studio, policy, objects, motions and job for the page."""
         with self._lock:
             upload = self._uploads.of(self._object)
+            upload_view: dict[str, Any] | None = None
+            upload_notes: Sequence[str] = []
+            if upload is not None:
+                upload_view = upload.view()
+                upload_notes = upload.notes
             return {
                 "studio": describe(self._studio),
                 "history": self._history.view(),
@@ -120,8 +136,8 @@ class Session:
                 "objects": self._objects.names,
                 "chosen": self._object,
                 "shown": self._shown,
-                "upload": None if upload is None else upload.view(),
-                "notes": [] if upload is None else upload.notes,
+                "upload": upload_view,
+                "notes": upload_notes,
                 "policy": self._grasping.newest(),
                 "motions": self._motions.view(),
                 "training": self._window is not None,
@@ -135,23 +151,29 @@ class Session:
     def hand(self, name: str) -> Message:
         """The studio's hand, or another that a motion may name (see `hand_message`)."""
         with self._lock:
-            own = self._studio.hand
-        return hand_message(own if name == own.name else known_hand(name))
+            hand = self._studio.hand
+        if name != hand.name:
+            hand = known_hand(name)
+        return hand_message(hand)
 
     def mesh(self) -> Message:
         """The painted mesh of the object."""
         with self._lock:
-            canvas, name = self._studio.canvas, self._studio.obj.name
-        own = {} if canvas.colours is None else {"colours": canvas.colours}
-        return Message({"vertices": canvas.vertices, "faces": canvas.faces, **own}, {"name": name})
+            canvas = self._studio.canvas
+            name = self._studio.obj.name
+        arrays = {"vertices": canvas.vertices, "faces": canvas.faces}
+        if canvas.colours is not None:
+            arrays["colours"] = canvas.colours
+        return Message(arrays, {"name": name})
 
     def rest_picture(self, index: str) -> Picture:
         """The object in one of its resting poses, from 0."""
         with self._lock:
             obj = self._studio.obj
-        return self._thumbnails.picture(
-            obj, int(index) if index.isdecimal() and len(index) < 6 else -1
-        )
+        rest = -1  # none
+        if index.isdecimal() and len(index) <= _MAX_INDEX_DIGITS:
+            rest = int(index)
+        return self._thumbnails.picture(obj, rest)
 
     def motion(self, key: str) -> Message:
         """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for
@@ -190,13 +212,16 @@ class Session:
                 "No recordings were named.", "Start the studio with --recordings FOLDER."
             )
         try:
-            when, around = float(time), float(seconds)
+            recorded_at = float(time)
+            distance_s = float(seconds)
         except ValueError:
-            when = around = math.nan
-        if not (0.0 <= when < _LATEST and math.isfinite(around)):
+            recorded_at = math.nan
+            distance_s = math.nan
+        if not (0.0 <= recorded_at < _LATEST and math.isfinite(distance_s)):
             raise BadRequest("A search for episodes needs two finite numbers: time and seconds.")
-        reach, episodes = self._window.recordings.around(when, min(max(around, 0.1), 3600.0))
-        return {"seconds": reach, "episodes": episodes}
+        distance_s = min(max(distance_s, _MIN_SEARCH_S), _MAX_SEARCH_S)
+        searched_s, episodes = self._window.recordings.around(recorded_at, distance_s)
+        return {"seconds": searched_s, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
         """Runs one action of the user; returns the new state."""
@@ -206,19 +231,7 @@ class Session:
         except (ValueError, KeyError, RecursionError):
             raise CongraspError("The request is not a JSON object with an 'action'.") from None
         with self._lock:
-            actions: dict[str, Callable[..., Any]] = {
-                "hand": self._choose_hand,
-                "object": self._choose_object,
-                "unit": self._choose_unit,
-                "weigh": self._weigh,
-                "time": self._time,
-                "grasp": self._grasp,
-                "draw_motion": self._draw_motion,
-                "delete": lambda id: self._motions.delete(str(id)),
-                "undo": self._history.undo,
-                "redo": self._history.redo,
-                **{name: functools.partial(self._history.do, name) for name in ACTIONS},
-            }
+            actions = self._actions()
             if not isinstance(action, str) or action not in actions:
                 raise CongraspError(
                     f"There is no action '{str(action)[:40]}'.",
@@ -230,6 +243,24 @@ class Session:
                 raise CongraspError(f"'{action}' takes other values ({error}).") from None
         return self.state()
 
+    def _actions(self) -> dict[str, Callable[..., Any]]:
+        """Actions of the user by name; those of the studio can be undone."""
+        actions: dict[str, Callable[..., Any]] = {
+            "hand": self._choose_hand,
+            "object": self._choose_object,
+            "unit": self._choose_unit,
+            "weigh": self._weigh,
+            "time": self._time,
+            "grasp": self._grasp,
+            "draw_motion": self._draw_motion,
+            "delete": lambda id: self._motions.delete(str(id)),
+            "undo": self._history.undo,
+            "redo": self._history.redo,
+        }
+        for name in ACTIONS:
+            actions[name] = functools.partial(self._history.do, name)
+        return actions
+
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
         """Imports a mesh and then shows its object; waits for the user's choice if several units
         fit.
@@ -237,25 +268,23 @@ class Session:
         upload = self._uploads.take(query.get("name", ""), body)
         with self._lock:
             if upload.unit:
-                return self._import(
-                    upload.path.name, lambda: self._uploads.load(upload, upload.unit)
-                )
+                load = functools.partial(self._uploads.load, upload, upload.unit)
+                return self._import(upload.path.name, load)
             self._jobs.require_idle()
             self._uploads.pending = upload
             return self._jobs.state()
 
     def _choose_unit(self, unit: str) -> None:
         """Imports the uploaded mesh again in another unit."""
-        upload, replaces = (
-            self._uploads.of(self._object),
-            "" if self._uploads.pending else self._object,
-        )
+        upload = self._uploads.of(self._object)
         if upload is None or unit not in METRES:
             raise CongraspError(
                 f"The unit cannot be '{str(unit)[:20]}'.",
                 "Open a mesh, then choose m, cm, mm or in.",
             )
-        self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
+        replaces = "" if self._uploads.pending else self._object
+        load = functools.partial(self._uploads.load, upload, unit, replaces)
+        self._import(upload.path.name, load)
 
     def _weigh(self, mass_g: float = 0, material: str = "") -> None:
         """Sets the object's mass: `mass_g`, else by a material, else its original mass."""
@@ -264,23 +293,24 @@ class Session:
                 f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing."
             )
         obj = self._objects.get(self._object)
-        self._studio.obj = with_mass(obj, mass_g / 1000 if mass_g else None, material)
+        mass_kg = mass_g / 1000 if mass_g else None
+        self._studio.obj = with_mass(obj, mass_kg, material)
         self._weight = {"mass_g": mass_g, "material": material}
 
     def _time(self, **phases: float) -> None:
         """Sets approach (s), lift (m) or hold (s) of further grasps."""
         for name, value in phases.items():
-            most = getattr(LONGEST, name, None)
-            if most is None or not 0 <= float(value) <= most:
-                limits = ", ".join(
-                    f"{phase} 0 to {value:g}" for phase, value in LONGEST._asdict().items()
-                )
+            limit = getattr(LONGEST, name, None)
+            if limit is None or not 0 <= float(value) <= limit:
+                ranges = [
+                    f"{phase} 0 to {longest:g}" for phase, longest in LONGEST._asdict().items()
+                ]
                 raise CongraspError(
-                    f"The {name[:20]} cannot be {str(value)[:20]}.", f"Write (s, m, s): {limits}."
+                    f"The {name[:20]} cannot be {str(value)[:20]}.",
+                    f"Write (s, m, s): {', '.join(ranges)}.",
                 )
-        self._phases = self._phases._replace(
-            **{name: float(value) for name, value in phases.items()}
-        )
+        values = {name: float(value) for name, value in phases.items()}
+        self._phases = self._phases._replace(**values)
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
         """Begins an import by `load`, which returns the object's name, and then shows the
@@ -336,14 +366,17 @@ class Session:
     def _show(self, name: str) -> None:
         """Shows an object of the catalogue."""
         self._studio.take(self._objects.get(name))
-        self._weight = dict(_OWN_WEIGHT)
+        self._weight = dict(_UNCHANGED_WEIGHT)
         self._history = History(self._studio)
-        self._object, self._shown = name, self._shown + 1
+        self._object = name
+        self._shown += 1
 
     def _grasp(self) -> None:
         """Begins the requested grasp, whose motion is kept."""
-        request, obj = self._studio.request, self._studio.labelled
-        grasping, phases = self._grasping, self._phases
+        request = self._studio.request
+        obj = self._studio.labelled
+        grasping = self._grasping
+        phases = self._phases
 
         def work(progress: Progress) -> str:
             """Grasps; returns the motion's key."""
@@ -357,20 +390,16 @@ class Session:
         """Begins to render a motion as one of `DRAWN`, for `drawn`."""
         key = str(id)
         episode = self.motion(key)
+        text = f"drawing the {kind}"
 
         def work(progress: Progress) -> str:
             """Draws it."""
             self._drawn = drawing(
-                episode,
-                key,
-                kind,
-                camera,
-                frame,
-                lambda share: progress(f"drawing the {kind}", share),
+                episode, key, kind, camera, frame, lambda share: progress(text, share)
             )
             return _DRAWING
 
-        self._jobs.start(f"drawing the {kind}", work)
+        self._jobs.start(text, work)
 
 
 def json_object(body: bytes) -> dict[str, Any]:
@@ -409,77 +438,3 @@ def open_page(
         opened.append(Sessions(lambda: Session(shared, offered(objects), Importer(), window)))
         with contextlib.closing(opened[0]):
             yield server.url
-
-
-class Jobs:
-    """Runs one job at a time in a separate thread."""
-
-    def __init__(self) -> None:
-        """Begins without a job."""
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
-        self._lock = threading.RLock()
-        self._number = 0
-        self._since = 0.0
-        self._state: dict[str, Any] = _state(0, running=False)
-
-    def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
-        """Begins a job, which may return the key of its result; returns the job's state.
-
-        Raises:
-          CongraspError: another job is still running.
-        """
-        with self._lock:
-            self.require_idle()
-            self._number += 1
-            self._since = time.monotonic()
-            self._state = _state(self._number, text=text)
-            self._pool.submit(self._run, work)
-            return dict(self._state)
-
-    def require_idle(self) -> None:
-        """Raises a CongraspError while a job is running."""
-        with self._lock:
-            if self._state["running"]:
-                raise CongraspError(f"Please wait: {self.state()['text']}.")
-
-    def state(self) -> dict[str, Any]:
-        """The current job, or the last one: number, running, text, share, error, and the key of its
-        result (made).
-        """
-        with self._lock:
-            seconds = f"{time.monotonic() - self._since:.0f}"
-            return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
-
-    def close(self) -> None:
-        """Rejects further jobs, without waiting for a running one."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def _run(self, work: Callable[[Progress], str | None]) -> None:
-        """Runs a job to its end and stores its result or error."""
-        error, made = "", None
-        try:
-            made = work(self._progress)
-        except CongraspError as found:
-            error = str(found)
-        except Exception as found:  # the page shows any error of a job, and the studio continues
-            error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
-            log("error", error)
-        with self._lock:
-            self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
-
-    def _progress(self, text: str, share: float) -> None:
-        """Stores the progress of the job."""
-        with self._lock:
-            self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
-
-
-def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
-    """A job's state at its start."""
-    return {
-        "number": number,
-        "running": running,
-        "text": text,
-        "share": 0.0,
-        "error": "",
-        "made": None,
-    }

@@ -5,7 +5,7 @@ with undo and redo.
 import collections
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -45,8 +45,10 @@ from congrasp.services.studio.drawing import (
 Fields = Mapping[str, np.ndarray]
 """Goal arrays of a constraint by field, without batch axis."""
 Tool = Literal["arrow", "paint", "hand", "path", ""]
-_LEAST_PATH = 0.03  # m
+_SHORTEST_PATH_M = 0.03
 _MOST_EDITS = 100  # that can be undone
+_SLOT_STRIDE = 7919
+"""Prime step through the slots of a constraint set, so that successive suggestions differ."""
 
 
 def tool_of(constraint: Constraint) -> Tool:
@@ -55,8 +57,10 @@ def tool_of(constraint: Constraint) -> Tool:
         return "paint"
     if set(constraint.arrays) == set(Poses._fields):
         return "hand"
-    place = constraint.arrays.get("position")
-    return "" if place is None else "path" if place.shape[0] == "K" else "arrow"
+    position = constraint.arrays.get("position")
+    if position is None:
+        return ""
+    return "path" if position.shape[0] == "K" else "arrow"
 
 
 class Edit(NamedTuple):
@@ -83,21 +87,22 @@ class Studio:
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
         """Begins with an object, and a heading from above."""
+        self.hand = hand
         # Objects keep their size
-        self.hand, self.task = (
-            hand,
-            dataclasses.replace(task, object_scale=1.0),
-        )
+        self.task = dataclasses.replace(task, object_scale=1.0)
         self.take(obj)
 
     def take(self, obj: GraspObject) -> None:
         """Takes another object, and resets the request to a heading from above."""
-        self.obj, self.rest = obj, 0
+        self.obj = obj
+        self.rest = 0
         self.asked: frozenset[str] = frozenset()
         self.canvas = Canvas(obj)
-        self.fields: Mapping[str, Fields] = {
-            c.name: c.suggested(self.hand, self.task) for c in optional(self.task) if not tool_of(c)
-        }
+        fields: dict[str, Fields] = {}
+        for constraint in optional(self.task):
+            if not tool_of(constraint):
+                fields[constraint.name] = constraint.suggested(self.hand, self.task)
+        self.fields: Mapping[str, Fields] = fields
         self._sets: tuple[bytes, Message] | None = None
         self._suggested: collections.Counter[str] = collections.Counter()
         self.arrow = from_above(obj, self.rest)
@@ -109,7 +114,10 @@ class Studio:
 
     @edit.setter
     def edit(self, edit: Edit) -> None:
-        self.rest, self.asked, self.fields, self.canvas.paint = edit
+        self.rest = edit.rest
+        self.asked = edit.asked
+        self.fields = edit.fields
+        self.canvas.paint = edit.paint
 
     @property
     def arrow(self) -> Arrow:
@@ -145,9 +153,8 @@ class Studio:
     def choose(self, constraint: str, field: str, values: Any) -> None:
         """Sets the flags of a constraint without a drawing tool, and switches it on."""
         require_known([constraint], self.task)
-        if tool_of(get_constraint(constraint)) or field not in get_constraint(constraint).labels(
-            self.hand
-        ):
+        spec = get_constraint(constraint)
+        if tool_of(spec) or field not in spec.labels(self.hand):
             others = [c.name for c in optional(self.task) if not tool_of(c)]
             raise CongraspError(
                 f"There is nothing to choose for '{constraint}'.", f"Choose for: {others}."
@@ -155,10 +162,8 @@ class Studio:
         flags = self.fields[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):
             raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
-        self._set(
-            constraint,
-            {**self.fields[constraint], field: np.array([bool(value) for value in values])},
-        )
+        chosen = np.array([bool(value) for value in values])
+        self._set(constraint, {**self.fields[constraint], field: chosen})
         self._switch(constraint, True)
 
     def set_heading(self, surface: Any, direction: Any) -> None:
@@ -201,26 +206,30 @@ class Studio:
         A displacement that grows along the path makes it end at the wrist of the reference pose, or
         of the hand closed at the arrow. The orientation of the wrist is that of the end throughout.
         """
-        name, drawn = self._drawn_by("path"), stroke("path", points)
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=-1))])
-        if along[-1] < _LEAST_PATH:
+        name = self._drawn_by("path")
+        drawn = stroke("path", points)
+        segments = np.linalg.norm(np.diff(drawn, axis=0), axis=-1)
+        arc_length = np.concatenate([[0.0], np.cumsum(segments)])
+        if arc_length[-1] < _SHORTEST_PATH_M:
             raise CongraspError(
-                f"The path is {100 * along[-1]:.1f} cm long.",
-                f"Draw {100 * _LEAST_PATH:.0f} cm or more.",
+                f"The path is {100 * arc_length[-1]:.1f} cm long.",
+                f"Draw {100 * _SHORTEST_PATH_M:.0f} cm or more.",
             )
-        poses = [
-            self.fields[c.name]
-            for c in known(self.task)
-            if tool_of(c) == "hand" and c.name in self.fields
-        ]
-        end = poses[0] if poses else self._closed()
+        end = self._reference_pose()
         share = np.linspace(0.0, 1.0, self.task.trajectory_points)
-        even = np.stack([np.interp(share * along[-1], along, drawn[:, i]) for i in range(3)], -1)
+        at = share * arc_length[-1]
+        even = np.stack([np.interp(at, arc_length, drawn[:, axis]) for axis in range(3)], -1)
         position = even + share[:, None] * (end["position"] - even[-1])
-        self._set(
-            name, {"position": position, "quaternion": np.tile(end["quaternion"], (len(share), 1))}
-        )
+        quaternion = np.tile(end["quaternion"], (len(share), 1))
+        self._set(name, {"position": position, "quaternion": quaternion})
         self._switch(name, True)
+
+    def _reference_pose(self) -> Fields:
+        """The reference pose that has been set, else the hand closed at the arrow."""
+        for constraint in known(self.task):
+            if tool_of(constraint) == "hand" and constraint.name in self.fields:
+                return self.fields[constraint.name]
+        return self._closed()
 
     def suggest(self, constraint: str) -> None:
         """Requests the next heading, reference pose or wrist path that training would draw for this
@@ -244,33 +253,28 @@ class Studio:
         """Sets the goal arrays of `suggest`; those of a reference also for weaker constraints from
         references.
         """
-        sets, reference = self._constraint_sets().arrays, get_constraint(name).from_reference
-        same = [c.name for c in known(self.task) if c.from_reference == reference]
-        region = (
-            max((get_constraint(asked).region for asked in self.asked), default=0)
-            * self.canvas.avoid.any()
-        )
-        allowed = next(sets[f"{other}/allowed"] for other in same if f"{other}/allowed" in sets)[
-            region, self.rest
-        ]
-        slots = np.flatnonzero(allowed)
+        sets = self._constraint_sets().arrays
+        reference = get_constraint(name).from_reference
+        related = [c.name for c in known(self.task) if c.from_reference == reference]
+        region = 0
+        if self.canvas.avoid.any():
+            region = max((get_constraint(asked).region for asked in self.asked), default=0)
+        allowed = [sets[f"{c}/allowed"] for c in related if f"{c}/allowed" in sets]
+        slots = np.flatnonzero(allowed[0][region, self.rest])
         if not len(slots):
             raise CongraspError(
                 f"The table leaves no room for a {name} in this resting pose.",
                 "Take another resting pose, or paint less.",
             )
-        slot = slots[(self._suggested[name] * 7919) % len(slots)]
+        slot = slots[(self._suggested[name] * _SLOT_STRIDE) % len(slots)]
         self._suggested[name] += 1
-        for other in same[: same.index(name) + 1]:
-            fields = {
-                field: sets[f"{other}/{field}"][region, slot]
-                for field in get_constraint(other).arrays
-            }
+        for other in related[: related.index(name) + 1]:
+            fields = {}
+            for field in get_constraint(other).arrays:
+                fields[field] = sets[f"{other}/{field}"][region, slot]
             if f"{other}/back" in sets:
-                fields["position"] = (
-                    fields["position"]
-                    - sets[f"{other}/back"][region, self.rest, slot] * fields["direction"]
-                )
+                back_off = sets[f"{other}/back"][region, self.rest, slot]
+                fields["position"] = fields["position"] - back_off * fields["direction"]
             self._set(other, fields)
 
     @property
@@ -291,11 +295,15 @@ class Studio:
 
     def _request(self) -> GraspRequest:
         """The request, possible or not."""
-        active = [c for c in known(self.task) if not c.optional or c.name in self.asked]
-        avoid = self.canvas.avoid if any(tool_of(c) == "paint" for c in active) else None
-        return GraspRequest(
-            {c.name: self.fields.get(c.name, {}) for c in active}, avoid, rest=self.rest
-        )
+        fields: dict[str, Fields] = {}
+        avoid = None
+        for constraint in known(self.task):
+            if constraint.optional and constraint.name not in self.asked:
+                continue
+            fields[constraint.name] = self.fields.get(constraint.name, {})
+            if tool_of(constraint) == "paint":
+                avoid = self.canvas.avoid
+        return GraspRequest(fields, avoid, rest=self.rest)
 
     @property
     def goal(self) -> Goal:
@@ -306,10 +314,11 @@ class Studio:
     def resolution(self) -> Resolution:
         """The request after the priority rules, without batch axes."""
         asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
-        goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
-        found = _resolve(self.hand, self._surface, goal, asked)
+        batch = _resolve(self.hand, self._surface, self._goal_batch(), asked)
         return Resolution(
-            found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0]
+            goal=batch.goal.row(0),
+            redirected=np.asarray(batch.redirected)[0],
+            aligned=np.asarray(batch.aligned)[0],
         )
 
     @property
@@ -320,33 +329,52 @@ class Studio:
     @property
     def trouble(self) -> str:
         """Reason why the request is impossible, with a remedy; empty if it is possible."""
-        goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
-        asked = [c for c in optional(self.task) if c.name in self.asked]
-        for constraint in asked:
-            if tool_of(constraint) == "paint" and (
-                self.canvas.avoid.all() or not self.canvas.avoid.any()
-            ):
-                what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
-                return f"{what} painted as avoid region. Paint a part of the object with the brush."
-            if not constraint.valid(self._surface, goal[constraint.name])[0]:
-                return " ".join(constraint.invalid)
-        found = self.resolution
-        if not found.aligned:
+        requested = [c for c in optional(self.task) if c.name in self.asked]
+        trouble = self._constraint_trouble(requested)
+        if trouble:
+            return trouble
+        resolution = self.resolution
+        if not resolution.aligned:
             return (
                 "The wrist path ends nearer to the avoid region. Draw another path, or paint "
                 "elsewhere."
             )
-        paths = [found.goal[c.name].position for c in asked if tool_of(c) == "path"]
-        if any(self._world(point)[2] < 0 for path in paths for point in path):
-            return (
-                "The wrist path goes through the table. Draw it higher, or take another suggestion."
-            )
-        heading = found.goal["heading"]
-        if not paths and self._world(heading.position - BACK_OFF * heading.direction)[2] < 0:
+        return self._table_trouble(requested, resolution.goal)
+
+    def _constraint_trouble(self, requested: Sequence[Constraint]) -> str:
+        """Reason why one of the requested constraints is invalid; empty without one."""
+        goal = self._goal_batch()
+        avoid = self.canvas.avoid
+        for constraint in requested:
+            if tool_of(constraint) == "paint" and (avoid.all() or not avoid.any()):
+                painted = "Everything is" if avoid.any() else "Nothing is"
+                return (
+                    f"{painted} painted as avoid region. Paint a part of the object with the brush."
+                )
+            if not constraint.valid(self._surface, goal[constraint.name])[0]:
+                return " ".join(constraint.invalid)
+        return ""
+
+    def _table_trouble(self, requested: Sequence[Constraint], goal: Goal) -> str:
+        """Reason why the table is in the way of the wrist path or of the approach; else empty."""
+        paths = [goal[c.name].position for c in requested if tool_of(c) == "path"]
+        for path in paths:
+            if any(self._world(point)[2] < 0 for point in path):
+                return (
+                    "The wrist path goes through the table. Draw it higher, or take another "
+                    "suggestion."
+                )
+        heading = goal["heading"]
+        approach_start = heading.position - BACK_OFF * heading.direction
+        if not paths and self._world(approach_start)[2] < 0:
             return (
                 "The approach begins under the table. Turn the arrow so that it comes from above."
             )
         return ""
+
+    def _goal_batch(self) -> Goal:
+        """Goal arrays before the priority rules, with a batch axis."""
+        return jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
 
     @property
     def up(self) -> np.ndarray:
@@ -390,7 +418,8 @@ class Studio:
         """The constraint set of the object with its current paint, generated on demand."""
         key = self.canvas.avoid.tobytes()
         if self._sets is None or self._sets[0] != key:
-            self._sets = key, make_sets(self.hand, self.task, [self.labelled], seed=0)[0]
+            (sets,) = make_sets(self.hand, self.task, [self.labelled], seed=0)
+            self._sets = (key, sets)
         return self._sets[1]
 
     def _world(self, point: np.ndarray) -> np.ndarray:
@@ -420,6 +449,14 @@ ACTIONS = {
 """Methods of `Studio` that a page may call, with their arguments by name, and their labels on the
 page.
 """
+
+
+def _last_label(edits: Sequence[tuple[str, Edit]]) -> str:
+    """Label of the last edit; empty if there is none."""
+    if not edits:
+        return ""
+    action, _ = edits[-1]
+    return ACTIONS[action]
 
 
 class History:
@@ -460,8 +497,7 @@ class History:
 
     def view(self) -> dict[str, str]:
         """Labels of the next undo and redo; empty if there is none."""
-        found = {"undo": self._done, "redo": self._undone}
-        return {name: ACTIONS[edits[-1][0]] if edits else "" for name, edits in found.items()}
+        return {"undo": _last_label(self._done), "redo": _last_label(self._undone)}
 
     def _swap(self, source: list[tuple[str, Edit]], target: list[tuple[str, Edit]]) -> None:
         """Restores the last edit of `source`, and keeps the current one in `target`."""

@@ -1,5 +1,4 @@
-"""State of a run while it trains, and its recorded episodes: curves, events, counters, and newest
-episodes of actors.
+"""State of a run while it trains: curves, events, counters, and newest episodes of actors.
 
 It accepts log messages and the learner's status from any receiver, and is independent of network
 and browser.
@@ -7,7 +6,6 @@ and browser.
 
 import bisect
 import collections
-import contextlib
 import dataclasses
 import pathlib
 import threading
@@ -18,7 +16,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.errors import CongraspError
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
@@ -26,32 +24,29 @@ from congrasp.common.wire.codec import Message, decode
 from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops import status as statuses
 from congrasp.services.ops.logs import log
-from congrasp.services.record.chunks import DamagedChunkError
 from congrasp.services.record.reader import (
     Record,
-    intact_summary,
     is_episode,
     log_files,
-    messages_between,
     metrics_of,
     read_records,
 )
-from congrasp.services.record.scene import EPISODE_SCHEMA
 from congrasp.services.record.writer import flatten
+from congrasp.services.studio.recordings import Recordings
 from congrasp.services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows by default."""
-MOST = 60
-"""Maximum number of episodes of one search: those nearest to the time."""
-FARTHER = (1.0, 5.0, 25.0)
-"""Factors on the time searched, tried in turn until there is an episode."""
 _LAST = {"success": "episode/success", "steps_per_second": "steps_per_second"}
 _REPORTED = ("version", "rollouts", "steps_per_second")
 _READ = ("/metrics/", "/events/")
 _EVENTS = 100
-_TREND = 200  # episodes of an actor that its success covers
-_STALE = 15.0  # seconds after which an actor that the learner no longer lists is removed
+_TREND_EPISODES = 200
+"""Episodes of an actor that its success covers."""
+_STALE_S = 15.0
+"""Time after which an actor that the learner no longer lists is removed."""
+_POINTS_PER_SECTION = 3
+"""Points of a thinned curve in each section: the lowest, the highest and the sharpest one."""
 
 
 @dataclasses.dataclass
@@ -81,16 +76,17 @@ class Curve:
         index = np.arange(len(self.steps))
         if len(index) > most:
             values = np.array(self.values)
-            sudden = np.abs(np.diff(np.pad(values, 1, "edge"), 2))
-            parts = np.array_split(index, most // 3)
-            index = np.unique(
-                [
-                    [p[values[p].argmin()], p[values[p].argmax()], p[sudden[p].argmax()]]
-                    for p in parts
-                ]
-            )
+            sharpness = np.abs(np.diff(np.pad(values, 1, "edge"), 2))
+            picked: list[int] = []
+            for section in np.array_split(index, most // _POINTS_PER_SECTION):
+                picked.append(section[values[section].argmin()])
+                picked.append(section[values[section].argmax()])
+                picked.append(section[sharpness[section].argmax()])
+            index = np.unique(picked)
         return {
-            name: [getattr(self, name)[i] for i in index] for name in ("steps", "values", "times")
+            "steps": [self.steps[i] for i in index],
+            "values": [self.values[i] for i in index],
+            "times": [self.times[i] for i in index],
         }
 
 
@@ -103,7 +99,7 @@ class Actor:
     """Its newest episode."""
     episodes: int = 0
     recent: collections.deque[bool] = dataclasses.field(
-        default_factory=lambda: collections.deque(maxlen=_TREND)
+        default_factory=lambda: collections.deque(maxlen=_TREND_EPISODES)
     )
     """Success of its last episodes."""
     last: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -119,15 +115,19 @@ class TrainingWindow:
       recordings: recorded episodes of the run, or None.
     """
 
-    def __init__(self, run: str, recordings: "Recordings | None" = None):
+    def __init__(self, run: str, recordings: Recordings | None = None):
         """Begins without messages."""
-        self.run, self.recordings, self.live, self.damaged = run, recordings, False, 0
+        self.run = run
+        self.recordings = recordings
+        self.live = False
+        self.damaged = 0
         self._lock = threading.Lock()
         self._curves: dict[str, Curve] = {}
         self._actors: dict[str, Actor] = {}
         self._events: collections.deque[dict[str, Any]] = collections.deque(maxlen=_EVENTS)
         self._status: Mapping[str, Any] | None = None
-        self._disconnected, self._loading = True, False
+        self._disconnected = True
+        self._loading = False
         self._labels: dict[str, dict[str, str]] = {}
 
     def take(self, key: str, message: Message, now: float) -> None:
@@ -138,25 +138,26 @@ class TrainingWindow:
                 if kind == "metrics":
                     self._metrics(role, name, message.meta, now)
                 elif kind == "event":
-                    text, level = str(message.meta["text"]), str(message.meta["level"])
+                    text = str(message.meta["text"])
+                    level = str(message.meta["level"])
                     self._event(float(message.meta.get("time", now)), level, text)
                 elif kind == "episode":
                     self._episode(name, message, now)
         except (AttributeError, KeyError, TypeError, ValueError):
             self.damaged += 1
 
-    def take_status(self, found: Mapping[str, Any] | None, now: float) -> None:
+    def take_status(self, status: Mapping[str, Any] | None, now: float) -> None:
         """Accepts the learner's status; None while there is no response."""
         with self._lock:
-            self._disconnected = found is None
-            if found is None:
+            self._disconnected = status is None
+            if status is None:
                 return
-            self._status = found
-            listed = {role["id"] for role in found["roles"] if role["role"] == "actor"}
+            self._status = status
+            listed = {role["id"] for role in status["roles"] if role["role"] == "actor"}
             for name in listed:
                 self._actors.setdefault(name, Actor(now)).seen = now
-            for name in [name for name, actor in self._actors.items() if name not in listed]:
-                if now - self._actors[name].seen > _STALE:
+            for name in self._actors.keys() - listed:
+                if now - self._actors[name].seen > _STALE_S:
                     del self._actors[name]
 
     def load(self) -> None:
@@ -179,29 +180,32 @@ class TrainingWindow:
         """Does the work of `load`."""
         newest: dict[str, Record] = {}
         for file in log_files(path):
-            for record in read_records(
-                file, lambda topic: topic.startswith(_READ) or is_episode(topic)
-            ):
+            for record in read_records(file, _is_read):
                 _, kind, role, name = record.topic.split("/", 3)
-                if kind == "events":
-                    event = Log.FromString(record.data)
-                    with self._lock:
-                        self._event(
-                            record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
-                        )
-                    continue
                 if kind == "episode":
                     newest[role] = record
-                    continue
-                meta = metrics_of(record)
-                with self._lock:
-                    self._metrics(
-                        role, name, {**meta, "values": flatten(meta["values"])}, record.time / 1e9
-                    )
+                elif kind == "events":
+                    self._take_event(record)
+                else:
+                    self._take_metrics(record, role, name)
         for name, record in newest.items():
             with self._lock:
                 if name not in self._actors or self._actors[name].episode is None:
                     self._episode(name, decode(record.data), time.time())
+
+    def _take_event(self, record: Record) -> None:
+        """Stores a recorded line of the log."""
+        event = Log.FromString(record.data)
+        with self._lock:
+            level = Log.Level.Name(event.level).lower()
+            self._event(record.time / 1e9, level, event.message)
+
+    def _take_metrics(self, record: Record, role: str, name: str) -> None:
+        """Adds the recorded numbers of a learner's update or of an actor's rollout."""
+        meta = metrics_of(record)
+        with self._lock:
+            flat = {**meta, "values": flatten(meta["values"])}
+            self._metrics(role, name, flat, record.time / 1e9)
 
     def episode(self, actor: str) -> Message:
         """The newest episode of an actor.
@@ -210,45 +214,69 @@ class TrainingWindow:
           CongraspError: none has been received.
         """
         with self._lock:
-            known = self._actors.get(actor)
-            if known is None or known.episode is None:
+            state = self._actors.get(actor)
+            if state is None or state.episode is None:
                 raise CongraspError(
                     f"There is no episode of the actor '{actor}' yet.",
                     "Wait: actors send one from time to time.",
                 )
-            return known.episode
+            return state.episode
 
     def view(self, names: Sequence[str] = (), points: int = 300) -> dict[str, Any]:
         """The state of the run for a page, as JSON, with the named curves."""
         with self._lock:
-            found, roles = self._status, {}
-            if found is not None:
-                roles = {role["id"]: role for role in found["roles"] if role["role"] == "actor"}
             phase = self._phase()
-            first = (
-                FIRST if phase in ("training", "disconnected") else (*FIRST, *self._labels_of_all())
-            )
-            wanted = [name for name in names or dict.fromkeys(first) if name in self._curves]
+            status = self._status or {}
             return {
                 "run": self.run,
                 "phase": phase,
                 "loading": self._loading,
                 "last": self._last(),
-                "version": None if found is None else found["version"],
-                "rates": {} if found is None else found["rates"],
-                "queue": None if found is None else found["queue"],
-                "counters": {} if found is None else found["counters"],
-                "warnings": [] if found is None else found["warnings"],
-                "curves": {name: self._curves[name].thinned(points) for name in wanted},
+                "version": status.get("version"),
+                "rates": status.get("rates", {}),
+                "queue": status.get("queue"),
+                "counters": status.get("counters", {}),
+                "warnings": status.get("warnings", []),
+                "curves": self._thinned_curves(names or self._default_names(phase), points),
                 "names": self._labels_of_all(),
-                "constraints": {
-                    constraint.name: self._curves[f"success/{constraint.name}"].values[-1]
-                    for constraint in CONSTRAINTS
-                    if f"success/{constraint.name}" in self._curves
-                },
-                "actors": [self._row(name, roles.get(name)) for name in sorted(self._actors)],
+                "constraints": self._success_by_constraint(),
+                "actors": self._rows(),
                 "events": list(self._events)[-20:][::-1],
             }
+
+    def _default_names(self, phase: str) -> list[str]:
+        """Curves that the page shows first: all of a run that has ended."""
+        if phase in ("training", "disconnected"):
+            return list(FIRST)
+        return list(dict.fromkeys((*FIRST, *self._labels_of_all())))
+
+    def _thinned_curves(
+        self, names: Iterable[str], points: int
+    ) -> dict[str, dict[str, list[float]]]:
+        """The curves of these names that exist, with at most `points` each."""
+        curves: dict[str, dict[str, list[float]]] = {}
+        for name in names:
+            if name in self._curves:
+                curves[name] = self._curves[name].thinned(points)
+        return curves
+
+    def _success_by_constraint(self) -> dict[str, float]:
+        """Newest success under each constraint that has a curve."""
+        success: dict[str, float] = {}
+        for constraint in CONSTRAINTS:
+            curve = self._curves.get(f"success/{constraint.name}")
+            if curve is not None:
+                success[constraint.name] = curve.values[-1]
+        return success
+
+    def _rows(self) -> list[dict[str, Any]]:
+        """List entries of the actors."""
+        roles: dict[str, Mapping[str, Any]] = {}
+        if self._status is not None:
+            for role in self._status["roles"]:
+                if role["role"] == "actor":
+                    roles[role["id"]] = role
+        return [self._row(name, roles.get(name)) for name in sorted(self._actors)]
 
     def _phase(self) -> str:
         """Phase of the run: training, finished, disconnected, or recorded (read from its recordings
@@ -264,13 +292,14 @@ class TrainingWindow:
         """Update and time (seconds since 1970) of the newest point, and the newest success and
         throughput.
         """
-        found = {
-            name: self._curves[curve].values[-1]
-            for name, curve in _LAST.items()
-            if curve in self._curves
-        }
-        ends = [(curve.steps[-1], curve.times[-1]) for curve in self._curves.values()]
-        return found | (dict(zip(("update", "time"), max(ends), strict=True)) if ends else {})
+        last: dict[str, float] = {}
+        for name, metric in _LAST.items():
+            if metric in self._curves:
+                last[name] = self._curves[metric].values[-1]
+        if self._curves:
+            ends = [(curve.steps[-1], curve.times[-1]) for curve in self._curves.values()]
+            last["update"], last["time"] = max(ends)
+        return last
 
     def _labels_of_all(self) -> dict[str, dict[str, str]]:
         """Title, unit and group of each curve, in the order of the figures."""
@@ -304,7 +333,9 @@ class TrainingWindow:
         if "link_position" not in message.arrays or "success" not in message.meta:
             raise ValueError("not an episode")
         actor = self._actors.setdefault(name, Actor(now))
-        actor.seen, actor.episode, actor.episodes = now, message, actor.episodes + 1
+        actor.seen = now
+        actor.episode = message
+        actor.episodes += 1
         actor.recent.append(bool(message.meta["success"]))
 
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -323,22 +354,25 @@ class TrainingWindow:
 
 def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     """Title, unit and group of each metric, in the order of the figures of `congrasp plot`."""
-    any_values = np.arange(2.0), np.arange(2.0)
-    found = {}
-    for group, panels in figures(
-        {"": {f"learner/0/{name}": any_values for name in metrics}}
-    ).values():
+    any_values = (np.arange(2.0), np.arange(2.0))
+    run = {f"learner/0/{name}": any_values for name in metrics}
+    labels: dict[str, dict[str, str]] = {}
+    for group, panels in figures({"": run}).values():
         for panel in panels:
             for name in panel.metrics:
-                title = (
-                    panel.title
-                    if len(panel.metrics) == 1
-                    else f"{panel.title}: {name.rpartition('_')[2]}"
-                )
-                found[name] = {"title": title, "unit": panel.unit, "group": group}
-    return found | {
-        n: {"title": n, "unit": "", "group": "Details"} for n in sorted(metrics) if n not in found
-    }
+                title = panel.title
+                if len(panel.metrics) > 1:
+                    title = f"{panel.title}: {name.rpartition('_')[2]}"
+                labels[name] = {"title": title, "unit": panel.unit, "group": group}
+    for name in sorted(metrics):
+        if name not in labels:
+            labels[name] = {"title": name, "unit": "", "group": "Details"}
+    return labels
+
+
+def _is_read(topic: str) -> bool:
+    """True for topics that `TrainingWindow.load` reads."""
+    return topic.startswith(_READ) or is_episode(topic)
 
 
 def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
@@ -352,8 +386,11 @@ def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
     Raises:
       CongraspError: there is no folder or recording of this name.
     """
-    parts = [part for part in recordings.resolve().parts if part != LOGS] if recordings else [""]
-    window = TrainingWindow(run or parts[-1], Recordings(recordings) if recordings else None)
+    if recordings is None:
+        window = TrainingWindow(run)
+    else:
+        parts = [part for part in recordings.resolve().parts if part != LOGS]
+        window = TrainingWindow(run or parts[-1], Recordings(recordings))
     threading.Thread(target=window.load, daemon=True, name="curves").start()
     return window
 
@@ -363,7 +400,9 @@ class Follower:
 
     def __init__(self, transport: Transport, window: TrainingWindow, every: float = 1.0):
         """Subscribes and starts the threads; the caller still owns the transport."""
-        self._transport, self._window, self._every = transport, window, every
+        self._transport = transport
+        self._window = window
+        self._every = every
         window.live = True
         self._stop = threading.Event()
         self._subscription = transport.subscribe(Keys(window.run).logs, depth=1024)
@@ -391,123 +430,9 @@ class Follower:
         """Queries the learner's status periodically."""
         while True:
             try:
-                found = statuses.ask(self._transport, self._window.run)
+                status = statuses.ask(self._transport, self._window.run)
             except CongraspError:
-                found = None
-            self._window.take_status(found, time.time())
+                status = None
+            self._window.take_status(status, time.time())
             if self._stop.wait(self._every):
                 return
-
-
-class Recordings:
-    """The episodes in a folder of recordings, found by their time.
-
-    Episodes of the last search stay in memory, for the player.
-    """
-
-    def __init__(self, path: pathlib.Path):
-        """Reads nothing until the first search, because files may appear and grow.
-
-        Raises:
-          CongraspError: there is no folder or recording of this name.
-        """
-        remedy = "Name a run's folder, or its recordings."
-        if not path.exists():
-            raise CongraspError(f"There is no file or folder {path}.", remedy)
-        if not path.is_dir() and ".mcap" not in path.suffixes:
-            raise CongraspError(f"{path} is no recording (*.mcap).", remedy)
-        self.path = path
-        self._lock = threading.Lock()
-        self._found: dict[str, Message] = {}
-
-    def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
-        """Episodes that were recorded around a time, in the order of their times.
-
-        Args:
-          time: seconds since 1970.
-          seconds: largest distance from it; the search widens by `FARTHER` while it finds none.
-
-        Returns:
-          The distance searched (s), and the list entry of each episode; its `id` is for `episode`.
-
-        Raises:
-          CongraspError: there are no recordings, or a file cannot be read.
-        """
-        files = log_files(self.path)
-        for farther in FARTHER:
-            begin, end = (int(1e9 * (time + sign * farther * seconds)) for sign in (-1, 1))
-            found = [item for file in files for item in _within(file, begin, end)]
-            if found:
-                break
-        found = sorted(found, key=lambda item: abs(item[0] - 1e9 * time))[:MOST]
-        kept = {
-            f"{when}{topic}": decode(data)
-            for when, topic, data in sorted(found, key=lambda item: item[0])
-        }
-        with self._lock:
-            self._found = kept
-        return farther * seconds, [_recorded(key, message) for key, message in kept.items()]
-
-    def episode(self, key: str) -> Message:
-        """An episode of the last search.
-
-        Raises:
-          CongraspError: the last search did not find it.
-        """
-        with self._lock:
-            if key not in self._found:
-                raise CongraspError(
-                    "This episode is not among those found last.", "Click the curve again."
-                )
-            return self._found[key]
-
-
-def _recorded(key: str, message: Message) -> dict[str, Any]:
-    """List entry of an episode."""
-    time, _, topic = key.partition("/")
-    return {
-        "id": key,
-        "time": int(time) / 1e9,
-        "actor": topic.split("/")[1],
-        "object": message.meta.get("object"),
-        "version": message.meta.get("version"),
-        "success": bool(message.meta.get("success")),
-    }
-
-
-def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]]:
-    """Time (ns), topic and bytes of a file's raw episodes between two times."""
-    if (found := _by_index(file, begin, end)) is not None:
-        return found
-    return [
-        (record.time, record.topic, record.data)
-        for record in read_records(file, is_episode)
-        if record.schema == EPISODE_SCHEMA and begin <= record.time <= end
-    ]
-
-
-def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
-    """Does the work of `_within` by the index of a finished file; None if it is unfinished, or
-    damaged where read.
-    """
-    with (
-        os_errors_as(f"{file} cannot be read"),
-        contextlib.suppress(DamagedChunkError),
-        file.open("rb") as stream,
-    ):
-        if (summary := intact_summary(stream)) is None or (
-            statistics := summary.statistics
-        ) is None:
-            return None
-        if statistics.message_start_time > end or statistics.message_end_time < begin:
-            return []
-        topics = [
-            channel.topic for channel in summary.channels.values() if is_episode(channel.topic)
-        ]
-        messages = messages_between(stream, summary, topics, begin, end)
-        return [
-            (message.log_time, channel.topic, message.data)
-            for schema, channel, message in messages
-            if schema is not None and schema.name == EPISODE_SCHEMA
-        ]
-    return None

@@ -21,9 +21,16 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import measure
+from congrasp.services.serve.load import Load, Target, measure
 from congrasp.services.serve.requests import Query
-from congrasp.services.serve.server import DEPTH, SHARE, PolicyServer, follow_file, follow_run
+from congrasp.services.serve.server import (
+    DEPTH,
+    SHARE,
+    Answer,
+    PolicyServer,
+    follow_file,
+    follow_run,
+)
 from congrasp.services.train.command import untrained
 from tests import task
 from tests.services.ops.test_metrics import scrape
@@ -130,7 +137,8 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
 
 def test_a_latency_test_sends_no_more_than_its_rate(served):
     _, endpoint, episode = served
-    result = measure(endpoint, "policy", episode, repeat=6, concurrency=2, timeout=5.0, rate=10.0)
+    target = Target(endpoint, "policy", timeout=5.0)
+    result = measure(target, episode, Load(repeat=6, concurrency=2, rate=10.0))
     assert result["failed"] == result["overloaded"] == 0
     assert result["answers_per_s"] <= 6 / 0.25  # the last is sent after two and a half periods
 
@@ -167,16 +175,20 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
 
 def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
     old, new = object(), object()
-    part = lambda held, value: (Inference(np.full((2, 3), value), [["x"]] * 2), held, 0.25, 0.5)  # noqa: E731
-    whole = (Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
-    server = types.SimpleNamespace(_infer=lambda queries, queued: [whole])
+
+    def part(policy: object, value: float) -> Answer:
+        return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
+
+    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
+    server = types.SimpleNamespace(_infer=lambda queries, queued: [repeated])
     query = Query(np.zeros((4, 5), np.float32), ())
-    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is whole
-    inference, held, queued, inferred = PolicyServer._join(
-        server, query, [part(new, 1.0), part(new, 2.0)]
-    )
-    np.testing.assert_array_equal(inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
-    assert (inference.active, held, queued, inferred) == ([["x"]] * 4, new, 0.25, 1.0)
+    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is repeated
+    joined = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+    np.testing.assert_array_equal(joined.inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
+    assert joined.inference.active == [["x"]] * 4
+    assert joined.policy is new
+    assert joined.queue_s == 0.25
+    assert joined.infer_s == 1.0
 
 
 def test_bad_lists_of_states_are_refused(served):

@@ -14,9 +14,10 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
+from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import Recordings, TrainingWindow
+from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
 from tests.browser import drag, on_object, orange, picture
 from tests.studio import BEGIN, DIP

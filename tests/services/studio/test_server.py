@@ -26,9 +26,10 @@ from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
 from congrasp.services.studio.catalogue import Uploads
+from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import Recordings, TrainingWindow
+from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
 
 

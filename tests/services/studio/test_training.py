@@ -15,12 +15,12 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.recorder import Recorder
-from congrasp.services.studio import training as training_module
+from congrasp.services.studio import recordings as recordings_module
+from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.training import (
     FIRST,
     Curve,
     Follower,
-    Recordings,
     TrainingWindow,
     labels_of,
     opened_window,
@@ -206,7 +206,7 @@ def test_only_the_damaged_part_of_a_finished_file_is_lost(
 def test_of_many_episodes_the_nearest_are_taken(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training_module, "MOST", 3)
+    monkeypatch.setattr(recordings_module, "MOST", 3)
     fake.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
     _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
     assert [row["actor"] for row in rows] == ["a000", "a001", "a002"]
