@@ -311,8 +311,8 @@ def compound(rng: Rng) -> Draft:
         else:
             center = direction / np.linalg.norm(direction) * rng.uniform(0.03, 0.045)
         part = 0 if is_first else 1
-        pos = tuple(center.tolist())
-        pieces.append(Piece(kind, size, pos, tuple(quat), part=part))
+        x, y, z = center.tolist()
+        pieces.append(Piece(kind, size, (x, y, z), tuple(quat), part=part))
     return Draft(tuple(pieces), ("core", "growths"), draft.either(rng))
 
 

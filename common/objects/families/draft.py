@@ -326,9 +326,9 @@ def slab(
     return _prism(outline, center[2] - z, center[2] + z, 1.0, part)
 
 
-def moved(piece: Piece, shift: Sequence[float]) -> Piece:
+def moved(piece: Piece, shift: Sequence[float] | np.ndarray) -> Piece:
     """Returns the piece translated by (3,) metres."""
-    x, y, z = np.add(piece.pos, shift)
+    x, y, z = np.add(piece.pos, shift).tolist()
     return dataclasses.replace(piece, pos=(x, y, z))
 
 
