@@ -66,8 +66,7 @@ def _field(name: str, array: Any) -> Any:
     if "quaternion" in last or last.endswith("_quat"):
         return quaternion(array)
     kind = last.removesuffix("_initial").rpartition("_")[2]
-    return (
-        vector(array)
-        if kind in _VECTORS and last != "q_velocity" and np.shape(array)[-1:] == (3,)
-        else array
-    )
+    is_vector = kind in _VECTORS and last != "q_velocity"
+    if is_vector and np.shape(array)[-1:] == (3,):
+        return vector(array)
+    return array

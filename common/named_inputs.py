@@ -122,7 +122,8 @@ def content_digest(kind: str, path: pathlib.Path) -> str:
         return hashlib.sha256(hand_text(get_hand("mano")).encode()).hexdigest()[:_DIGITS]
     content = hashlib.sha256()
     for file in _files(kind, path):
-        content.update(f"{file.name}\n".encode() if file != path else b"")
+        if file != path:
+            content.update(f"{file.name}\n".encode())
         content.update(_sha256(file))
     return content.hexdigest()[:_DIGITS]
 

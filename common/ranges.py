@@ -18,9 +18,11 @@ below it.
 """
 MAX_NUMBER = 1e6
 """Largest absolute value of any field."""
-MAX_INPUTS, MAX_ACTIONS = 16_384, 256
-"""Largest sizes of a policy's observation and action."""
-_TASK: dict[str, tuple[float, float]] = {
+MAX_INPUTS = 16_384
+"""Largest size of a policy's observation."""
+MAX_ACTIONS = 256
+"""Largest size of a policy's action."""
+_TASK_LIMITS: dict[str, tuple[float, float]] = {
     "object_scale": (0.0, 100.0),
     "control_dt": (1e-4, 1.0),
     "substeps": (1, 100),
@@ -32,7 +34,7 @@ _TASK: dict[str, tuple[float, float]] = {
     "trajectory_points": (2, 1000),
     "history": (2, 64),
 }
-_SENSING = {
+_SENSING_LIMITS = {
     "period": 10.0,
     "delay": 1.0,
     "position_noise": 1.0,
@@ -42,7 +44,10 @@ _SENSING = {
     "camera_elevation": 1.5,
 }
 """Upper bounds of the ranges of a task's tracker or camera."""
-_LAYERS, _UNITS = 16, 8192
+_MAX_LAYERS = 16
+"""Most layers of a network."""
+_MAX_UNITS = 8192
+"""Most units of a layer."""
 
 
 def task_faults(task: TaskConfig) -> Iterator[str]:
@@ -50,7 +55,7 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
     yield from _numbers(task)
     if task.observation not in SENSORS:
         yield f"observation is '{task.observation[:60]}', not one of {', '.join(SENSORS)}"
-    for name, (low, high) in _TASK.items():
+    for name, (low, high) in _TASK_LIMITS.items():
         value = getattr(task, name)
         if not low <= value <= high:
             yield f"{name} is {value:g}, not {low:g} to {high:g}"
@@ -58,10 +63,11 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
         low, high = getattr(task, name)
         if not 0 <= low <= high:
             yield f"{name} is {low:g} to {high:g}"
-    for name, most in {**_SENSING, "latency": (task.history - 1) * task.control_dt}.items():
+    max_latency = (task.history - 1) * task.control_dt
+    for name, limit in {**_SENSING_LIMITS, "latency": max_latency}.items():
         low, high = getattr(task.sensing, name)
-        if not 0 <= low <= high <= most:
-            yield f"{name} is {low:g} to {high:g}, not within 0 and {most:g}"
+        if not 0 <= low <= high <= limit:
+            yield f"{name} is {low:g} to {high:g}, not within 0 and {limit:g}"
 
 
 def network_faults(
@@ -71,30 +77,30 @@ def network_faults(
     phrase each.
     """
     yield from _numbers(network)
-    if not 1 <= len(network.hidden) <= _LAYERS or not all(
-        1 <= units <= _UNITS for units in network.hidden
-    ):
-        yield (
-            f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} "
-            f"units"
-        )
-    if not 1 <= len(network.points) <= _LAYERS or not all(
-        1 <= units <= _UNITS for units in network.points
-    ):
-        yield (
-            f"points is {str(network.points)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} "
-            f"units"
-        )
-    if not 1 <= network.encoder <= _UNITS:
-        yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
-    sizes = [size for _, size in layout]  # a policy of headings only has no mask
-    if (
-        not all(size >= (name != "mask") for name, size in layout)
-        or not 1 <= sum(sizes) <= MAX_INPUTS
-    ):
+    yield from _layer_faults("hidden", network.hidden)
+    yield from _layer_faults("points", network.points)
+    if not 1 <= network.encoder <= _MAX_UNITS:
+        yield f"encoder is {network.encoder}, not 1 to {_MAX_UNITS}"
+    sizes = [size for _, size in layout]
+    has_sizes = all(size >= _min_size(block) for block, size in layout)
+    if not has_sizes or not 1 <= sum(sizes) <= MAX_INPUTS:
         yield f"the observation has {str(sizes)[:60]} values, not 1 to {MAX_INPUTS}"
     if not 1 <= action_size <= MAX_ACTIONS:
         yield f"the action has {action_size} values, not 1 to {MAX_ACTIONS}"
+
+
+def _layer_faults(name: str, units: Sequence[int]) -> Iterator[str]:
+    """Yields a phrase if the number of layers, or the units of one, are out of range."""
+    has_layers = 1 <= len(units) <= _MAX_LAYERS
+    if not has_layers or not all(1 <= count <= _MAX_UNITS for count in units):
+        yield (
+            f"{name} is {str(units)[:60]}, not 1 to {_MAX_LAYERS} layers of 1 to {_MAX_UNITS} units"
+        )
+
+
+def _min_size(block: str) -> int:
+    """Smallest size of a block of the observation: a policy of headings only has no mask."""
+    return 0 if block == "mask" else 1
 
 
 def _numbers(config: Any) -> Iterator[str]:
@@ -104,8 +110,9 @@ def _numbers(config: Any) -> Iterator[str]:
         if dataclasses.is_dataclass(value):
             yield from _numbers(value)
             continue
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, (int, float)) and not (
-                math.isfinite(number) and abs(number) <= MAX_NUMBER
-            ):
+        numbers = value if isinstance(value, tuple) else (value,)
+        for number in numbers:
+            if not isinstance(number, (int, float)):
+                continue
+            if not math.isfinite(number) or abs(number) > MAX_NUMBER:
                 yield f"{field.name} is not a finite number of at most {MAX_NUMBER:g}"

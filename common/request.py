@@ -59,8 +59,8 @@ class GraspRequest:
                 "The constraints must be a dict of dicts.",
                 "Pass {'heading': {'direction': …}}, say.",
             )
-        for name, own in self.constraints.items():
-            if not isinstance(own, Mapping):
+        for name, fields in self.constraints.items():
+            if not isinstance(fields, Mapping):
                 raise RefusedError(
                     f"The constraint '{name}' must be a dict from its fields to arrays."
                 )

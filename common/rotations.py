@@ -15,7 +15,8 @@ _SIGNS = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]]
 """Component k of the Hamilton product a b is the sum over i of a_i signs[i, k] b[factors[i, k]]."""
 _SKEW = np.array([[0, 2, 1], [2, 1, 0], [1, 0, 2]])
 _SKEW_SIGNS = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.float32)
-_IDENTITY, _AXES = np.eye(4, dtype=np.float32)[0], np.eye(4, dtype=np.float32)[1:]
+_IDENTITY = np.eye(4, dtype=np.float32)[0]
+_AXES = np.eye(4, dtype=np.float32)[1:]
 _UNDECIDED = 1e-5
 """Cosine of the y angle below which the x angle keeps its previous value
 (`quaternion_to_euler`).
@@ -39,7 +40,8 @@ def cross(a: Array, b: Array) -> Array:
 
 def rotate(q: Array, v: Array) -> Array:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
-    w, axis = q[..., :1], q[..., 1:]
+    w = q[..., :1]
+    axis = q[..., 1:]
     t = 2.0 * cross(axis, v)
     return v + w * t + cross(axis, t)
 
@@ -48,10 +50,10 @@ def to_matrix(q: Array) -> Array:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4): (2 w^2 - 1) I + 2 (v v^T + w
     [v]_x).
     """
-    w, v = q[..., :1, None], q[..., 1:]
-    return (2.0 * w * w - 1.0) * np.eye(3, dtype=np.float32) + 2.0 * (
-        v[..., :, None] * v[..., None, :] + w * skew(v)
-    )
+    w = q[..., :1, None]
+    v = q[..., 1:]
+    outer = v[..., :, None] * v[..., None, :]
+    return (2.0 * w * w - 1.0) * np.eye(3, dtype=np.float32) + 2.0 * (outer + w * skew(v))
 
 
 def skew(v: Array) -> Array:
@@ -64,15 +66,15 @@ def from_matrix(m: Array) -> Array:
     rotation.
     """
     entries = m.reshape(*m.shape[:-2], 9)
-    axes, trace = entries[..., ::4], jnp.sum(entries[..., ::4], -1, keepdims=True)
+    axes = entries[..., ::4]
+    trace = jnp.sum(entries[..., ::4], -1, keepdims=True)
     diagonal = jnp.concatenate([trace, axes], -1)
     opposite = entries[..., np.array([7, 2, 3])] - entries[..., np.array([5, 6, 1])]
     # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
     w_row = jnp.concatenate([1.0 + trace, opposite], -1)
-    axis_rows = m + m.mT + (1.0 - trace)[..., None] * np.eye(3, dtype=np.float32)
-    rows = jnp.concatenate(
-        [w_row[..., None, :], jnp.concatenate([opposite[..., :, None], axis_rows], -1)], -2
-    )
+    axis_block = m + m.mT + (1.0 - trace)[..., None] * np.eye(3, dtype=np.float32)
+    axis_rows = jnp.concatenate([opposite[..., :, None], axis_block], -1)
+    rows = jnp.concatenate([w_row[..., None, :], axis_rows], -2)
     best = jnp.argmax(diagonal, -1)
     q = jnp.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
     q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
@@ -99,7 +101,8 @@ def axis_rotation(axis: Array, theta: Array) -> Array:
     """Rotation matrices (..., 3, 3) about unit axes (..., 3) by angles (...,), by Rodrigues'
     formula.
     """
-    s, c = jnp.sin(theta)[..., None, None], jnp.cos(theta)[..., None, None]
+    s = jnp.sin(theta)[..., None, None]
+    c = jnp.cos(theta)[..., None, None]
     outer = axis[..., :, None] * axis[..., None, :]
     return c * np.eye(3, dtype=np.float32) + s * skew(axis) + (1.0 - c) * outer
 
@@ -128,7 +131,8 @@ def quaternion_to_euler(q: Array, near: Array) -> Array:
     m = to_matrix(q)
     # A weight on the current x decides where the matrix does not: it moves x by less than 0.1
     # degrees while y is more than a third of a degree from 90. y and z are exact for any x.
-    sine, cosine = _UNDECIDED * jnp.sin(near[..., 0]), _UNDECIDED * jnp.cos(near[..., 0])
+    sine = _UNDECIDED * jnp.sin(near[..., 0])
+    cosine = _UNDECIDED * jnp.cos(near[..., 0])
     branches = [
         _euler_given_x(m, jnp.arctan2(sine - side * m[..., 1, 2], cosine + side * m[..., 2, 2]))
         for side in (1.0, -1.0)
@@ -140,7 +144,8 @@ def quaternion_to_euler(q: Array, near: Array) -> Array:
 
 def _euler_given_x(m: Array, x: Array) -> Array:
     """Angles (..., 3) of matrices (..., 3, 3) for a known x (...,): those of Rx(-x) R = Ry Rz."""
-    s, c = jnp.sin(x), jnp.cos(x)
+    s = jnp.sin(x)
+    c = jnp.cos(x)
     y = jnp.arctan2(m[..., 0, 2], c * m[..., 2, 2] - s * m[..., 1, 2])
     z = jnp.arctan2(c * m[..., 1, 0] + s * m[..., 2, 0], c * m[..., 1, 1] + s * m[..., 2, 1])
     return jnp.stack([x, y, z], -1)
@@ -203,7 +208,8 @@ def relative_pose(
 ) -> tuple[Array, Array]:
     """Pose of `other` in the frame of the first pose (..., 3), (..., 4)."""
     inverse = conjugate(quaternion)
-    return rotate(inverse, other_position - position), multiply(inverse, other_quaternion)
+    relative_position = rotate(inverse, other_position - position)
+    return relative_position, multiply(inverse, other_quaternion)
 
 
 def compose_pose(
@@ -218,4 +224,5 @@ def compose_pose(
 def continuous(q: np.ndarray) -> np.ndarray:
     """Quaternions (T, 4) of a motion without sign flips, so that neighbours can be interpolated."""
     flips = np.sign(np.sum(q[1:] * q[:-1], -1))
-    return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]
+    factors = np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)])
+    return q * np.cumprod(factors)[:, None]

@@ -152,7 +152,7 @@ def flesh(skeleton: Skeleton) -> Surface:
     normals = _gradient(points, palm, fingers)
     weights = _weights(len(skeleton.names), points, faces, palm, fingers)
     for finger, (anchor, matrix) in zip(fingers, turns, strict=True):  # undoes the spread
-        share = weights[:, [cone.links[0] for cone in finger]].sum(1)[:, None]
+        share = weights[:, _links(finger)].sum(1)[:, None]
         points = points + share * ((points - anchor) @ matrix + anchor - points)
         normals = normals + share * (normals @ matrix - normals)
     return Surface(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), faces, weights)
@@ -190,10 +190,11 @@ def _fingers(skeleton: Skeleton) -> list[list[Cone]]:
         first = [int(np.flatnonzero(skeleton.capsule_link == link)[0]) for link in chain]
         radii = skeleton.radii[first]
         joints = [radii[0], *((radii[1:] + radii[:-1]) / 2), radii[-1]]
-        cones = zip(skeleton.capsules[first], joints[:-1], joints[1:], chain, strict=True)
-        fingers.append(
-            [Cone(start, end, (float(a), float(b)), (link,)) for (start, end), a, b, link in cones]
-        )
+        finger = []
+        for i, link in enumerate(chain):
+            start, end = skeleton.capsules[first[i]]
+            finger.append(Cone(start, end, (float(joints[i]), float(joints[i + 1])), (link,)))
+        fingers.append(finger)
     return fingers
 
 
@@ -202,23 +203,20 @@ def _palm(skeleton: Skeleton) -> list[Cone]:
     is_of_palm = skeleton.capsule_link == 0
     metacarpals = skeleton.capsules[is_of_palm]
     radii = skeleton.radii[is_of_palm]
-    thumb = _of_link(skeleton, skeleton.chains()[0][0])
+    thumb_link = skeleton.chains()[0][0]
+    thumb = _of_link(skeleton, thumb_link)
     centres, widest, back = wrist_circles(skeleton)
     palm = []
     for (start, end), radius, wide, last in zip(metacarpals, radii, centres, widest, strict=True):
         palm.append(Cone(start, end, (radius, radius), (0,)))
-        palm.append(
-            Cone(
-                wide - 0.2 * _WRIST_LENGTH * back,
-                wide + _WRIST_LENGTH * back,
-                (1.1 * radius, last),
-                (0,),
-            )
-        )
+        wrist_start = wide - 0.2 * _WRIST_LENGTH * back
+        wrist_end = wide + _WRIST_LENGTH * back
+        palm.append(Cone(wrist_start, wrist_end, (1.1 * radius, last), (0,)))
     start, end = min(metacarpals, key=lambda ends: float(np.linalg.norm(ends.mean(0) - thumb[1])))
-    for near, far, first, last in _BALL:
-        along = start + near * (end - start), thumb[0] + far * (thumb[1] - thumb[0])
-        palm.append(Cone(*along, (first, last), (0, skeleton.chains()[0][0])))
+    for metacarpal_share, thumb_share, first, last in _BALL:
+        on_metacarpal = start + metacarpal_share * (end - start)
+        on_thumb = thumb[0] + thumb_share * (thumb[1] - thumb[0])
+        palm.append(Cone(on_metacarpal, on_thumb, (first, last), (0, thumb_link)))
     return palm
 
 
@@ -230,11 +228,15 @@ def wrist_circles(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarra
     starts = skeleton.capsules[is_of_palm, 0]
     root = starts.mean(0)
     knuckles = [_of_link(skeleton, chain[0])[0] for chain in skeleton.chains()[1:]]
-    return (
-        root + _WRIST_WIDTH * (starts - root),
-        1.3 * skeleton.radii[is_of_palm],
-        _unit(root - np.mean(knuckles, 0)),
-    )
+    centres = root + _WRIST_WIDTH * (starts - root)
+    radii = 1.3 * skeleton.radii[is_of_palm]
+    back = _unit(root - np.mean(knuckles, 0))
+    return centres, radii, back
+
+
+def _links(finger: Sequence[Cone]) -> list[int]:
+    """Link of each cone of a finger."""
+    return [cone.links[0] for cone in finger]
 
 
 def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:
@@ -244,11 +246,10 @@ def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:
 
 def _bounds(cones: Sequence[Cone]) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box around cones, with a margin for blending."""
-    reach = (
-        np.array([max(cone.radii) for cone in cones for _ in range(2)])[:, None] + 2 * _CELL + 0.004
-    )
-    ends = np.array([end for cone in cones for end in (cone.start, cone.end)])
-    return (ends - reach).min(0), (ends + reach).max(0)
+    radii = np.array([max(cone.radii) for cone in cones])
+    reach = radii[:, None, None] + 2 * _CELL + 0.004
+    ends = np.array([(cone.start, cone.end) for cone in cones])
+    return (ends - reach).min((0, 1)), (ends + reach).max((0, 1))
 
 
 def _to(points: np.ndarray, cone: Cone) -> np.ndarray:
@@ -256,9 +257,13 @@ def _to(points: np.ndarray, cone: Cone) -> np.ndarray:
     along = cone.end - cone.start
     share = np.clip((points - cone.start) @ along / (along @ along), 0, 1)
     first, last = cone.radii
-    return np.linalg.norm(points - cone.start - share[:, None] * along, axis=-1) - (
-        first + share * (last - first)
-    )
+    to_axis = np.linalg.norm(points - cone.start - share[:, None] * along, axis=-1)
+    return to_axis - (first + share * (last - first))
+
+
+def _to_nearest(points: np.ndarray, cones: Sequence[Cone]) -> np.ndarray:
+    """Approximate signed distances (n,) of points (n, 3) to the nearest of some cones."""
+    return np.min([_to(points, cone) for cone in cones], 0)
 
 
 def _blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
@@ -281,7 +286,7 @@ def _distance(
     body = -_blend(-body, -beyond, _CUT)  # the wrist ends flat
     nearest = body
     for i, finger in enumerate(fingers):
-        to_finger = np.min([_to(points, cone) for cone in finger], 0)
+        to_finger = _to_nearest(points, finger)
         width = _FINGER_BLEND if i else _THUMB_BLEND
         nearest = np.minimum(nearest, _blend(body, to_finger, width))
     return nearest
@@ -322,8 +327,9 @@ def surface_net(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for axis in range(3):
         u = (axis + 1) % 3
         v = (axis + 2) % 3
-        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
-        crossed = np.argwhere(np.moveaxis((first < 0) != (second < 0), 0, axis))
+        layers = np.moveaxis(values, axis, 0)
+        changes_sign = (layers[:-1] < 0) != (layers[1:] < 0)
+        crossed = np.argwhere(np.moveaxis(changes_sign, 0, axis))
         at = tuple(crossed.T)
         after = tuple((crossed + np.eye(3, dtype=int)[axis]).T)
         place = crossed + np.eye(3)[axis] * (values[at] / (values[at] - values[after]))[:, None]
@@ -355,9 +361,7 @@ def _weights(
     far = np.full((len(points), links), np.inf)
     palm = [*palm, fingers[0][0]]  # the thumb's metacarpal belongs to the palm
     fingers = [fingers[0][1:], *fingers[1:]]
-    distances = np.stack(
-        [np.min([_to(points, cone) for cone in finger], 0) for finger in fingers], 1
-    )
+    distances = np.stack([_to_nearest(points, finger) for finger in fingers], 1)
     nearest = distances.argmin(1)
     first, second = np.sort(distances, 1).T[:2]
     for cone in palm:
@@ -378,13 +382,12 @@ def _weights(
     around = sparse.csr_array(
         (np.ones(pairs.shape[1]), (pairs[0], pairs[1])), (len(points), len(points))
     )
-    others = [
-        (nearest != i, [cone.links[0] for cone in finger]) for i, finger in enumerate(fingers)
-    ]
+    finger_links = [_links(finger) for finger in fingers]
     for _ in range(_SMOOTHINGS):
         weights = 0.5 * weights + 0.5 * (around @ weights) / around.sum(1)[:, None]
-        for beyond, theirs in others:
-            weights[np.ix_(beyond, theirs)] = 0.0
+        for i, links_of_finger in enumerate(finger_links):
+            weights[np.ix_(nearest != i, links_of_finger)] = 0.0
         weights[:, 0] = 1 - weights[:, 1:].sum(1)
-    weights[weights < np.maximum(np.sort(weights, 1)[:, -_MAX_INFLUENCES, None], _MIN_WEIGHT)] = 0.0
+    smallest_influence = np.sort(weights, 1)[:, -_MAX_INFLUENCES, None]
+    weights[weights < np.maximum(smallest_influence, _MIN_WEIGHT)] = 0.0
     return weights / weights.sum(1, keepdims=True)

@@ -35,10 +35,18 @@ MARGIN = 0.024
 """Margin of the grid around the object, m: more than the radius of the thickest capsule of a
 hand.
 """
-_MOST = 1 << 28  # limit of the grid points of all objects
-_SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # spacing of samples on a mesh, m; fewest and most
-_MOST_FILES = 4096  # cached grids of meshes
-_NEWTON = 12  # iterations of the search for the nearest point of an ellipsoid
+_MAX_TOTAL_CELLS = 1 << 28
+"""Most grid points of all objects."""
+_SPACING = 1e-3
+"""Spacing of samples on a mesh, m."""
+_MIN_SAMPLES = 4000
+"""Fewest samples on a mesh."""
+_MAX_SAMPLES = 120_000
+"""Most samples on a mesh."""
+_MAX_CACHED_FILES = 4096
+"""Most cached grids of meshes."""
+_NEWTON_STEPS = 12
+"""Iterations of the search for the nearest point of an ellipsoid."""
 
 
 class DistanceField(NamedTuple):
@@ -78,10 +86,9 @@ class DistanceField(NamedTuple):
         total = jnp.zeros(points.shape[:-1])
         for corner in np.ndindex(2, 2, 2):
             weight = jnp.prod(jnp.where(np.array(corner) == 1, share, 1.0 - share), -1)
-            found = flat.at[first + jnp.sum(np.array(corner) * strides, -1)].get(
-                mode="promise_in_bounds"
-            )
-            total += weight * found.astype(jnp.float32)
+            index_in_flat = first + jnp.sum(np.array(corner) * strides, -1)
+            distance = flat.at[index_in_flat].get(mode="promise_in_bounds")
+            total += weight * distance.astype(jnp.float32)
         return total + jnp.linalg.norm(place - inside, axis=-1) * self.cell[index][:, None]
 
 
@@ -93,16 +100,36 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
       objects: N objects; beyond 2,048 grids become coarser, so that they need at most half a
         gigabyte.
     """
-    cells = min(CELLS, _MOST // len(objects))
+    cells = min(CELLS, _MAX_TOTAL_CELLS // len(objects))
     lattices = [_lattice(obj, cells) for obj in objects]
-    values = [
-        _mesh_values(obj, *lattice, cells)
-        if any(piece.kind == "mesh" for piece in obj.pieces)
-        else _primitive_values(_slots(obj.pieces), *lattice, cells)
-        for obj, lattice in zip(objects, lattices, strict=True)
-    ]
-    origin, cell, shape = (np.array(column) for column in zip(*lattices, strict=True))
-    return jax.device_put(DistanceField(np.stack(values), origin, cell.astype(np.float32), shape))
+    values = []
+    for obj, lattice in zip(objects, lattices, strict=True):
+        if any(piece.kind == "mesh" for piece in obj.pieces):
+            values.append(_mesh_values(obj, lattice, cells))
+        else:
+            values.append(_primitive_values(_slots(obj.pieces), *lattice, cells))
+    field = DistanceField(
+        values=np.stack(values),
+        origin=np.array([lattice.origin for lattice in lattices]),
+        cell=np.array([lattice.cell for lattice in lattices]).astype(np.float32),
+        shape=np.array([lattice.shape for lattice in lattices]),
+    )
+    return jax.device_put(field)
+
+
+class _Lattice(NamedTuple):
+    """Points of a grid around an object."""
+
+    origin: np.ndarray
+    """(3,) float32: the first point, m."""
+    cell: float
+    """Spacing, m."""
+    shape: np.ndarray
+    """(3,) int32: points along each axis."""
+
+    def points(self) -> np.ndarray:
+        """All points (n, 3), m; the last axis runs fastest."""
+        return self.origin + self.cell * np.indices(self.shape.tolist()).reshape(3, -1).T
 
 
 class _Slots(NamedTuple):
@@ -118,17 +145,18 @@ def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
     """Groups pieces by kind, padded to a fixed number of slots, so that one program serves all
     objects.
     """
-    found = {}
+    slots = {}
     for kind, count in PRIMITIVE_SLOTS.items():
-        own = [piece for piece in pieces if piece.kind == kind]
-        filled = [*own, *[Piece(kind, (1.0, 1.0, 1.0))] * (count - len(own))]  # type: ignore[arg-type]
-        found[kind] = _Slots(
-            np.arange(len(filled)) < len(own),
-            np.array([piece.size for piece in filled], np.float32),
-            np.array([piece.pos for piece in filled], np.float32),
-            np.array([shapes.rotation(piece) for piece in filled], np.float32),
+        used = [piece for piece in pieces if piece.kind == kind]
+        padding = Piece(kind, (1.0, 1.0, 1.0))  # type: ignore[arg-type]
+        filled = [*used, *[padding] * (count - len(used))]
+        slots[kind] = _Slots(
+            used=np.arange(len(filled)) < len(used),
+            size=np.array([piece.size for piece in filled], np.float32),
+            position=np.array([piece.pos for piece in filled], np.float32),
+            rotation=np.array([shapes.rotation(piece) for piece in filled], np.float32),
         )
-    return found
+    return slots
 
 
 @jax.jit
@@ -146,9 +174,8 @@ def _least(pieces: dict[str, _Slots], points: Array) -> Array:
             least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]
         ) -> Array:
             # In the piece's frame; all shapes are symmetric.
-            return jnp.minimum(
-                least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size)
-            )
+            local = jnp.abs((points - slot.position) @ slot.rotation)
+            return jnp.minimum(least, of(local, slot.size))
 
         for i in range(len(slots.used)):
             slot = _Slots(*(field[i] for field in slots))
@@ -161,9 +188,8 @@ def _box(x: Array, half: Array) -> Array:
     coordinates.
     """
     beyond = x - half
-    return jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1) + jnp.minimum(
-        jnp.max(beyond, -1), 0.0
-    )
+    outside = jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1)
+    return outside + jnp.minimum(jnp.max(beyond, -1), 0.0)
 
 
 def _cylinder(x: Array, size: Array) -> Array:
@@ -175,7 +201,8 @@ def _cylinder(x: Array, size: Array) -> Array:
 
 def _capsule(x: Array, size: Array) -> Array:
     """Signed distance (n,) from a capsule of this radius and half length along z."""
-    return jnp.linalg.norm(x.at[:, 2].set(jnp.maximum(x[:, 2] - size[1], 0.0)), axis=-1) - size[0]
+    from_axis = x.at[:, 2].set(jnp.maximum(x[:, 2] - size[1], 0.0))
+    return jnp.linalg.norm(from_axis, axis=-1) - size[0]
 
 
 def _ellipsoid(x: Array, radii: Array) -> Array:
@@ -185,18 +212,17 @@ def _ellipsoid(x: Array, radii: Array) -> Array:
     (Eberly, "Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The
     left side is decreasing and convex, so Newton's method from below the root never overshoots.
     """
-    # In a plane of symmetry the root would be a pole
-    squares, x = (
-        radii**2,
-        jnp.maximum(x, 1e-3 * radii),
-    )
+    squares = radii**2
+    # In a plane of symmetry the root would be a pole.
+    x = jnp.maximum(x, 1e-3 * radii)
 
     def newton(_: int, t: Array) -> Array:
         share = (radii * x / (squares + t)) ** 2
         slope = 2 * jnp.sum(share / (squares + t), -1, keepdims=True)
         return t + (jnp.sum(share, -1, keepdims=True) - 1) / slope
 
-    t = jax.lax.fori_loop(0, _NEWTON, newton, jnp.max(radii * x - squares, -1, keepdims=True))
+    start = jnp.max(radii * x - squares, -1, keepdims=True)
+    t = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, start)
     return jnp.sign(t[:, 0]) * jnp.linalg.norm(x * t / (squares + t), axis=-1)
 
 
@@ -214,45 +240,48 @@ def _primitive_values(
     return _least(pieces, origin + cell * place).astype(jnp.float16)
 
 
-def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarray]:
-    """First point (3,), spacing and shape (3,) of a grid of at most `cells` points around an
-    object.
-    """
-    low, high = obj.visual_vertices.min(0) - MARGIN, obj.visual_vertices.max(0) + MARGIN
+def _lattice(obj: GraspObject, cells: int) -> _Lattice:
+    """Grid of at most `cells` points around an object."""
+    low = obj.visual_vertices.min(0) - MARGIN
+    high = obj.visual_vertices.max(0) + MARGIN
     cell = float(np.prod(high - low) / cells) ** (1 / 3)
-    while np.prod(shape := np.ceil((high - low) / cell).astype(np.int32) + 1) > cells:
+    shape = _points_along(high - low, cell)
+    while np.prod(shape) > cells:
         cell *= 1.01
-    return low.astype(np.float32), cell, shape
+        shape = _points_along(high - low, cell)
+    return _Lattice(low.astype(np.float32), cell, shape)
 
 
-def _mesh_values(
-    obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray, cells: int
-) -> np.ndarray:
+def _points_along(size: np.ndarray, cell: float) -> np.ndarray:
+    """Grid points (3,) int32 along the sides (3,) of a box, in m."""
+    return np.ceil(size / cell).astype(np.int32) + 1
+
+
+def _mesh_values(obj: GraspObject, lattice: _Lattice, cells: int) -> np.ndarray:
     """Distances (cells,) float16 from a visual mesh at the grid points, padded with zeros; cached
     if possible.
     """
     parts = [
         obj.visual_vertices.astype(np.float32),
         obj.visual_faces.astype(np.int32),
-        origin,
-        shape,
+        lattice.origin,
+        lattice.shape,
     ]
-    key = hashlib.sha256(
-        b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-    ).hexdigest()[:32]
+    content = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    key = hashlib.sha256(content).hexdigest()[:32]
     file = cache_folder("distances") / f"{key}.safetensors"
-    kept = message.arrays.get("distance") if (message := read_kept(file)) else None
-    if kept is not None and kept.shape == (cells,) and np.isfinite(kept).all():
-        return kept
-    found = _mesh_distance(obj, origin, cell, shape).astype(np.float16)
-    found = np.pad(found, (0, cells - len(found)))
-    keep(file, Message({"distance": found}), _MOST_FILES)
-    return found
+    message = read_kept(file)
+    if message:
+        cached = message.arrays.get("distance")
+        if cached is not None and cached.shape == (cells,) and np.isfinite(cached).all():
+            return cached
+    distance = _mesh_distance(obj, lattice).astype(np.float16)
+    distance = np.pad(distance, (0, cells - len(distance)))
+    keep(file, Message({"distance": distance}), _MAX_CACHED_FILES)
+    return distance
 
 
-def _mesh_distance(
-    obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray
-) -> np.ndarray:
+def _mesh_distance(obj: GraspObject, lattice: _Lattice) -> np.ndarray:
     """Signed distances (n,) from an object's visual mesh at the points of a grid.
 
     The magnitude is the distance from the triangle of the nearest of many samples. A point is
@@ -260,20 +289,18 @@ def _mesh_distance(
     surface. The orientation of faces and small holes therefore do not matter, and walls thinner
     than two cells have no inside.
     """
-    points = origin + cell * np.indices(shape.tolist()).reshape(3, -1).T
+    points = lattice.points()
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
     mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
-    count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
+    count = int(np.clip(mesh.area / _SPACING**2, _MIN_SAMPLES, _MAX_SAMPLES))
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
     # Triangles too small to be sampled contribute their centres.
-    samples, face = (
-        np.concatenate([samples, triangles.mean(1)]),
-        np.concatenate([face, np.arange(len(triangles))]),
-    )
+    samples = np.concatenate([samples, triangles.mean(1)])
+    face = np.concatenate([face, np.arange(len(triangles))])
     distance, nearest = cKDTree(samples).query(points, workers=cores())
     on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)
     distance = np.minimum(distance, np.linalg.norm(points - on_triangle, axis=-1))
-    free = (distance > 0.5 * math.sqrt(3.0) * cell).reshape(shape)
+    free = (distance > 0.5 * math.sqrt(3.0) * lattice.cell).reshape(lattice.shape)
     regions, _ = ndimage.label(free)
     inside = free & (regions != regions[0, 0, 0])
     if free.any():  # near the surface the sign is that of the nearest point farther away from it

@@ -9,6 +9,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, SCANS, Draft
+from congrasp.common.objects.families.draft import moved
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.shapes import DENSE, balanced, halves, mass_properties, sample_union
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject, Piece
@@ -28,13 +29,19 @@ change.
 """
 MASS_RANGE = (0.02, 0.6)
 """Kilograms."""
-_SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}
+_SETTLING_MASS_RANGE = (0.05, 0.5)
+_HOUSEHOLD_SETTLING_MASS_RANGE = (0.02, 0.5)
 """Ranges in kilograms to which the mass is clipped while an object settles into its resting poses:
 of basic families, and of the others. They are fixed so that a change of `MASS_RANGE` does not move
 resting poses by rounding errors."""
-_SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
-_LEAST_SHARE = 0.1
-_ATTEMPTS = 100
+_SIZE_RANGE = (0.03, 0.25)
+"""Metres; the largest side of a basic object."""
+_HOUSEHOLD_SIZE_RANGE = (0.03, 0.3)
+"""Metres; the largest side of any other object."""
+_MIN_SHARE = 0.1
+"""Smallest share of the surface points in the graspable region, and in the avoid region."""
+_MAX_ATTEMPTS = 100
+"""Drafts of a family before a seed is given up."""
 
 
 def generate(seed: int, family: str | None = None) -> GraspObject:
@@ -52,14 +59,17 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     Raises:
       CongraspError: the family is unknown or the seed negative.
     """
-    _check(seed, () if family is None else (family,))
     if family is None:
-        family = BASIC_FAMILIES[np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))]
+        _check(seed, ())
+        choice = np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))
+        family = BASIC_FAMILIES[choice]
+    else:
+        _check(seed, (family,))
     # Seeded by name, so that adding families does not change the objects of others; basic ones keep
     # their first numbers.
     stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
     rng = np.random.default_rng((seed, stream))
-    for _ in range(_ATTEMPTS):
+    for _ in range(_MAX_ATTEMPTS):
         obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
         if obj is not None:
             return obj
@@ -83,9 +93,11 @@ def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[G
 
 def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[str]:
     """Families of the objects of `generate_many`, in order."""
-    chosen = [name for entry in families or ("basic",) for name in GROUPS.get(entry, (entry,))]
-    _check(seed, chosen)
-    return [chosen[(seed + i) % len(chosen)] for i in range(count)]
+    names: list[str] = []
+    for entry in families or ("basic",):
+        names += GROUPS.get(entry, (entry,))
+    _check(seed, names)
+    return [names[(seed + i) % len(names)] for i in range(count)]
 
 
 def _check(seed: int, families: Sequence[str]) -> None:
@@ -102,45 +114,37 @@ def _check(seed: int, families: Sequence[str]) -> None:
 
 def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
     """Builds the object of a draft; returns None if its size or its parts are out of range."""
-    sizes = _SIZE_RANGE if family in BASIC else _HOUSEHOLD_SIZE_RANGE
-    weight = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
-    densities = rng.uniform(*draft.density) * weight[[piece.part for piece in draft.pieces]]
-    mass, center, inertia = mass_properties(draft.pieces, densities)
-    pieces = tuple(
-        dataclasses.replace(piece, pos=tuple((np.array(piece.pos) - center).tolist()))
-        for piece in draft.pieces
-    )
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    reach = np.max([shapes.support(piece, axes) for piece in pieces], axis=0)
-    size = (reach[:3] + reach[3:]).max()
-    part = np.array([piece.part for piece in pieces], np.int32)
-    points, normals, owner = sample_union(pieces, rng, DENSE if draft.thin else SURFACE_POINTS)
-    if draft.thin:
-        chosen = balanced(np.array(draft.graspable)[part[owner]])
-        points, normals, owner = points[chosen], normals[chosen], owner[chosen]
+    mass, center, inertia = mass_properties(draft.pieces, _densities(draft, rng))
+    pieces = tuple(moved(piece, -center) for piece in draft.pieces)
+    points, normals, owner = _surface(draft, pieces, rng)
     if draft.part_names:
-        part_names, graspable = draft.part_names, np.array(draft.graspable)
-        labels = part[owner]
+        part_names = draft.part_names
+        graspable = np.array(draft.graspable)
+        labels = _parts(pieces)[owner]
     else:
-        part_names, first = ("near half", "far half"), rng.random() < 0.5
-        graspable = np.array([first, not first])
+        part_names = ("near half", "far half")
+        near_is_graspable = rng.random() < 0.5
+        graspable = np.array([near_is_graspable, not near_is_graspable])
         labels = halves(points, rng.uniform(0.35, 0.65))
-    share = graspable[labels].mean()
-    if not (sizes[0] <= size <= sizes[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
+    min_size, max_size = _SIZE_RANGE if family in BASIC else _HOUSEHOLD_SIZE_RANGE
+    if not min_size <= _largest_side(pieces) <= max_size:
         return None
-    settled, clipped = (
-        np.clip(mass, *_SETTLED[family in BASIC]),
-        np.clip(draft.heavier * mass, *MASS_RANGE),
-    )
+    if not _MIN_SHARE <= graspable[labels].mean() <= 1 - _MIN_SHARE:
+        return None
+    settling_range = _SETTLING_MASS_RANGE
+    if family not in BASIC:
+        settling_range = _HOUSEHOLD_SETTLING_MASS_RANGE
+    settling_mass = np.clip(mass, *settling_range)
+    final_mass = np.clip(draft.heavier * mass, *MASS_RANGE)
     vertices, faces = shapes.mesh_of(pieces)
-    obj = GraspObject(
+    settling = GraspObject(
         name=name,
         family=family,
         pieces=pieces,
         part_names=part_names,
         graspable=graspable,
-        mass=float(settled),
-        inertia=inertia * settled / mass,
+        mass=float(settling_mass),
+        inertia=inertia * settling_mass / mass,
         points=points.astype(np.float32),
         normals=normals.astype(np.float32),
         labels=labels,
@@ -149,8 +153,44 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
         visual_faces=faces,
     )
     return dataclasses.replace(
-        obj, mass=float(clipped), inertia=inertia * clipped / mass, rest_poses=rest_poses(obj)
+        settling,
+        mass=float(final_mass),
+        inertia=inertia * final_mass / mass,
+        rest_poses=rest_poses(settling),
     )
+
+
+def _densities(draft: Draft, rng: np.random.Generator) -> np.ndarray:
+    """Density (pieces,) of each piece, kg/m^3: a random one, weighted by the piece's part."""
+    weights = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
+    return rng.uniform(*draft.density) * weights[[piece.part for piece in draft.pieces]]
+
+
+def _parts(pieces: Sequence[Piece]) -> np.ndarray:
+    """Part (pieces,) int32 of each piece."""
+    return np.array([piece.part for piece in pieces], np.int32)
+
+
+def _largest_side(pieces: Sequence[Piece]) -> float:
+    """Largest side of the pieces' bounding box, m."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    reach = np.max([shapes.support(piece, axes) for piece in pieces], axis=0)
+    return float((reach[:3] + reach[3:]).max())
+
+
+def _surface(
+    draft: Draft, pieces: tuple[Piece, ...], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (512, 3), normals (512, 3) and owning pieces (512,) of the object's surface.
+
+    Half of the points of a thin draft lie in its graspable region.
+    """
+    if not draft.thin:
+        return sample_union(pieces, rng, SURFACE_POINTS)
+    points, normals, owner = sample_union(pieces, rng, DENSE)
+    is_graspable = np.array(draft.graspable)[_parts(pieces)[owner]]
+    chosen = balanced(is_graspable)
+    return points[chosen], normals[chosen], owner[chosen]
 
 
 def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspObject:

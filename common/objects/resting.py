@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import CONTACT, add_object
@@ -10,23 +11,36 @@ from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.runtime.physics_library import mujoco
 
 MAX_POSES = 8
-_SAME_NORMAL = np.cos(np.radians(15))  # tolerance at which two directions count as one
-_SAME_KIND = (
-    0.03  # poses whose heights differ by less than this share count as rotations of one another
-)
-_PER_KIND = 4
-_LEAST_LIKELY = 0.02
-_STILL = 1e-3  # m/s
-_SPEED_SECONDS = 0.025
-_SECONDS = 0.25  # of settling
-_FREE_SECONDS = 0.5  # time after which an unstable object is recognised by its speed
-# Rad, m; a pose is unstable if a tilt lowers its centre of mass by more than this
-_DROPS = (
+"""Most resting poses of an object."""
+_SAME_DIRECTION_COSINE = np.cos(np.radians(15))
+"""Directions with a larger cosine between them count as one."""
+_SAME_HEIGHT = 0.03
+"""Poses whose heights differ by less than this share count as rotations of one another."""
+_MAX_ROTATIONS = 4
+"""Most poses that are rotations of one another."""
+_MIN_LIKELIHOOD = 0.02
+"""Likelihood below which a pose is dropped, unless it is the only one."""
+_MAX_SPEED_AT_REST = 1e-3
+"""Speed below which an object is at rest, m/s."""
+_SPEED_WINDOW_S = 0.025
+"""Time over which the speed is averaged, s."""
+_SETTLING_S = 0.25
+"""Simulated time of a round of settling, s."""
+_FREE_S = 0.5
+"""Simulated time after which an unstable object is recognised by its speed, s."""
+_TUMBLING_S = 20 * _SETTLING_S
+"""Simulated time of an object that has no stable pose, s."""
+_MAX_DROPS = (
     (0.03, 1.5e-6),
     (0.06, 5e-6),
 )
-_ROUNDS = 4
-_UPRIGHT = np.radians(30)
+"""Tilts in rad; a pose is unstable if one lowers its centre of mass by more than this many m."""
+_MAX_ROUNDS = 4
+"""Most rounds of settling of a pose."""
+_MAX_TILT = np.radians(30)
+"""Angle in rad between the object's z axis and upright below which it counts as upright."""
+_MAX_ROLLS_LOG2 = 12
+"""Logarithm of the most facets over which an object rolls."""
 
 
 class Settled(NamedTuple):
@@ -86,19 +100,19 @@ class TableScene:
                 self.model.body_mass[1] * 9.81 * self.radius * inertia
             )
         steps = max(1, round(seconds / CONTACT.timestep))
-        last = min(steps, round(_SPEED_SECONDS / CONTACT.timestep))
-        if steps > last:
-            mujoco.mj_step(self.model, self.data, nstep=steps - last)
+        window = min(steps, round(_SPEED_WINDOW_S / CONTACT.timestep))
+        if steps > window:
+            mujoco.mj_step(self.model, self.data, nstep=steps - window)
         before = self.data.qpos.copy()
-        mujoco.mj_step(self.model, self.data, nstep=last)
+        mujoco.mj_step(self.model, self.data, nstep=window)
         self.model.dof_damping[:] = damping
+        after = self.data.qpos.copy()
         turn = np.zeros(3)
-        mujoco.mju_subQuat(turn, self.data.qpos[3:], before[3:])
-        linear, angular = np.linalg.norm([self.data.qpos[:3] - before[:3], turn], axis=-1) / (
-            last * CONTACT.timestep
-        )
-        moved = np.linalg.norm(self.data.qpos[:3] - pose[:3])
-        return Settled(self.data.qpos.copy(), float(linear + self.radius * angular), float(moved))
+        mujoco.mju_subQuat(turn, after[3:], before[3:])
+        changes = np.linalg.norm([after[:3] - before[:3], turn], axis=-1)
+        linear, angular = changes / (window * CONTACT.timestep)
+        moved = np.linalg.norm(after[:3] - pose[:3])
+        return Settled(after, float(linear + self.radius * angular), float(moved))
 
 
 def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
@@ -115,24 +129,26 @@ def rest_poses(obj: GraspObject) -> np.ndarray:
     """
     candidates, _ = quasi_static_poses(obj.pieces)
     scene = TableScene(obj)
-    found: list[np.ndarray] = []
+    stable: list[np.ndarray] = []
     downs: list[np.ndarray] = []
-    for pose in candidates:
-        for _ in range(_ROUNDS):
-            settled = scene.settle(pose, _SECONDS, overdamped=True)
+    for candidate in candidates:
+        pose = candidate
+        for _ in range(_MAX_ROUNDS):
+            settled = scene.settle(pose, _SETTLING_S, overdamped=True)
             pose = settled.pose
             down = -shapes.matrix(pose[3:])[2]
-            if any(down @ other > _SAME_NORMAL for other in downs):
+            if any(down @ other > _SAME_DIRECTION_COSINE for other in downs):
                 break
-            still = settled.speed < _STILL and _stable(obj.pieces, down)
-            if still and scene.settle(pose, _FREE_SECONDS).speed < _STILL:
-                found.append(pose)
+            if settled.speed >= _MAX_SPEED_AT_REST or not _stable(obj.pieces, down):
+                continue
+            if scene.settle(pose, _FREE_S).speed < _MAX_SPEED_AT_REST:
+                stable.append(pose)
                 downs.append(down)
                 break
-    if not found:
-        tumbled = scene.settle(candidates[0], 20 * _SECONDS)
-        found.append(scene.settle(tumbled.pose, 20 * _SECONDS, overdamped=True).pose)
-    poses = np.array(found)
+    if not stable:
+        tumbled = scene.settle(candidates[0], _TUMBLING_S)
+        stable.append(scene.settle(tumbled.pose, _TUMBLING_S, overdamped=True).pose)
+    poses = np.array(stable)
     poses[:, :2] = 0.0
     return poses
 
@@ -143,7 +159,7 @@ def upright_rest(obj: GraspObject) -> int | None:
     """
     tilts = rest_tilts(obj)
     best = int(np.argmin(tilts))
-    return best if tilts[best] < _UPRIGHT else None
+    return best if tilts[best] < _MAX_TILT else None
 
 
 def rest_tilts(obj: GraspObject) -> np.ndarray:
@@ -170,22 +186,10 @@ def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarra
       their likelihoods (R,). Unlikely poses are dropped.
     """
     hull = shapes.hull_of(np.concatenate([shapes.tessellate(piece)[0] for piece in pieces]))
-    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
-    corners = hull.points[hull.simplices]
-    # Distance of the projected centre of mass beyond the edge opposite to each corner.
-    foot = -offsets[:, None] * normals
-    start, along = np.roll(corners, -1, 1), np.roll(corners, -2, 1) - np.roll(corners, -1, 1)
-    outward = np.cross(along, normals[:, None])
-    outward /= np.linalg.norm(outward, axis=-1, keepdims=True) + 1e-12
-    outward *= np.sign(((start - corners) * outward).sum(-1, keepdims=True))
-    beyond = ((foot[:, None] - start) * outward).sum(-1)
-    rows, worst = np.arange(len(normals)), beyond.argmax(-1)
-    neighbor = hull.neighbors[rows, worst]
-    rolls = (beyond[rows, worst] > 1e-9) & (offsets[neighbor] > offsets - 1e-9)
-    target = np.where(rolls, neighbor, rows)
-    for _ in range(12):
-        target = target[target]
-    weights = np.bincount(target, _solid_angles(corners), len(normals)) / (4 * np.pi)
+    normals = hull.equations[:, :3]
+    final_facet = _final_facets(hull)
+    solid_angles = _solid_angles(hull.points[hull.simplices])
+    weights = np.bincount(final_facet, solid_angles, len(normals)) / (4 * np.pi)
     sinks = weights > 0
     downs, weights = _merge(normals[sinks], weights[sinks])
     if any(piece.kind in ("cylinder", "capsule", "ellipsoid") for piece in pieces):
@@ -194,6 +198,33 @@ def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarra
     chosen = _choose(heights, weights)
     poses = np.array([[0.0, 0.0, heights[i], *_upright(downs[i])] for i in chosen])
     return poses, weights[chosen]
+
+
+def _final_facets(hull: ConvexHull) -> np.ndarray:
+    """Index (F,) of the facet onto which an object rolls from each facet of its hull.
+
+    Args:
+      hull: the object's convex hull; the origin is the centre of mass.
+    """
+    normals = hull.equations[:, :3]
+    offsets = hull.equations[:, 3]
+    corners = hull.points[hull.simplices]
+    # Distance of the projected centre of mass beyond the edge opposite to each corner.
+    foot = -offsets[:, None] * normals
+    start = np.roll(corners, -1, 1)
+    along = np.roll(corners, -2, 1) - start
+    outward = np.cross(along, normals[:, None])
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True) + 1e-12
+    outward *= np.sign(((start - corners) * outward).sum(-1, keepdims=True))
+    beyond = ((foot[:, None] - start) * outward).sum(-1)
+    rows = np.arange(len(normals))
+    worst = beyond.argmax(-1)
+    neighbor = hull.neighbors[rows, worst]
+    rolls = (beyond[rows, worst] > 1e-9) & (offsets[neighbor] > offsets - 1e-9)
+    facet = np.where(rolls, neighbor, rows)
+    for _ in range(_MAX_ROLLS_LOG2):
+        facet = facet[facet]
+    return facet
 
 
 def _height(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
@@ -207,7 +238,8 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
     """Directions (D, 3) near the given ones with a lower centre of mass, by pattern search on the
     sphere.
     """
-    best, height = downs, _height(pieces, downs)
+    best = downs
+    height = _height(pieces, downs)
     columns = np.arange(len(best))
     step = 0.1
     for i in range(12):
@@ -226,10 +258,11 @@ def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
     downwards.
     """
     height = _height(pieces, down[None])[0]
-    return all(
-        _height(pieces, _cone(down[None], tilt, 64)[:, 0]).min() > height - drop
-        for tilt, drop in _DROPS
-    )
+    for tilt, max_drop in _MAX_DROPS:
+        tilted = _cone(down[None], tilt, 64)[:, 0]
+        if _height(pieces, tilted).min() <= height - max_drop:
+            return False
+    return True
 
 
 def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.ndarray:
@@ -250,7 +283,9 @@ def _solid_angles(corners: np.ndarray) -> np.ndarray:
     a, b, c = np.moveaxis(corners, 1, 0)
     la, lb, lc = np.linalg.norm(corners, axis=-1).T
     triple = np.abs((a * np.cross(b, c)).sum(-1))
-    ab, bc, ca = ((x * y).sum(-1) for x, y in ((a, b), (b, c), (c, a)))
+    ab = (a * b).sum(-1)
+    bc = (b * c).sum(-1)
+    ca = (c * a).sum(-1)
     return 2 * np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb)
 
 
@@ -258,24 +293,25 @@ def _merge(downs: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Merges close directions; returns directions and summed weights, most likely first."""
     order = np.argsort(-weights, kind="stable")
     downs, weights = downs[order], weights[order].copy()
-    close = downs @ downs.T > _SAME_NORMAL
-    kept: list[int] = []
+    is_close = downs @ downs.T > _SAME_DIRECTION_COSINE
+    distinct: list[int] = []
     for i in range(len(downs)):
-        near = [k for k in kept if close[i, k]]
+        near = [k for k in distinct if is_close[i, k]]
         if near:
             weights[near[0]] += weights[i]
         else:
-            kept.append(i)
-    kept.sort(key=lambda i: -weights[i])
-    return downs[kept], weights[kept]
+            distinct.append(i)
+    distinct.sort(key=lambda i: -weights[i])
+    return downs[distinct], weights[distinct]
 
 
 def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
     """Indices of at most eight likely poses, with few rotations of one another."""
     chosen: list[int] = []
     for i, (height, weight) in enumerate(zip(heights, weights, strict=True)):
-        alike = sum(abs(heights[k] - height) < _SAME_KIND * height for k in chosen)
-        if not chosen or (len(chosen) < MAX_POSES and alike < _PER_KIND and weight > _LEAST_LIKELY):
+        rotations = sum(abs(heights[k] - height) < _SAME_HEIGHT * height for k in chosen)
+        has_room = len(chosen) < MAX_POSES and rotations < _MAX_ROTATIONS
+        if not chosen or (has_room and weight > _MIN_LIKELIHOOD):
             chosen.append(i)
     return chosen
 

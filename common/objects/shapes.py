@@ -14,16 +14,19 @@ from scipy.spatial import ConvexHull
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 from congrasp.common.runtime.physics_library import mujoco
 
-_SEGMENTS = 24
 DENSE = 8192
 """Surface points from which `balanced` chooses."""
-# M; a point is on the outer surface if a step of this length along its normal leaves all pieces
+_SEGMENTS = 24
+"""Sides of the triangle mesh of a round primitive."""
 _SEAM = 2e-4
-# M; a mesh's surface counts as accessible if the collision pieces end within this distance
+"""Step along its normal, in m, with which a point of the outer surface leaves all pieces."""
 _REACHABLE = 4e-3
-# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4
-# sequence).
+"""A mesh's surface counts as accessible if the collision pieces end within this distance, m."""
+_MIN_REACHABLE_SHARE = 0.25
+"""Share of accessible points below which all points of a mesh are used."""
 _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
+"""Steps (4,) of the low-discrepancy sequence: powers of the generalised golden ratio of four
+dimensions, the positive root of x^5 = x + 1 (Roberts' R4 sequence)."""
 
 
 def rotation(piece: Piece) -> np.ndarray:
@@ -65,7 +68,8 @@ def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
 def _triangulated(data: bytes) -> trimesh.Trimesh:
     """Mesh of the hull of points given as bytes of float64."""
     hull = _hull(data)
-    vertices, faces = hull.points, hull.simplices
+    vertices = hull.points
+    faces = hull.simplices
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
@@ -92,30 +96,33 @@ def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     """Centre of mass (3,) and inertia (3, 3) about it for one kilogram of uniform density, in the
     object frame.
     """
-    a, b, c = piece.size
     if piece.kind == "mesh":
         properties = triangulate(_vertices(piece)).mass_properties
-        center, local = (
-            np.asarray(properties["center_mass"]),
-            np.asarray(properties["inertia"]) / properties["mass"],
-        )
+        center = np.asarray(properties["center_mass"])
+        inertia = np.asarray(properties["inertia"]) / properties["mass"]
     else:
         center = np.zeros(3)
-        if piece.kind == "box":
-            squares = np.array([a, b, c]) ** 2 / 3
-        elif piece.kind == "ellipsoid":
-            squares = np.array([a, b, c]) ** 2 / 5
-        elif piece.kind == "cylinder":
-            squares = np.array([a**2 / 4, a**2 / 4, b**2 / 3])
-        else:
-            # A cylinder and two half balls whose centres of mass are 3a/8 beyond its ends.
-            cylinder, ball = 2 * np.pi * a**2 * b, 4 / 3 * np.pi * a**3
-            axial = cylinder * b**2 / 3 + ball * (a**2 / 5 + b**2 + 3 * a * b / 4)
-            radial = cylinder * a**2 / 4 + ball * a**2 / 5
-            squares = np.array([radial, radial, axial]) / (cylinder + ball)
-        local = np.diag(squares.sum() - squares)
+        squares = _mean_squares(piece)
+        inertia = np.diag(squares.sum() - squares)
     r = rotation(piece)
-    return np.asarray(piece.pos) + r @ center, r @ local @ r.T
+    return np.asarray(piece.pos) + r @ center, r @ inertia @ r.T
+
+
+def _mean_squares(piece: Piece) -> np.ndarray:
+    """Mean squares (3,) of the coordinates in a primitive piece, in its frame, m^2."""
+    a, b, c = piece.size
+    if piece.kind == "box":
+        return np.array([a, b, c]) ** 2 / 3
+    if piece.kind == "ellipsoid":
+        return np.array([a, b, c]) ** 2 / 5
+    if piece.kind == "cylinder":
+        return np.array([a**2 / 4, a**2 / 4, b**2 / 3])
+    # A cylinder and two half balls whose centres of mass are 3a/8 beyond its ends.
+    cylinder = 2 * np.pi * a**2 * b
+    ball = 4 / 3 * np.pi * a**3
+    axial = cylinder * b**2 / 3 + ball * (a**2 / 5 + b**2 + 3 * a * b / 4)
+    radial = cylinder * a**2 / 4 + ball * a**2 / 5
+    return np.array([radial, radial, axial]) / (cylinder + ball)
 
 
 def contains(piece: Piece, points: np.ndarray) -> np.ndarray:
@@ -190,7 +197,8 @@ def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
         gradient = unit / radii
         stretch = np.linalg.norm(gradient, axis=-1)
         keep = u[:, 3] * (1 / radii.min()) < stretch
-        x, n = unit * radii, gradient / stretch[:, None]
+        x = unit * radii
+        n = gradient / stretch[:, None]
     else:
         x, n, _ = on_triangles(np.asarray(triangulate(_vertices(piece)).triangles), u)
     r = rotation(piece)
@@ -210,11 +218,9 @@ def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.n
     face = np.searchsorted(edges, u[:, 0] * edges[-1], side="right").clip(max=len(edges) - 1)
     root = np.sqrt(u[:, 1])
     weights = np.stack([1 - root, root * (1 - u[:, 2]), root * u[:, 2]], -1)
-    return (
-        np.einsum("ni,nij->nj", weights, triangles[face]),
-        crosses[face] / doubled[face, None],
-        face,
-    )
+    points = np.einsum("ni,nij->nj", weights, triangles[face])
+    normals = crosses[face] / doubled[face, None]
+    return points, normals, face
 
 
 def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
@@ -222,13 +228,16 @@ def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
     a, b, c = piece.size
     if piece.kind == "mesh":
         mesh = triangulate(_vertices(piece))
-        x, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        x = np.asarray(mesh.vertices)
+        faces = np.asarray(mesh.faces)
     else:
         unit, faces = _template(piece.kind)
         if piece.kind == "capsule":
             x = unit * a + np.sign(unit[:, 2:]) * [0, 0, b]
+        elif piece.kind == "cylinder":
+            x = unit * [a, a, b]
         else:
-            x = unit * ([a, a, b] if piece.kind == "cylinder" else [a, b, c])
+            x = unit * [a, b, c]
     return x @ rotation(piece).T + np.asarray(piece.pos), faces
 
 
@@ -236,12 +245,17 @@ def mesh_of(pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, concatenated, in the object
     frame.
     """
-    meshes = [tessellate(piece) for piece in pieces]
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
-    vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
-    return vertices, np.concatenate(
-        [f + start for (_, f), start in zip(meshes, starts, strict=True)]
-    ).astype(np.int32)
+    all_vertices = []
+    all_faces = []
+    vertex_count = 0
+    for piece in pieces:
+        vertices, faces = tessellate(piece)
+        all_vertices.append(vertices)
+        all_faces.append(faces + vertex_count)
+        vertex_count += len(vertices)
+    vertices = np.concatenate(all_vertices).astype(np.float32)
+    faces = np.concatenate(all_faces).astype(np.int32)
+    return vertices, faces
 
 
 @functools.cache
@@ -253,9 +267,8 @@ def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.creation.cylinder(1.0, 2.0, sections=_SEGMENTS)
     else:
         # An even number of rings has none on the equator, where a capsule is cut in two.
-        mesh = trimesh.creation.uv_sphere(
-            1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2)
-        )
+        rings = 9 if kind == "capsule" else 10
+        mesh = trimesh.creation.uv_sphere(1.0, count=(rings, _SEGMENTS // 2))
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
@@ -269,7 +282,8 @@ def _vertices(piece: Piece) -> np.ndarray:
 def _sphere(u: np.ndarray) -> np.ndarray:
     """Points (n, 3) distributed evenly over the unit sphere, from random numbers (n, 2 or more)."""
     z = 2 * u[:, 0] - 1
-    ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
+    ring = np.sqrt(1 - z**2)
+    turn = 2 * np.pi * u[:, 1]
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
 
 
@@ -310,7 +324,8 @@ def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndar
     along = (2 * u[:, 0] - 1) * (radius + half)
     center = np.clip(along, -half, half)
     z = (along - center) / radius
-    ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
+    ring = np.sqrt(1 - z**2)
+    turn = 2 * np.pi * u[:, 1]
     normals = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
     return radius * normals + center[:, None] * [0.0, 0.0, 1.0], normals
 
@@ -335,25 +350,28 @@ def sample_union(
     edges = np.cumsum([proposal_area(piece) for piece in pieces])
     starts = np.concatenate([[0.0], edges[:-1]])
     offset = rng.random(4)
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    total, drawn = 0, 0
+    batches: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    total = 0
+    drawn = 0
     while total < count:
         u = _sequence(offset, drawn, 2 * count)
         drawn += 2 * count
         area = u[:, 0] * edges[-1]
         owner = np.searchsorted(edges, area, side="right").clip(max=len(pieces) - 1)
         u[:, 0] = (area - starts[owner]) / (edges - starts)[owner]
-        points, normals, keep = np.empty((len(u), 3)), np.empty((len(u), 3)), np.empty(len(u), bool)
+        points = np.empty((len(u), 3))
+        normals = np.empty((len(u), 3))
+        keep = np.empty(len(u), bool)
         for i, piece in enumerate(pieces):
-            own = owner == i
-            points[own], normals[own], keep[own] = propose(piece, u[own])
+            is_owned = owner == i
+            points[is_owned], normals[is_owned], keep[is_owned] = propose(piece, u[is_owned])
         outside = points + _SEAM * normals
         for i, piece in enumerate(pieces):
             keep &= (owner == i) | ~contains(piece, outside)
-        found.append((points[keep], normals[keep], owner[keep]))
+        batches.append((points[keep], normals[keep], owner[keep]))
         total += int(keep.sum())
-    points, normals, owner = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
-    return points, normals, owner
+    points, normals, owner = map(np.concatenate, zip(*batches, strict=True))
+    return points[:count], normals[:count], owner[:count]
 
 
 def sample_mesh(
@@ -374,20 +392,25 @@ def sample_mesh(
     Returns:
       Points (N, 3), outward unit normals (N, 3), and indices (N,) of each point's triangle.
     """
-    points, normals, face = on_triangles(triangles, _sequence(rng.random(4), 0, 8 * SURFACE_POINTS))
-    outer, inner = (
-        np.any([contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0)
-        for side in (1, -1)
-    )
+    u = _sequence(rng.random(4), 0, 8 * SURFACE_POINTS)
+    points, normals, face = on_triangles(triangles, u)
+    is_covered_outside = _in_any(pieces, points + _REACHABLE * normals)
+    is_covered_inside = _in_any(pieces, points - _REACHABLE * normals)
     if oriented:
-        reachable = ~outer
+        reachable = ~is_covered_outside
     else:
-        reachable = ~(outer & inner)
-        normals = np.where((outer & ~inner)[:, None], -normals, normals)
-    if reachable.mean() < 0.25:
+        reachable = ~(is_covered_outside & is_covered_inside)
+        is_inverted = is_covered_outside & ~is_covered_inside
+        normals = np.where(is_inverted[:, None], -normals, normals)
+    if reachable.mean() < _MIN_REACHABLE_SHARE:
         reachable[:] = True
     chosen = np.flatnonzero(reachable)[:SURFACE_POINTS]
     return points[chosen], normals[chosen], face[chosen]
+
+
+def _in_any(pieces: Sequence[Piece], points: np.ndarray) -> np.ndarray:
+    """Mask (N,) of the points (N, 3) that lie inside at least one piece."""
+    return np.any([contains(piece, points) for piece in pieces], axis=0)
 
 
 def balanced(graspable: np.ndarray) -> np.ndarray:
@@ -436,10 +459,12 @@ def mass_properties(
       densities: (pieces,) kg/m^3.
     """
     masses = densities * [volume(piece) for piece in pieces]
-    centers, inertias = zip(*(unit_inertia(piece) for piece in pieces), strict=True)
+    centers, unit_inertias = zip(*map(unit_inertia, pieces), strict=True)
     mass = float(masses.sum())
     center = masses @ np.array(centers) / mass
+    offsets = np.array(centers) - center
     inertia = np.zeros((3, 3))
-    for m, c, own in zip(masses, np.array(centers) - center, inertias, strict=True):
-        inertia += m * (own + (c @ c) * np.eye(3) - np.outer(c, c))
+    for piece_mass, offset, unit in zip(masses, offsets, unit_inertias, strict=True):
+        # The parallel axis theorem.
+        inertia += piece_mass * (unit + (offset @ offset) * np.eye(3) - np.outer(offset, offset))
     return mass, center, inertia

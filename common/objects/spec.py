@@ -21,9 +21,11 @@ PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
 """Most pieces of each kind in a primitive object: the geoms reserved for the object in a batched
 environment.
 """
-SURFACE_ERROR, VOLUME_ERROR = 0.005, 0.5
-"""Deviation in m, and as a share of the mesh's volume, from which an imported shape is
-unreliable.
+SURFACE_ERROR = 0.005
+"""Deviation of an imported shape's surface above which it is unreliable, m."""
+VOLUME_ERROR = 0.5
+"""Deviation of an imported shape's volume above which it is unreliable, as a share of the mesh's
+volume.
 """
 MAX_MESH_PIECES = 48
 """Most convex pieces of an object with mesh pieces."""
@@ -47,6 +49,22 @@ class Piece:
     vertices: np.ndarray | None = None
     part: int = 0
     """Index into the object's `part_names`."""
+
+    def mirrored(self) -> "Piece":
+        """The mirror image of the piece; all kinds but meshes are symmetric in their frames."""
+        x, y, z = self.pos
+        a, b, c, d = self.quat
+        vertices = None if self.vertices is None else mirror.vector(self.vertices)
+        return dataclasses.replace(self, pos=(-x, y, z), quat=(a, b, -c, -d), vertices=vertices)
+
+    def scaled(self, factor: float) -> "Piece":
+        """The piece with all lengths multiplied by `factor`."""
+        return dataclasses.replace(
+            self,
+            size=_scaled(self.size, factor),
+            pos=_scaled(self.pos, factor),
+            vertices=None if self.vertices is None else factor * self.vertices,
+        )
 
 
 class Colours(NamedTuple):
@@ -102,7 +120,8 @@ class GraspObject:
         """True if the pieces are close enough to the imported mesh for their grasps to transfer to
         it.
         """
-        surface, volume = self.surface_error or 0.0, self.volume_error or 0.0
+        surface = self.surface_error or 0.0
+        volume = self.volume_error or 0.0
         return surface <= SURFACE_ERROR and abs(volume) <= VOLUME_ERROR
 
     @property
@@ -116,23 +135,16 @@ class GraspObject:
         """
         sides = np.array([-1.0, 1.0, 1.0])
 
-        def piece(own: Piece) -> Piece:
-            """A mirrored piece; all kinds but meshes are symmetric in their own frames."""
-            (x, y, z), (a, b, c, d) = own.pos, own.quat
-            vertices = None if own.vertices is None else mirror.vector(own.vertices)
-            return dataclasses.replace(own, pos=(-x, y, z), quat=(a, b, -c, -d), vertices=vertices)
-
         x, y, z = self.origin
-        rest = self.rest_poses
+        rest_positions = mirror.vector(self.rest_poses[:, :3])
+        rest_quats = mirror.quaternion(self.rest_poses[:, 3:])
         return dataclasses.replace(
             self,
-            pieces=tuple(map(piece, self.pieces)),
+            pieces=tuple(piece.mirrored() for piece in self.pieces),
             inertia=self.inertia * np.outer(sides, sides),
             points=mirror.vector(self.points),
             normals=mirror.vector(self.normals),
-            rest_poses=np.concatenate(
-                [mirror.vector(rest[:, :3]), mirror.quaternion(rest[:, 3:])], -1
-            ),
+            rest_poses=np.concatenate([rest_positions, rest_quats], -1),
             visual_vertices=mirror.vector(self.visual_vertices),
             visual_faces=self.visual_faces[:, ::-1],
             origin=(-x, y, z),
@@ -146,32 +158,23 @@ class GraspObject:
         """
         if factor == 1.0:
             return self
-        heavier = 1.0 if constant_mass else factor**3
-
-        def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-            """Returns the vector times the factor."""
-            x, y, z = (factor * length for length in vector)
-            return x, y, z
-
-        pieces = tuple(
-            dataclasses.replace(
-                piece,
-                size=longer(piece.size),
-                pos=longer(piece.pos),
-                vertices=None if piece.vertices is None else factor * piece.vertices,
-            )
-            for piece in self.pieces
-        )
+        mass_factor = 1.0 if constant_mass else factor**3
         return dataclasses.replace(
             self,
-            pieces=pieces,
-            mass=heavier * self.mass,
-            inertia=heavier * factor**2 * self.inertia,
+            pieces=tuple(piece.scaled(factor) for piece in self.pieces),
+            mass=mass_factor * self.mass,
+            inertia=mass_factor * factor**2 * self.inertia,
             points=factor * self.points,
             rest_poses=self.rest_poses * np.array([factor] * 3 + [1.0] * 4),
             visual_vertices=factor * self.visual_vertices,
-            origin=longer(self.origin),
+            origin=_scaled(self.origin, factor),
             file_scale=factor * self.file_scale,
             surface_error=None if self.surface_error is None else factor * self.surface_error,
             colours=self.colours and self.colours._replace(points=factor * self.colours.points),
         )
+
+
+def _scaled(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    """Returns the vector times the factor."""
+    x, y, z = vector
+    return factor * x, factor * y, factor * z

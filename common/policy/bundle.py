@@ -38,12 +38,14 @@ from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 FORMAT = 2
 _SCHEMA = 1
 _CRITIC = "critic"
-_MOST_COUNT = 1 << 53
+_MAX_COUNT = 1 << 53
 """Limit of versions and environment steps, which JSON keeps exactly."""
-_LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
+_MAX_WEIGHT = 1e4
+_MAX_STATISTIC = 1e30
+_MAX_LOG_STD = 10.0
 """Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond
 them, inference in float32 overflows."""
-_SAMPLES_KEPT = 1e5
+_MAX_PRIOR_SAMPLES = 1e5
 """Most samples that count when inputs are added: samples of these soon outweigh the unit variance
 of their start.
 """
@@ -98,8 +100,7 @@ class PolicySpec:
         if spec.schema != self.schema:
             raise CongraspError(
                 f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not "
-                f"for hand "
-                f"'{self.hand_name}' (schema {self.schema}).",
+                f"for hand '{self.hand_name}' (schema {self.schema}).",
                 "Use a policy of this hand, task and network, or change them.",
             )
 
@@ -300,25 +301,27 @@ def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> 
     Raises:
       CongraspError: the policy has another hand, other networks, or inputs that the spec lacks.
     """
-    size, count = bundle.spec.layout[0][1], float(bundle.observation.count)
+    size = bundle.spec.layout[0][1]
+    count = float(bundle.observation.count)
     state = np.arange(size)
     if spec.schema != bundle.spec.schema:
         hand = get_hand(spec.hand)
-        now, before = (_state_inputs(hand, each) for each in (task, bundle.task))
-        grown = dataclasses.replace(
-            bundle.spec, layout=(("state", len(now)), *bundle.spec.layout[1:])
-        )
-        spec.require(
-            grown if len(before) == size and {*before} <= {*now} else bundle.spec, "to begin with"
-        )
-        index = {name: i for i, name in enumerate(before)}
-        state = np.array([index.get(name, -1) for name in now])
+        new_inputs = _state_inputs(hand, task)
+        old_inputs = _state_inputs(hand, bundle.task)
+        extended_spec = bundle.spec
+        if len(old_inputs) == size and set(old_inputs) <= set(new_inputs):
+            layout = (("state", len(new_inputs)), *bundle.spec.layout[1:])
+            extended_spec = dataclasses.replace(bundle.spec, layout=layout)
+        spec.require(extended_spec, "to begin with")
+        index = {name: i for i, name in enumerate(old_inputs)}
+        state = np.array([index.get(name, -1) for name in new_inputs])
     same_critic = spec.privileged == bundle.spec.privileged
-    privileged = (
-        np.arange(spec.privileged_size) if same_critic else np.full(spec.privileged_size, -1)
-    )
+    if same_critic:
+        privileged = np.arange(spec.privileged_size)
+    else:
+        privileged = np.full(spec.privileged_size, -1)
     rows = np.concatenate([state, np.arange(size, len(bundle.observation.mean))])
-    fewer = min(count, _SAMPLES_KEPT) if (state < 0).any() else count
+    fewer = min(count, _MAX_PRIOR_SAMPLES) if (state < 0).any() else count
     scale = fewer / count if count else 1.0
     mean = np.where(rows < 0, 0.0, bundle.observation.mean[rows])
     m2 = np.where(rows < 0, fewer, bundle.observation.m2[rows] * scale)
@@ -334,8 +337,10 @@ def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> 
 
 def _state_inputs(hand: Hand, task: TaskConfig) -> list[tuple[str, int]]:
     """Field and index within the field of each input of the state."""
-    state = task_observation.fields(hand, task)["state"]
-    return [(field.name, i) for field in state for i in range(field.size)]
+    inputs = []
+    for field in task_observation.fields(hand, task)["state"]:
+        inputs += [(field.name, i) for i in range(field.size)]
+    return inputs
 
 
 def content_hash(encoded: bytes) -> str:
@@ -364,9 +369,8 @@ def load(path: pathlib.Path) -> PolicyBundle:
 @functools.partial(jax.jit, static_argnums=0)
 def mean_action(layout: Layout, parameters: InferenceParameters, observation: Array) -> Array:
     """Deterministic action (..., A) for raw observations (..., D)."""
-    mean, _ = network.policy(
-        parameters.params, layout, normalizer.apply(parameters.normalization, observation)
-    )
+    normalized = normalizer.apply(parameters.normalization, observation)
+    mean, _ = network.policy(parameters.params, layout, normalized)
     return mean
 
 
@@ -375,9 +379,8 @@ def sample_action(
     layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
 ) -> tuple[Array, Array]:
     """Sampled action (..., A) for raw observations (..., D), and its log probability (...,)."""
-    mean, log_std = network.policy(
-        parameters.params, layout, normalizer.apply(parameters.normalization, observation)
-    )
+    normalized = normalizer.apply(parameters.normalization, observation)
+    mean, log_std = network.policy(parameters.params, layout, normalized)
     action = network.sample(key, mean, log_std)
     return action, network.log_probability(mean, log_std, action)
 
@@ -416,7 +419,7 @@ def _spec(meta: Mapping[str, Any]) -> PolicySpec:
 def _count(meta: Mapping[str, Any], name: str) -> int:
     """Returns a counter in a bundle's metadata; raises a ValueError outside its range."""
     number = int(meta[name])
-    if not 0 <= number <= _MOST_COUNT:
+    if not 0 <= number <= _MAX_COUNT:
         raise ValueError(f"its {name} is {number:.4g}")
     return number
 
@@ -457,35 +460,39 @@ def _check_arrays(
     """Raises a `CongraspError` unless the arrays have these names and shapes, and values with which
     one can act.
     """
-    if odd := sorted(expected.keys() ^ arrays.keys()):
+    differing = sorted(expected.keys() ^ arrays.keys())
+    if differing:
         raise CongraspError(
-            f"The policy {source} lacks '{odd[0]}', or should not have it.", _REMEDY
+            f"The policy {source} lacks '{differing[0]}', or should not have it.", _REMEDY
         )
     for name, shape in expected.items():
-        array, last = arrays[name], name.rpartition("/")[2]
-        high = (
-            _LARGEST_LOG_STD
-            if last == "log_std"
-            else _LARGEST_STATISTIC
-            if last in Statistics._fields
-            else _LARGEST
-        )
-        low = 0.0 if last in ("count", "m2") else -high
+        array = arrays[name]
         if tuple(array.shape) != shape:
             raise CongraspError(
                 f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY
             )
         # Arrays on a device never left this process; those from a file or the wire are NumPy
         # arrays.
-        if isinstance(array, np.ndarray) and not (
-            array.dtype.kind == "f" and np.isfinite(array).all()
-        ):
+        if not isinstance(array, np.ndarray):
+            continue
+        if array.dtype.kind != "f" or not np.isfinite(array).all():
             raise CongraspError(
                 f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY
             )
-        if isinstance(array, np.ndarray) and not (
-            low <= array.min(initial=0) and array.max(initial=0) <= high
-        ):
+        low, high = _limits(name)
+        if array.min(initial=0) < low or array.max(initial=0) > high:
             raise CongraspError(
                 f"The policy {source} has values in '{name}' out of range.", _REMEDY
             )
+
+
+def _limits(name: str) -> tuple[float, float]:
+    """Smallest and largest value of the array of this name."""
+    leaf = name.rpartition("/")[2]
+    if leaf == "log_std":
+        return -_MAX_LOG_STD, _MAX_LOG_STD
+    if leaf in ("count", "m2"):
+        return 0.0, _MAX_STATISTIC
+    if leaf in Statistics._fields:
+        return -_MAX_STATISTIC, _MAX_STATISTIC
+    return -_MAX_WEIGHT, _MAX_WEIGHT

@@ -17,7 +17,6 @@ policies are computed in the same way, use the backend's default (TF32 on NVIDIA
 cost.
 """
 
-import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -40,8 +39,10 @@ TRUNK = ("state", "heading", "mask")
 """Blocks that feed the trunk directly, in this order; the codes of the gated blocks follow."""
 PRIVILEGED = "privileged"
 """Block of the critic's privileged inputs, which follow the codes in its trunk."""
-CLOUD, POINT = "cloud", 4
-"""Block of a camera's cloud, always active, and its numbers a point."""
+CLOUD = "cloud"
+"""Block of a camera's cloud, always active."""
+POINT = 4
+"""Numbers of each point of a cloud."""
 _HIDDEN_GAIN = math.sqrt(2.0)
 _ACTION_GAIN = 0.01  # initial actions are noise around zero, independent of the observation
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -55,11 +56,9 @@ def gated(layout: Layout) -> tuple[str, ...]:
 def check_layout(layout: Layout) -> None:
     """Raises a `CongraspError` unless the layout has exactly the blocks of the networks."""
     names = [name for name, _ in layout]
-    if (
-        len(set(names)) < len(names)
-        or not {*TRUNK} <= {*names}
-        or dict(layout)["mask"] != len(gated(layout))
-    ):
+    has_duplicates = len(set(names)) < len(names)
+    lacks_trunk = not set(TRUNK) <= set(names)
+    if has_duplicates or lacks_trunk or dict(layout)["mask"] != len(gated(layout)):
         raise CongraspError(
             f"The observation layout {names} does not match the network.",
             "Use this version's layout.",
@@ -68,11 +67,12 @@ def check_layout(layout: Layout) -> None:
 
 def split(layout: Layout, observation: Array) -> dict[str, Array]:
     """Splits observations (..., D) into blocks by name."""
-    ends = itertools.accumulate(size for _, size in layout)
-    return {
-        name: observation[..., end - size : end]
-        for (name, size), end in zip(layout, ends, strict=True)
-    }
+    blocks = {}
+    start = 0
+    for name, size in layout:
+        blocks[name] = observation[..., start : start + size]
+        start += size
+    return blocks
 
 
 class GatedNetwork(nn.Module):
@@ -136,12 +136,11 @@ def _fast(
 def _sizes(tree: Params) -> tuple[tuple[int, ...], tuple[int, ...], int, int]:
     """Units of a network's trunk, points, encoders and output, from its kernels' shapes."""
     units = {name: layer["kernel"].shape[-1] for name, layer in tree.items()}
-    depths = {kind: layer_count(tree, kind) for kind in ("trunk", CLOUD)}
-    hidden, points = (
-        tuple(units.pop(f"{kind}_{i}") for i in range(depth)) for kind, depth in depths.items()
-    )
+    hidden = tuple(units.pop(f"trunk_{i}") for i in range(layer_count(tree, "trunk")))
+    points = tuple(units.pop(f"{CLOUD}_{i}") for i in range(layer_count(tree, CLOUD)))
     outputs = units.pop("output")
-    return hidden, points, next(iter(units.values()), 0), outputs
+    encoder = next(iter(units.values()), 0)
+    return hidden, points, encoder, outputs
 
 
 def layer_count(tree: Mapping[str, Any], kind: str) -> int:
@@ -194,16 +193,13 @@ def init(
 
     def fill(layers: Params, output_gain: float) -> Params:
         """Initialises the layers of one network, the last with a separate gain."""
-        gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
-        return {
-            name: {
-                "kernel": (gains[name] * _orthogonal(rng, layer["kernel"].shape)).astype(
-                    np.float32
-                ),
-                "bias": np.zeros(layer["bias"].shape, np.float32),
-            }
-            for name, layer in layers.items()
-        }
+        filled = {}
+        for name, layer in layers.items():
+            gain = output_gain if name == "output" else _HIDDEN_GAIN
+            kernel = gain * _orthogonal(rng, layer["kernel"].shape)
+            bias = np.zeros(layer["bias"].shape, np.float32)
+            filled[name] = {"kernel": kernel.astype(np.float32), "bias": bias}
+        return filled
 
     log_std = np.full(action_size, math.log(config.initial_std), np.float32)
     actor = {"network": fill(tree["actor"]["network"], _ACTION_GAIN), "log_std": log_std}
@@ -231,9 +227,9 @@ def policy(
     """
     actor = params["actor"]
     build = _exact if exact else _fast
-    return build(layout, *_sizes(actor["network"])).apply(
-        {"params": actor["network"]}, observation
-    ), actor["log_std"]
+    module = build(layout, *_sizes(actor["network"]))
+    mean = module.apply({"params": actor["network"]}, observation)
+    return mean, actor["log_std"]
 
 
 def value(
@@ -246,7 +242,8 @@ def value(
     if privileged is not None:
         layout = _critic_layout(layout, privileged.shape[-1])
         observation = jnp.concatenate([observation, privileged], -1)
-    output: Array = _fast(layout, *_sizes(critic)).apply({"params": critic}, observation)
+    module = _fast(layout, *_sizes(critic))
+    output: Array = module.apply({"params": critic}, observation)
     return output[..., 0]
 
 
@@ -260,13 +257,15 @@ def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Pa
         -1 if it is new.
       privileged: the same for the critic's privileged inputs, of which some may be dropped.
     """
-    before = len(params["actor"]["network"]["trunk_0"]["kernel"])
-    kept = np.concatenate([state, np.arange(np.count_nonzero(state >= 0), before)])
-    rows = np.concatenate([kept, np.where(privileged < 0, -1, before + privileged)])
-    actor = {**params["actor"], "network": _with_rows(params["actor"]["network"], kept)}
-    widened = {**params, "actor": actor}
+    actor = params["actor"]
+    old_size = len(actor["network"]["trunk_0"]["kernel"])
+    old_state_size = np.count_nonzero(state >= 0)
+    actor_rows = np.concatenate([state, np.arange(old_state_size, old_size)])
+    widened = {**params, "actor": {**actor, "network": _with_rows(actor["network"], actor_rows)}}
     if "critic" in params:
-        widened["critic"] = _with_rows(params["critic"], rows)
+        privileged_rows = np.where(privileged < 0, -1, old_size + privileged)
+        critic_rows = np.concatenate([actor_rows, privileged_rows])
+        widened["critic"] = _with_rows(params["critic"], critic_rows)
     return widened
 
 

@@ -19,7 +19,8 @@ from congrasp.common.task.types import Array
 
 LIMIT = 10.0
 """Normalised observations are clipped to [-LIMIT, LIMIT]."""
-_SMALLEST_STD = 1e-3
+_MIN_STD = 1e-3
+"""Smallest standard deviation by which values are divided."""
 
 
 class Statistics(NamedTuple):
@@ -80,7 +81,7 @@ def merge(*parts: Statistics) -> Statistics:
 
 def _std(statistics: Statistics) -> np.ndarray:
     """Standard deviations, bounded away from zero."""
-    return np.maximum(np.sqrt(statistics.m2 / statistics.count), _SMALLEST_STD)
+    return np.maximum(np.sqrt(statistics.m2 / statistics.count), _MIN_STD)
 
 
 def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
@@ -92,7 +93,8 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
     points of a cloud have the same scales, so that their order does not matter.
     """
     size = sum(width for _, width in layout)
-    shift, scale = np.zeros(size), np.ones(size)
+    shift = np.zeros(size)
+    scale = np.ones(size)
     start = 0
     for name, width in layout:
         block = slice(start, start + width)
@@ -100,13 +102,14 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
         if statistics.count == 0 or name == "mask":
             continue
         part = Statistics(statistics.count, statistics.mean[block], statistics.m2[block])
-        if name not in TRUNK:
-            mean_square = part.mean**2 + part.m2 / part.count
-            if name == CLOUD:
-                mean_square = np.tile(mean_square.reshape(-1, POINT).mean(0), width // POINT)
-            scale[block] = 1.0 / np.maximum(np.sqrt(mean_square), _SMALLEST_STD)
-        else:
-            shift[block], scale[block] = part.mean, 1.0 / _std(part)
+        if name in TRUNK:
+            shift[block] = part.mean
+            scale[block] = 1.0 / _std(part)
+            continue
+        mean_square = part.mean**2 + part.m2 / part.count
+        if name == CLOUD:
+            mean_square = np.tile(mean_square.reshape(-1, POINT).mean(0), width // POINT)
+        scale[block] = 1.0 / np.maximum(np.sqrt(mean_square), _MIN_STD)
     return Affine(shift.astype(np.float32), scale.astype(np.float32))
 
 
@@ -115,17 +118,18 @@ def privileged_affine(statistics: Statistics) -> Affine:
     the identity.
     """
     if statistics.count == 0:
-        return Affine(
-            np.zeros_like(statistics.mean, np.float32), np.ones_like(statistics.mean, np.float32)
-        )
-    return Affine(statistics.mean.astype(np.float32), (1.0 / _std(statistics)).astype(np.float32))
+        zeros = np.zeros_like(statistics.mean, np.float32)
+        return Affine(shift=zeros, scale=np.ones_like(zeros))
+    scale = 1.0 / _std(statistics)
+    return Affine(statistics.mean.astype(np.float32), scale.astype(np.float32))
 
 
 def apply(affine: Affine, observation: Array) -> Array:
     """Normalised observations (..., D) in float32, clipped to `LIMIT`. Zeros of inactive blocks
     stay zero.
     """
-    return jnp.clip((observation.astype(jnp.float32) - affine.shift) * affine.scale, -LIMIT, LIMIT)
+    normalized = (observation.astype(jnp.float32) - affine.shift) * affine.scale
+    return jnp.clip(normalized, -LIMIT, LIMIT)
 
 
 def value_affine(statistics: Statistics) -> Affine:

@@ -19,11 +19,13 @@ def pretrained_file(hand: str) -> pathlib.Path | None:
 
     A hand described by a file can only have a policy of the user, whatever its name.
     """
-    found = get_hand(hand)
-    packaged, own = _FOLDER / f"{found.name}{SUFFIX}", own_policy_file(found.name)
-    return next(
-        (path for path in ([own] if found.text else [packaged, own]) if path.exists()), None
-    )
+    spec = get_hand(hand)
+    users_file = own_policy_file(spec.name)
+    candidates = [users_file] if spec.text else [packaged_file(spec.name), users_file]
+    for path in candidates:
+        if path.exists():
+            return path
+    return None
 
 
 def packaged_file(name: str) -> pathlib.Path:
@@ -46,23 +48,27 @@ def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
       CongraspError: there is no such hand, or no policy for it.
     """
     path = pathlib.Path(name)
-    by_hand = str(name) in HANDS or not (path.suffix or path.exists() or _packaged(path))
-    return policy_file(None if by_hand else path, str(name))
+    is_policy = bool(path.suffix or path.exists() or _packaged(path))
+    if str(name) in HANDS or not is_policy:
+        return policy_file(None, str(name))
+    return policy_file(path)
 
 
 def _packaged(name: pathlib.Path) -> pathlib.Path | None:
     """Returns the package's policy file of this name, unless there is such a file in the working
     directory.
     """
-    file = _FOLDER / f"{name}{SUFFIX}"
-    return file if len(name.parts) == 1 and not name.exists() and file.exists() else None
+    if len(name.parts) != 1 or name.exists():
+        return None
+    file = packaged_file(str(name))
+    return file if file.exists() else None
 
 
 def reference_file(hand: str) -> pathlib.Path | None:
     """Returns the file of a hand's reference policy, without reference poses and trajectories; None
     if absent.
     """
-    path = _FOLDER / f"{get_hand(hand).name}-reference{SUFFIX}"
+    path = packaged_file(f"{get_hand(hand).name}-reference")
     return path if path.exists() else None
 
 
@@ -70,32 +76,30 @@ def pretrained_hands() -> list[str]:
     """Names of the hands with a policy in the package, in the package's order: the human hand
     first.
     """
-    return [name for name in HANDS if (_FOLDER / f"{name}{SUFFIX}").exists()]
+    return [name for name in HANDS if packaged_file(name).exists()]
 
 
 def hands_with_policy() -> list[str]:
     """Names of `pretrained_hands`, followed by the user's custom hands that have a policy."""
-    packaged = pretrained_hands()
-    return [
-        *packaged,
-        *(name for name in own_hands() if name not in packaged and own_policy_file(name).exists()),
-    ]
+    hands = pretrained_hands()
+    for name in own_hands():
+        if name not in hands and own_policy_file(name).exists():
+            hands.append(name)
+    return hands
 
 
-def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
-    """Returns the policy file of a command: the given path or name, or else the pretrained one.
+def policy_file(policy: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
+    """Returns the policy file of a command: that of a path or name, or else the pretrained one.
 
     Raises:
       CongraspError: there is no such file, policy or hand, or the user's policy belongs to another
         hand of this name.
     """
-    path = (_packaged(given) or given) if given else pretrained_file(hand)
-    if (
-        not given
-        and path is not None
-        and (own := get_hand(hand)).text
-        and bundles.load(path).spec.hand != own.text
-    ):
+    if policy:
+        return _packaged(policy) or policy
+    path = pretrained_file(hand)
+    spec = get_hand(hand)
+    if path is not None and spec.text and bundles.load(path).spec.hand != spec.text:
         raise CongraspError(
             f"{path} was trained for another hand of this name, or for an earlier version of the "
             f"hand's file.",
@@ -103,10 +107,8 @@ def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path
         )
     if path is None:
         raise CongraspError(
-            f"No policy was given, and this installation has none for the hand "
-            f"'{get_hand(hand).name}'.",
+            f"No policy was given, and this installation has none for the hand '{spec.name}'.",
             "Train one with 'congrasp hands train', or pass --policy FILE: every run of 'congrasp "
-            "train' has a "
-            "policy.safetensors.",
+            "train' has a policy.safetensors.",
         )
     return path

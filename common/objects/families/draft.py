@@ -14,6 +14,12 @@ from scipy.spatial import ConvexHull
 
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, Piece
 
+_SIDES = 16
+"""Corners of the cross-section of a lathed shape."""
+_FLAT = 3e-4
+"""Depth to which a profile may lie below the chord that replaces it, m."""
+_STATIONS = 3
+"""Outer corners of a wall's segment around the axis."""
 Rng = np.random.Generator
 Vector = tuple[float, float, float]
 
@@ -92,16 +98,12 @@ def either(rng: Rng) -> tuple[bool, bool]:
 
 def _between(start: Vector, end: Vector) -> tuple[Vector, tuple[float, float, float, float], float]:
     """Centre, quaternion (z axis along the segment) and half length of a segment."""
-    a, b = np.array(start, float), np.array(end, float)
+    a = np.array(start, float)
+    b = np.array(end, float)
     x, y, z = (b - a) / np.linalg.norm(b - a)
     q = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
     q /= np.linalg.norm(q)
     return tuple((a + b) / 2), tuple(q), float(np.linalg.norm(b - a)) / 2
-
-
-_SIDES = 16
-_FLAT = 3e-4  # tolerance of a profile below the chord that replaces it, m
-_STATIONS = 3  # outer corners of a wall's segment around the axis
 
 
 def hull(*parts: Sequence[Sequence[float]] | np.ndarray, part: int = 0) -> Piece:
@@ -110,6 +112,29 @@ def hull(*parts: Sequence[Sequence[float]] | np.ndarray, part: int = 0) -> Piece
     """
     points = np.concatenate([np.asarray(points, float) for points in parts])
     return mesh(points[np.sort(ConvexHull(points).vertices)], part)
+
+
+def grid(xs: Sequence[float], ys: Sequence[float], zs: Sequence[float]) -> np.ndarray:
+    """Points (V, 3) with every combination of these coordinates; z changes fastest."""
+    return np.array(list(itertools.product(xs, ys, zs)), float)
+
+
+def thickened(
+    corners: Sequence[Sequence[float]] | np.ndarray, axis: int, half: float, *, part: int = 0
+) -> Piece:
+    """A plate: the hull of corners (V, 3) that are moved by `half` metres to both sides.
+
+    Args:
+      corners: corners of a polygon.
+      axis: index of the coordinate along which the corners move.
+      half: half of the thickness, m.
+      part: part of the piece.
+    """
+    offset = np.zeros(3)
+    offset[axis] = half
+    back = np.zeros(3)
+    back[axis] = -half
+    return hull(np.add(corners, back), np.add(corners, offset), part=part)
 
 
 def lathe(
@@ -128,15 +153,15 @@ def lathe(
       squash: factor on y: below 1 the cross-section is an ellipse.
       sides: number of corners of a cross-section.
     """
-    most = MAX_MESH_VERTICES // sides
-    pieces, first = [], 0
+    max_rings = MAX_MESH_VERTICES // sides
+    pieces = []
+    first = 0
     while first < len(profile) - 1:
         last = first + 1
-        while (
-            last + 1 < len(profile)
-            and last + 1 - first < most
-            and _bulges(profile[first : last + 2])
-        ):
+        while last + 1 < len(profile):
+            is_full = last + 1 - first >= max_rings
+            if is_full or not _bulges(profile[first : last + 2]):
+                break
             last += 1
         rings = [ring(radius, z, sides, squash) for z, radius in profile[first : last + 1]]
         pieces.append(hull(*rings, part=part))
@@ -160,14 +185,14 @@ def shell(
     pieces = []
     for pair in itertools.pairwise(profile):
         for start, end in itertools.pairwise(turns):
-            outside = np.linspace(start, end, _STATIONS)
-            corners = [
-                _around(radius, turn, z, squash) for z, radius, _ in pair for turn in outside
-            ]
-            corners += [
-                _around(radius, turn, z, squash) for z, _, radius in pair for turn in (start, end)
-            ]
-            pieces.append(hull(corners, part=part))
+            outside = []
+            inside = []
+            for z, outer_radius, inner_radius in pair:
+                for turn in np.linspace(start, end, _STATIONS):
+                    outside.append(_around(outer_radius, turn, z, squash))
+                for turn in (start, end):
+                    inside.append(_around(inner_radius, turn, z, squash))
+            pieces.append(hull(outside, inside, part=part))
     return pieces
 
 
@@ -191,12 +216,15 @@ def vessel(
     """
     heights, radii = np.array(profile).T
     corners = (_STATIONS - 1) * sides
-    inside = np.interp(wall, heights, radii)
-    floor = hull(
-        ring(radii[0], heights[0], corners, squash), ring(inside, wall, corners, squash), part=part
-    )
-    rest = [(wall, inside), *((z, radius) for z, radius in profile if z > wall)]
-    return [floor, *shell([(z, r, r - wall) for z, r in rest], sides, part=part, squash=squash)]
+    radius_above_floor = np.interp(wall, heights, radii)
+    bottom = ring(radii[0], heights[0], corners, squash)
+    top = ring(radius_above_floor, wall, corners, squash)
+    floor = hull(bottom, top, part=part)
+    wall_profile = [(wall, radius_above_floor, radius_above_floor - wall)]
+    for z, radius in profile:
+        if z > wall:
+            wall_profile.append((z, radius, radius - wall))
+    return [floor, *shell(wall_profile, sides, part=part, squash=squash)]
 
 
 def extrude(
@@ -212,28 +240,27 @@ def extrude(
       taper: factor on the outline at the top.
       part: part of the pieces.
     """
-    most = MAX_MESH_VERTICES // 2 - 1
+    max_corners = MAX_MESH_VERTICES // 2 - 1
     count = len(outline)
     convex = _turns_left(np.roll(outline, 1, 0), outline, np.roll(outline, -1, 0))
-    if convex.all() and count <= most:
+    if convex.all() and count <= max_corners:
         return [_prism(outline, low, high, taper, part)]
     # Sectors begin at a reflex corner if there is one.
-    outline, convex = (np.roll(values, -int(convex.argmin()), 0) for values in (outline, convex))
-    closed, first, pieces = np.concatenate([outline, outline[:1]]), 0, []
+    first_corner = int(convex.argmin())
+    outline = np.roll(outline, -first_corner, 0)
+    convex = np.roll(convex, -first_corner, 0)
+    closed = np.concatenate([outline, outline[:1]])
+    first = 0
+    pieces = []
     while first < count:
         last = first + 1
-        while (
-            last < count
-            and last - first < most - 2
-            and convex[last]
-            and _sector(closed[first : last + 2])
-        ):
+        while last < count:
+            is_full = last - first >= max_corners - 2
+            if is_full or not convex[last] or not _sector(closed[first : last + 2]):
+                break
             last += 1
-        pieces.append(
-            _prism(
-                np.concatenate([np.zeros((1, 2)), closed[first : last + 1]]), low, high, taper, part
-            )
-        )
+        sector = np.concatenate([np.zeros((1, 2)), closed[first : last + 1]])
+        pieces.append(_prism(sector, low, high, taper, part))
         first = last
     return pieces
 
@@ -259,7 +286,8 @@ def sweep(
       closed: joins the last centre to the first.
       part: part of the pieces.
     """
-    count, up = len(path), np.array(normal, float)
+    count = len(path)
+    up = np.array(normal, float)
     ways = np.roll(path, -1, 0) - path
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
     if closed:
@@ -271,15 +299,18 @@ def sweep(
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
     # A mitre is longer than the bar's width
     side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)
-    turns = (
-        np.pi / 4 * np.arange(8) + np.pi / 8 if rounded else np.pi / 2 * np.arange(4) + np.pi / 4
-    )
+    if rounded:
+        turns = np.pi / 4 * np.arange(8) + np.pi / 8
+    else:
+        turns = np.pi / 2 * np.arange(4) + np.pi / 4
     corners = np.stack([np.cos(turns), np.sin(turns)], -1) / np.cos(turns[0])
     across = np.broadcast_to(width, count)[:, None] / 2 * side
     along = np.broadcast_to(thickness, count)[:, None] / 2 * up
     sections = path[:, None] + corners[:, :1] * across[:, None] + corners[:, 1:] * along[:, None]
-    pairs = list(itertools.pairwise(sections)) + ([(sections[-1], sections[0])] if closed else [])
-    return [hull(*pair, part=part) for pair in pairs]
+    pieces = [hull(start, end, part=part) for start, end in itertools.pairwise(sections)]
+    if closed:
+        pieces.append(hull(sections[-1], sections[0], part=part))
+    return pieces
 
 
 def slab(
@@ -289,26 +320,22 @@ def slab(
     x, y, z = half
     turns = np.linspace(0, np.pi / 2, 4)
     arc = corner * np.stack([np.cos(turns), np.sin(turns)], -1)
-    quarters = [
-        (arc + np.array([x - corner, y - corner])) * [sx, sy]
-        for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    ]
-    return _prism(
-        np.concatenate(quarters) + np.array(center[:2]), center[2] - z, center[2] + z, 1.0, part
-    )
+    quarter = arc + np.array([x - corner, y - corner])
+    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    outline = np.concatenate([quarter * sign for sign in signs]) + np.array(center[:2])
+    return _prism(outline, center[2] - z, center[2] + z, 1.0, part)
 
 
-def moved(piece: Piece, shift: Sequence[float]) -> Piece:
+def moved(piece: Piece, shift: Sequence[float] | np.ndarray) -> Piece:
     """Returns the piece translated by (3,) metres."""
-    x, y, z = np.add(piece.pos, shift)
+    x, y, z = np.add(piece.pos, shift).tolist()
     return dataclasses.replace(piece, pos=(x, y, z))
 
 
 def ring(radius: float, z: float, sides: int = _SIDES, squash: float = 1.0) -> np.ndarray:
     """Corners (sides, 3) of a polygon around z."""
-    return np.array(
-        [_around(radius, turn, z, squash) for turn in 2 * np.pi / sides * np.arange(sides)]
-    )
+    turns = 2 * np.pi / sides * np.arange(sides)
+    return np.array([_around(radius, turn, z, squash) for turn in turns])
 
 
 def arc(
@@ -318,18 +345,17 @@ def arc(
     and z.
     """
     turns = np.linspace(start, end, count)
-    return np.array(center) + np.stack(
-        [radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1
-    )
+    offsets = np.stack([radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1)
+    return np.array(center) + offsets
 
 
 def smooth(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
     """Values (count,) of a random smooth curve that reaches both bounds."""
     at = np.linspace(0, 1, count)[:, None]
-    waves = rng.normal(size=3) / np.array([1.0, 1.5, 2.5])
-    values = (waves * np.cos(np.pi * np.array([1, 2, 3]) * at + rng.uniform(0, 2 * np.pi, 3))).sum(
-        -1
-    )
+    amplitudes = rng.normal(size=3) / np.array([1.0, 1.5, 2.5])
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    waves = amplitudes * np.cos(np.pi * np.array([1, 2, 3]) * at + phases)
+    values = waves.sum(-1)
     return low + (high - low) * (values - values.min()) / np.ptp(values)
 
 
@@ -343,15 +369,17 @@ def _bulges(profile: Sequence[tuple[float, float]]) -> bool:
     points.
     """
     z, radius = np.array(profile).T
-    return all(
-        radius[j] > np.interp(z[j], z[[i, k]], radius[[i, k]]) - _FLAT
-        for i, j, k in itertools.combinations(range(len(z)), 3)
-    )
+    for first, middle, last in itertools.combinations(range(len(z)), 3):
+        chord = np.interp(z[middle], z[[first, last]], radius[[first, last]])
+        if radius[middle] <= chord - _FLAT:
+            return False
+    return True
 
 
 def _turns_left(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(...,) bool: True where the path over points (..., 2) turns left or is straight."""
-    first, second = b - a, c - b
+    first = b - a
+    second = c - b
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0] > -1e-12
 
 
@@ -363,10 +391,6 @@ def _sector(corners: np.ndarray) -> bool:
 
 def _prism(outline: np.ndarray, low: float, high: float, taper: float, part: int) -> Piece:
     """The hull of an outline (V, 2) at the bottom and, scaled about the origin, at the top."""
-    return hull(
-        *(
-            np.column_stack([s * outline, np.full(len(outline), z)])
-            for s, z in ((1, low), (taper, high))
-        ),
-        part=part,
-    )
+    bottom = np.column_stack([outline, np.full(len(outline), low)])
+    top = np.column_stack([taper * outline, np.full(len(outline), high)])
+    return hull(bottom, top, part=part)
