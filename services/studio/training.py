@@ -27,12 +27,11 @@ from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops import status as statuses
 from congrasp.services.ops.logs import log
 from congrasp.services.record.chunks import DamagedChunkError
+from congrasp.services.record.mcap_messages import intact_summary, messages_between
 from congrasp.services.record.reader import (
     Record,
-    intact_summary,
     is_episode,
     log_files,
-    messages_between,
     metrics_of,
     read_records,
 )
