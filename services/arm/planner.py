@@ -15,14 +15,8 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm
-from congrasp.services.arm.robot import (
-    Infeasible,
-    Pose,
-    Robot,
-    build_robot,
-    default_mount,
-    moved_arm,
-)
+from congrasp.services.arm.moved_arm import moved_arm
+from congrasp.services.arm.robot import Infeasible, Pose, Robot, build_robot, default_mount
 from congrasp.services.export.frames import NOT_LINKS
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record.episode import MovedArm
