@@ -287,12 +287,12 @@ class LogWriter:
         """
         with os_errors_as(f"The folder {directory} cannot be created"):
             directory.mkdir(parents=True, exist_ok=True)
-        self._directory, self._name, self._run = directory, name, run
-        self._max_bytes, self._max_ns, self._open_file = (
-            max_bytes,
-            round(1e9 * max_seconds),
-            open_file,
-        )
+        self._directory = directory
+        self._name = name
+        self._run = run
+        self._max_bytes = max_bytes
+        self._max_ns = round(1e9 * max_seconds)
+        self._open_file = open_file
         self._number = 0
         self._file: IO[bytes] | None = None
         self._path = directory
