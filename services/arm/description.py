@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import xml.etree.ElementTree as ET
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,8 +19,10 @@ from congrasp.services.assets.hands.robot_texts import robot_text
 SPEED = 3.14
 """Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""
 _SITES = ("attachment_site", "flange", "tool0", "ee_site")
-_ARRAYS, _BODIES = "arm.npz", "arm.xml"
-_KINDS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_ARRAYS_FILE = "arm.npz"
+_BODIES_FILE = "arm.xml"
+_JOINT_TYPES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_MAX_LISTED_BODIES = 4  # in a message
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,16 +66,18 @@ def arm_file(name: str) -> pathlib.Path:
             f"There is no file {name}. A robot's name", "mujoco_menagerie"
         ) from None
     names = mujoco_menagerie.names()
-    found = [name] if name in names else [other for other in names if name in other.split("_")]
-    if len(found) != 1:
-        remedy = f"Name one of {', '.join(found)}." if found else "Pass an MJCF or URDF file."
-        raise CongraspError(f"MuJoCo Menagerie has {len(found)} robots called '{name}'.", remedy)
-    robot = mujoco_menagerie.get(found[0])
+    matches = [name]
+    if name not in names:
+        matches = [other for other in names if name in other.split("_")]
+    if len(matches) != 1:
+        remedy = f"Name one of {', '.join(matches)}." if matches else "Pass an MJCF or URDF file."
+        raise CongraspError(f"MuJoCo Menagerie has {len(matches)} robots called '{name}'.", remedy)
+    robot = mujoco_menagerie.get(matches[0])
     try:
         return pathlib.Path(robot.xml(_bare_entry(robot.entry_names)))
     except (mujoco_menagerie.MenagerieError, OSError):
         raise CongraspError(
-            f"'{found[0]}' of MuJoCo Menagerie could not be downloaded.",
+            f"'{matches[0]}' of MuJoCo Menagerie could not be downloaded.",
             "Connect to the internet, or pass an MJCF or URDF file.",
         ) from None
 
@@ -97,51 +101,71 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
       CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges
         nor slides, or the speed limits are invalid.
     """
-    with confined(write_arm, path, {"flange": flange, "speed": speed}) as (answer, folder):
-        arrays = read_npz(folder / _ARRAYS, "")
-        spec = mujoco.MjSpec.from_string((folder / _BODIES).read_text())
+    with confined(write_arm, path, {"flange": flange, "speed": speed}) as (names, folder):
+        arrays = read_npz(folder / _ARRAYS_FILE, "")
+        spec = mujoco.MjSpec.from_string((folder / _BODIES_FILE).read_text())
     name = path.parent.name if path.stem in ("robot", "scene") else path.stem
-    return Arm(name, spec, tuple(answer["joints"]), flange=answer["flange"], **arrays)
+    return Arm(
+        name=name,
+        spec=spec,
+        joints=tuple(names["joints"]),
+        flange=names["flange"],
+        **arrays,
+    )
 
 
 def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[str, Any]:
     """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and
     arrays.
+
+    Returns:
+      Names of the `joints` and of the body with the `flange`.
     """
     file = pathlib.Path(path)
     spec, _ = robot_spec(file, [])
+    _name_elements(spec)
+    with contextlib.chdir(file.parent):
+        model = spec.compile()
+    mount = _flange(model, file, flange)
+    flange_name = model.body(mount.body).name
+    joints = _joints_to(model, mount.body)
+    if not joints or any(model.jnt_type[joint] not in _JOINT_TYPES for joint in joints):
+        raise CongraspError(
+            f"{path} has no chain of hinges and slides from its base to '{flange_name}'.",
+            "Pass the arm's last body or site with --flange.",
+        )
+    names = tuple(model.joint(joint).name for joint in joints)
+    is_limited = model.jnt_limited[joints].astype(bool)
+    lower, upper = model.jnt_range[joints].T
+    _strip(spec, model, mount.body)
+    np.savez(
+        folder / _ARRAYS_FILE,
+        lower=np.where(is_limited, lower, -np.inf),
+        upper=np.where(is_limited, upper, np.inf),
+        speed=_speeds(file, names, speed),
+        position=mount.position,
+        quaternion=mount.quaternion,
+        postures=model.key_qpos[:, model.jnt_qposadr[joints]],
+    )
+    (folder / _BODIES_FILE).write_text(spec.to_xml())
+    return {"joints": names, "flange": flange_name}
+
+
+def _name_elements(spec: mujoco.MjSpec) -> None:
+    """Names the bodies and joints that have no name."""
     for i, body in enumerate(spec.bodies):
         body.name = body.name or f"body_{i}"
     for i, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint_{i}"
-    with contextlib.chdir(file.parent):
-        model = spec.compile()
-    body, position, quaternion = _flange(model, file, flange)
-    carried = [i for i in _above(model, body) if model.body_jntnum[i]]
-    joints = [int(model.body_jntadr[i]) + k for i in carried for k in range(model.body_jntnum[i])]
-    if not joints or any(model.jnt_type[j] not in _KINDS for j in joints):
-        raise CongraspError(
-            f"{path} has no chain of hinges and slides from its base to '{model.body(body).name}'.",
-            "Pass the arm's last body or site with --flange.",
-        )
-    names = tuple(model.joint(j).name for j in joints)
-    limited = model.jnt_limited[joints].astype(bool)
-    lower, upper = (
-        np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf))
-    )
-    postures = model.key_qpos[:, model.jnt_qposadr[joints]]
-    _strip(spec, model, body)
-    np.savez(
-        folder / _ARRAYS,
-        lower=lower,
-        upper=upper,
-        speed=_speeds(file, names, speed),
-        position=position,
-        quaternion=quaternion,
-        postures=postures,
-    )
-    (folder / _BODIES).write_text(spec.to_xml())
-    return {"joints": names, "flange": model.body(body).name}
+
+
+def _joints_to(model: mujoco.MjModel, body: int) -> list[int]:
+    """Joints from the base to a body."""
+    joints: list[int] = []
+    for link in _above(model, body):
+        first = int(model.body_jntadr[link])
+        joints.extend(range(first, first + int(model.body_jntnum[link])))
+    return joints
 
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
@@ -153,28 +177,43 @@ def _above(model: mujoco.MjModel, body: int) -> list[int]:
     return chain
 
 
-def _flange(
-    model: mujoco.MjModel, path: pathlib.Path, name: str
-) -> tuple[int, np.ndarray, np.ndarray]:
-    """The body that carries the hand, and position (3,) and quaternion (4,) of the flange in its
-    frame.
-    """
+class _Flange(NamedTuple):
+    """Frame to which the hand is attached."""
+
+    body: int
+    """The body that carries the hand."""
+    position: np.ndarray
+    """(3,) in the frame of the body, m."""
+    quaternion: np.ndarray
+    """(4,) w x y z, in the frame of the body."""
+
+
+def _frame_of(body: int) -> _Flange:
+    """A flange that is the frame of a body."""
+    return _Flange(body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> _Flange:
+    """Returns the flange of a name; if that is empty, of a usual site, or the end of the chain."""
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(model.nbody)]
-    chosen = name or next((site for site in _SITES if site in sites), "")
-    if chosen in sites:
-        site = sites.index(chosen)
-        return int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site]
-    if chosen in bodies:
-        return bodies.index(chosen), np.zeros(3), np.array([1.0, 0, 0, 0])
-    if chosen:
+    usual_sites = [site for site in _SITES if site in sites]
+    if not name and usual_sites:
+        name = usual_sites[0]
+    if name in sites:
+        site = sites.index(name)
+        return _Flange(int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site])
+    if name in bodies:
+        return _frame_of(bodies.index(name))
+    if name:
         raise CongraspError(
-            f"{path} has no site or body '{chosen}'.", f"It ends with {', '.join(bodies[-4:])}."
+            f"{path} has no site or body '{name}'.",
+            f"It ends with {', '.join(bodies[-_MAX_LISTED_BODIES:])}.",
         )
     return _last_body(model)
 
 
-def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
+def _last_body(model: mujoco.MjModel) -> _Flange:
     """The end of the chain of joints, before a gripper: see `_flange`.
 
     A gripper is a body without a joint whose children move apart; where it begins with a joint, it
@@ -188,15 +227,16 @@ def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
         moving[body] |= model.body_jntnum[body] > 0
         moving[int(model.body_parentid[body])] |= moving[body]
     body = 0
-    while branches := [child for child in children[body] if moving[child]]:
-        if len(branches) > 1:
-            if body and not model.body_jntnum[body]:
-                return int(model.body_parentid[body]), model.body_pos[body], model.body_quat[body]
-            break
+    branches = [child for child in children[body] if moving[child]]
+    while len(branches) == 1:
         body = branches[0]
+        branches = [child for child in children[body] if moving[child]]
+    if len(branches) > 1 and body and not model.body_jntnum[body]:  # a gripper
+        parent = int(model.body_parentid[body])
+        return _Flange(parent, model.body_pos[body], model.body_quat[body])
     while len(children[body]) == 1 and not moving[children[body][0]]:
         body = children[body][0]
-    return body, np.zeros(3), np.array([1.0, 0, 0, 0])
+    return _frame_of(body)
 
 
 def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
@@ -210,43 +250,68 @@ def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
     for material in spec.materials:
         for i in range(len(material.textures)):
             material.textures[i] = ""
-    for m, mesh in enumerate(spec.meshes):
-        turn = Rotation.from_quat(model.mesh_quat[m], scalar_first=True)
-        start, end = model.mesh_vertadr[m], model.mesh_vertadr[m] + model.mesh_vertnum[m]
-        first, last = model.mesh_faceadr[m], model.mesh_faceadr[m] + model.mesh_facenum[m]
-        mesh.uservert = (turn.apply(model.mesh_vert[start:end]) + model.mesh_pos[m]).ravel()
-        mesh.userface = model.mesh_face[first:last].ravel()
-        mesh.name, mesh.file, mesh.content_type, mesh.scale = model.mesh(m).name, "", "", np.ones(3)
-        mesh.refpos, mesh.refquat = np.zeros(3), [1.0, 0.0, 0.0, 0.0]
-    below = {flange}
-    for body in range(flange + 1, model.nbody):
-        if int(model.body_parentid[body]) in below:
-            below.add(body)
-    moving = {
-        b
-        for b in below - {flange}
-        if any(model.body_jntnum[x] for x in below if b in _above(model, x))
-    }
-    for body in moving:
-        if int(model.body_parentid[body]) == flange:
-            spec.delete(spec.body(model.body(body).name))
-    for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+    for index, mesh in enumerate(spec.meshes):
+        _embed(mesh, model, index)
+    _delete_moving_bodies(spec, model, flange)
+    planes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    for geom in planes:
         spec.delete(geom)
 
 
+def _embed(mesh: mujoco.MjsMesh, model: mujoco.MjModel, index: int) -> None:
+    """Replaces a mesh's file by its vertices and faces in the model."""
+    turn = Rotation.from_quat(model.mesh_quat[index], scalar_first=True)
+    first_vertex = model.mesh_vertadr[index]
+    end_vertex = first_vertex + model.mesh_vertnum[index]
+    vertices = turn.apply(model.mesh_vert[first_vertex:end_vertex]) + model.mesh_pos[index]
+    first_face = model.mesh_faceadr[index]
+    end_face = first_face + model.mesh_facenum[index]
+    mesh.uservert = vertices.ravel()
+    mesh.userface = model.mesh_face[first_face:end_face].ravel()
+    mesh.name = model.mesh(index).name
+    mesh.file = ""
+    mesh.content_type = ""
+    mesh.scale = np.ones(3)
+    mesh.refpos = np.zeros(3)
+    mesh.refquat = [1.0, 0.0, 0.0, 0.0]
+
+
+def _delete_moving_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
+    """Deletes the children of the flange that move or carry a moving body."""
+    moving: set[int] = set()
+    for body in range(flange + 1, model.nbody):
+        if model.body_jntnum[body]:
+            moving.update(_above(model, body))
+    for body in sorted(moving):
+        if int(model.body_parentid[body]) == flange:
+            spec.delete(spec.body(model.body(body).name))
+
+
 def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarray:
-    """(N,) speed limits: the given ones, those of a URDF, or `SPEED`."""
+    """(N,) speed limits: those in `text`, the option's; if it is empty, those of a URDF, or
+    `SPEED`.
+    """
     if text:
-        given = numbers_in(text)
-        if len(given) not in (1, len(joints)) or not (given > 0).all():
+        limits = numbers_in(text)
+        if len(limits) not in (1, len(joints)) or not (limits > 0).all():
             raise CongraspError(
                 f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}."
             )
-        return np.broadcast_to(given, len(joints))
-    stated = {}
-    text = robot_text(path)
-    if text.startswith("<robot"):
-        for joint in ET.fromstring(text).iter("joint"):
-            limit = joint.find("limit")
-            stated[joint.get("name")] = 0.0 if limit is None else float(limit.get("velocity", 0.0))
-    return np.array([speed if (speed := stated.get(name, 0.0)) > 0 else SPEED for name in joints])
+        return np.broadcast_to(limits, len(joints))
+    urdf_limits = _urdf_speeds(robot_text(path))
+    speeds = []
+    for name in joints:
+        limit = urdf_limits.get(name, 0.0)
+        speeds.append(limit if limit > 0 else SPEED)
+    return np.array(speeds)
+
+
+def _urdf_speeds(text: str) -> dict[str | None, float]:
+    """Speed limits of a URDF's joints by their names, 0 where there is none; empty for an MJCF."""
+    speeds: dict[str | None, float] = {}
+    if not text.startswith("<robot"):
+        return speeds
+    for joint in ET.fromstring(text).iter("joint"):
+        limit = joint.find("limit")
+        speeds[joint.get("name")] = 0.0 if limit is None else float(limit.get("velocity", 0.0))
+    return speeds

@@ -2,6 +2,7 @@
 events.
 """
 
+import dataclasses
 import pathlib
 from collections.abc import Sequence
 
@@ -25,14 +26,32 @@ SIGNALS = {
     "Contact": ("links_in_contact", "object_height"),
 }
 """Plots of an actor's episodes, by the fields of `signals`."""
-_LOOKED_AT = ("/episode/", "/metrics/learner/", "/events/")
-_SHOWN = ("scene", "contacts")
-_ACTORS = 4
+_TOPIC_PREFIXES = ("/episode/", "/metrics/learner/", "/events/")
+_SCENE_TOPICS = ("scene", "contacts")
+_MAX_VISIBLE_ACTORS = 4
 """Actors whose scenes are shown initially; the others can be enabled."""
+_SCENE_SHARE = 3.0
+"""Height of the 3-D panel, in heights of a plot."""
+
+
+@dataclasses.dataclass
+class _Contents:
+    """Topics and fields of a recording that a layout can show."""
+
+    signals: dict[str, set[str]] = dataclasses.field(default_factory=dict)
+    """Fields of each actor's signals, their levels separated by slashes."""
+    metrics: dict[str, set[str]] = dataclasses.field(default_factory=dict)
+    """Metrics of each topic of a learner."""
+    event_topic: str = ""
+    """The first topic with events; empty if there is none."""
 
 
 def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
     """Writes a layout for a recording, to be opened with Foxglove's "Import from file".
+
+    Args:
+      recording: a file or a folder.
+      path: the layout's file.
 
     Returns:
       The number of panels.
@@ -40,87 +59,105 @@ def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
     Raises:
       CongraspError: there is nothing to show in the recording.
     """
-    actors: dict[str, set[str]] = {}
-    metrics: dict[str, set[str]] = {}
-    events = ""
-    for file in log_files(recording):
-        for record in read_records(file, lambda topic: topic.startswith(_LOOKED_AT)):
-            kind, *rest = record.topic.strip("/").split("/")
-            if kind == "episode":
-                fields = actors.setdefault(rest[0], set())
-                if rest[1] == "signals":
-                    fields |= set(flatten(parse_json(record.data, "A recording's signals")))
-            elif kind == "metrics":
-                metrics.setdefault(record.topic, set()).update(
-                    flatten(metrics_of(record)["values"])
-                )
-            else:
-                events = events or record.topic
-    if not (actors or metrics):
+    contents = _read_contents(recording)
+    if not contents.signals and not contents.metrics:
         raise CongraspError(
             f"The recordings in {recording} hold neither episodes nor metrics of a learner."
         )
-    columns = []
-    if actors:
-        first = min(actors)
-        shown = {
-            title: [f for f in fields if f.replace(".", "/") in actors[first]]
-            for title, fields in SIGNALS.items()
-        }
-        plots = [
-            _plot(t, [f"/episode/{first}/signals.{field}" for field in fields])
-            for t, fields in shown.items()
-        ]
-        columns.append(
-            _split(
-                "column", [(3.0, _scene(sorted(actors))), *((1.0, plot) for plot in plots if plot)]
-            )
-        )
-    right: list[tuple[float, fl.Content]] = []
-    for title, names in CURVES.items():
-        found = [
-            (topic, name) for topic, known in metrics.items() for name in names if name in known
-        ]
-        if plot := _plot(
-            title, [f"{topic}.values.{name.replace('/', '.')}" for topic, name in found]
-        ):
-            right.append((1.0, plot))
-    if events:
-        right.append(
-            (1.0, fl.LogPanel(title="Events", config=fl.LogConfig(topic_to_render=events)))
-        )
-    if right:
-        columns.append(_split("column", right))
-    layout = fl.Layout(content=_split("row", [(1.0, column) for column in columns]))
+    columns: list[fl.SplitItem] = []
+    if contents.signals:
+        columns.append(fl.SplitItem(proportion=1.0, content=_episode_column(contents.signals)))
+    learner_panels = _learner_panels(contents)
+    if learner_panels:
+        column = fl.SplitContainer(direction="column", items=learner_panels)
+        columns.append(fl.SplitItem(proportion=1.0, content=column))
+    layout = fl.Layout(content=fl.SplitContainer(direction="row", items=columns))
     text = layout.to_json()
     write_atomically(path, text.encode())
     return text.count('"panelType"')
 
 
-def _plot(title: str, paths: Sequence[str]) -> fl.PlotPanel | None:
-    """A plot of some paths, if there are any."""
-    series = [
-        fl.PlotSeries(value=path, label=path.rpartition(".")[2], enabled=True) for path in paths
-    ]
-    return (
-        fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series, show_legend=True))
-        if series
-        else None
-    )
+def _read_contents(recording: pathlib.Path) -> _Contents:
+    """Collects the topics of a recording and their fields."""
+    contents = _Contents()
+    for file in log_files(recording):
+        for record in read_records(file, lambda topic: topic.startswith(_TOPIC_PREFIXES)):
+            kind, *levels = record.topic.strip("/").split("/")
+            if kind == "episode":
+                actor = levels[0]
+                fields = contents.signals.setdefault(actor, set())
+                if levels[1] == "signals":
+                    fields.update(flatten(parse_json(record.data, "A recording's signals")))
+            elif kind == "metrics":
+                names = contents.metrics.setdefault(record.topic, set())
+                names.update(flatten(metrics_of(record)["values"]))
+            elif not contents.event_topic:
+                contents.event_topic = record.topic
+    return contents
+
+
+def _episode_column(signals: dict[str, set[str]]) -> fl.SplitContainer:
+    """The scenes of all actors above the signals of the first one."""
+    actor = min(signals)
+    items = [fl.SplitItem(proportion=_SCENE_SHARE, content=_scene(sorted(signals)))]
+    for title, fields in SIGNALS.items():
+        paths = []
+        for field in fields:
+            if field.replace(".", "/") in signals[actor]:
+                paths.append(f"/episode/{actor}/signals.{field}")
+        if paths:
+            items.append(fl.SplitItem(proportion=1.0, content=_plot(title, paths)))
+    return fl.SplitContainer(direction="column", items=items)
+
+
+def _learner_panels(contents: _Contents) -> list[fl.SplitItem]:
+    """The learner's curves, then the events."""
+    items = []
+    for title, names in CURVES.items():
+        paths = _metric_paths(contents.metrics, names)
+        if paths:
+            items.append(fl.SplitItem(proportion=1.0, content=_plot(title, paths)))
+    if contents.event_topic:
+        config = fl.LogConfig(topic_to_render=contents.event_topic)
+        panel = fl.LogPanel(title="Events", config=config)
+        items.append(fl.SplitItem(proportion=1.0, content=panel))
+    return items
+
+
+def _metric_paths(metrics: dict[str, set[str]], names: Sequence[str]) -> list[str]:
+    """Message paths of the named metrics in every topic that has them."""
+    paths = []
+    for topic, recorded in metrics.items():
+        for name in names:
+            if name in recorded:
+                paths.append(f"{topic}.values.{name.replace('/', '.')}")
+    return paths
+
+
+def _plot(title: str, paths: Sequence[str]) -> fl.PlotPanel:
+    """A plot with a curve for each message path, named by its last field."""
+    series = []
+    for path in paths:
+        label = path.rpartition(".")[2]
+        series.append(fl.PlotSeries(value=path, label=label, enabled=True))
+    return fl.PlotPanel(title=title, config=fl.PlotConfig(paths=series, show_legend=True))
 
 
 def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
     """The 3-D panel with the actors' scenes."""
-    topics = {
-        f"/episode/{actor}/{part}": fl.BaseRendererSceneUpdateTopicSettings(
-            visible=number < _ACTORS
-        )
-        for number, actor in enumerate(actors)
-        for part in _SHOWN
-    }
+    topics = {}
+    for number, actor in enumerate(actors):
+        is_visible = number < _MAX_VISIBLE_ACTORS
+        for name in _SCENE_TOPICS:
+            settings = fl.BaseRendererSceneUpdateTopicSettings(visible=is_visible)
+            topics[f"/episode/{actor}/{name}"] = settings
     frames = fl.BaseRendererTransforms(visible=False, show_label=False)
     camera = fl.ThreeDeeCameraState(
-        distance=0.8, phi=65.0, theta_offset=45.0, target=(0.0, 0.0, 0.1), near=0.01
+        distance=0.8,
+        phi=65.0,
+        theta_offset=45.0,
+        target=(0.0, 0.0, 0.1),
+        near=0.01,
     )
     config = fl.ThreeDeeConfig(
         camera_state=camera,
@@ -130,9 +167,3 @@ def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
         topics=dict(topics),
     )
     return fl.ThreeDeePanel(title="Episodes", config=config)
-
-
-def _split(direction: str, items: Sequence[tuple[float, fl.Content]]) -> fl.Content:
-    """Arranges panels horizontally or vertically, with their shares of the space."""
-    kept = [fl.SplitItem(proportion=share, content=content) for share, content in items]
-    return fl.SplitContainer(direction="row" if direction == "row" else "column", items=kept)

@@ -29,11 +29,12 @@ OPAQUE = "x-safetensors"
 ROLLOUT_SCHEMA = "congrasp.Rollout"
 """Name of the schema of rollouts."""
 
-_FIELDS, _GROWTHS = 512, 32
-"""Limits of a topic's fields, and of the growth of its schema, which is written in full each
-time.
-"""
-_LONGEST_NAME, _DEEPEST = 128, 8
+_MAX_FIELDS = 512
+"""Limit of a topic's fields."""
+_MAX_SCHEMA_CHANGES = 32
+"""Limit of the changes of a topic's schema, which is written in full each time."""
+_MAX_NAME_CHARACTERS = 128
+_MAX_NAME_LEVELS = 8
 
 CONVENTIONS = {
     "units": "metres, radians, seconds, newtons, kilograms",
@@ -84,9 +85,14 @@ class Entry(NamedTuple):
 @functools.lru_cache(maxsize=4096)
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
     """Returns a channel of one of Foxglove's messages, with the descriptors that readers need."""
-    own: Any = kind  # hashable, although its type does not declare it
+    hashable: Any = kind  # its type does not declare it
     return Channel(
-        topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched
+        topic=topic,
+        encoding="protobuf",
+        schema_name=kind.DESCRIPTOR.full_name,
+        schema_encoding="protobuf",
+        schema=_descriptors(hashable),
+        latched=latched,
     )
 
 
@@ -99,7 +105,7 @@ def _descriptors(kind: Any) -> bytes:
 @functools.lru_cache(maxsize=4096)
 def opaque_channel(topic: str, name: str) -> Channel:
     """Returns a channel of encoded `common.wire.codec.Message`s of the kind `name`."""
-    return Channel(topic, OPAQUE, name, "", b"")
+    return Channel(topic, OPAQUE, schema_name=name, schema_encoding="", schema=b"")
 
 
 class JsonChannels:
@@ -113,38 +119,50 @@ class JsonChannels:
         """Starts without topics."""
         self._fields: dict[str, dict[str, Any]] = {}
         self._channels: dict[str, Channel] = {}
-        self._growths: collections.Counter[str] = collections.Counter()
+        self._schema_changes: collections.Counter[str] = collections.Counter()
 
     def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
         """Returns the object as an entry, without fields that are NaN or infinite, which JSON
         cannot represent.
         """
-        plain = finite(value)
+        finite_values = finite(value)
         fields = self._fields.setdefault(topic, {})
-        known = _known(fields, plain)
-        if (
-            self._growths[topic] >= _GROWTHS
-            or _count(fields) + _count(plain) - _count(known) > _FIELDS
-        ):
-            plain = known
-        if _merge(fields, plain) or topic not in self._channels:
-            self._growths[topic] += 1
-            # Schemas are identified by name, so every topic has a separate one.
-            schema = json.dumps(_schema(fields)).encode()
+        content = self._within_limits(topic, finite_values)
+        is_changed = _merge(fields, content)
+        if is_changed or topic not in self._channels:
+            self._schema_changes[topic] += 1
             self._channels[topic] = Channel(
-                topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema
+                topic=topic,
+                encoding="json",
+                # Schemas are identified by name, so every topic has a separate one.
+                schema_name=f"congrasp{topic.replace('/', '.')}",
+                schema_encoding="jsonschema",
+                schema=json.dumps(_schema(fields)).encode(),
             )
-        return Entry(self._channels[topic], time, json.dumps(plain, separators=(",", ":")).encode())
+        data = json.dumps(content, separators=(",", ":")).encode()
+        return Entry(self._channels[topic], time, data)
+
+    def _within_limits(self, topic: str, content: dict[str, Any]) -> dict[str, Any]:
+        """Returns an object; without its new fields if the topic is at one of its limits."""
+        fields = self._fields[topic]
+        old_content = _in_fields(fields, content)
+        if self._schema_changes[topic] >= _MAX_SCHEMA_CHANGES:
+            return old_content
+        new_fields = _count(content) - _count(old_content)
+        if _count(fields) + new_fields > _MAX_FIELDS:
+            return old_content
+        return content
 
     def forget(self, topic: str) -> None:
         """Forgets a topic that is no longer published."""
-        for known in (self._fields, self._channels, self._growths):
-            known.pop(topic, None)
+        self._fields.pop(topic, None)
+        self._channels.pop(topic, None)
+        self._schema_changes.pop(topic, None)
 
 
 def check_field(name: str) -> str:
     """Returns a field's name; raises a CongraspError if it is too long, or nested too deep."""
-    if len(name) > _LONGEST_NAME or name.count("/") > _DEEPEST:
+    if len(name) > _MAX_NAME_CHARACTERS or name.count("/") > _MAX_NAME_LEVELS:
         raise CongraspError(
             f"{ascii(name)[:60]} is too long or nested too deep for the name of a metric."
         )
@@ -157,10 +175,17 @@ def nest(values: Mapping[str, float]) -> dict[str, Any]:
     A name that is also a prefix of another (`loss` and `loss/policy`) becomes that group's empty
     name.
     """
+    groups = set()
+    for name in values:
+        levels = name.split("/")
+        for count in range(1, len(levels)):
+            groups.add("/".join(levels[:-count]))
     tree: dict[str, Any] = {}
-    groups = {name.rsplit("/", i)[0] for name in values for i in range(1, name.count("/") + 1)}
     for name, value in values.items():
-        *path, leaf = name.split("/") if name not in groups else [*name.split("/"), ""]
+        *path, leaf = name.split("/")
+        if name in groups:
+            path = name.split("/")
+            leaf = ""
         node = tree
         for part in path:
             node = node.setdefault(part, {})
@@ -181,30 +206,41 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
-    """Adds the fields of an object to the known ones; returns True if any is new."""
-    grown = False
+    """Adds the fields of an object; returns True if any is new.
+
+    A field has a JSON type, or the fields of a group.
+    """
+    is_changed = False
     for name, item in value.items():
         if isinstance(item, Mapping):
-            known = fields.setdefault(name, {})
-            grown |= _merge(known, item) if isinstance(known, dict) else False
+            group = fields.setdefault(name, {})
+            if isinstance(group, dict):
+                is_changed |= _merge(group, item)
         elif name not in fields:
-            is_number = isinstance(item, int | float)
-            fields[name] = (
-                "boolean" if isinstance(item, bool) else "number" if is_number else "string"
-            )
-            grown = True
-    return grown
+            fields[name] = _json_type(item)
+            is_changed = True
+    return is_changed
 
 
-def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the part of an object in known fields."""
-    kept = {name: item for name, item in value.items() if name in fields}
-    return {
-        name: _known(fields[name], item)
-        if isinstance(item, Mapping) and isinstance(fields[name], dict)
-        else item
-        for name, item in kept.items()
-    }
+def _json_type(value: Any) -> str:
+    """Name of a scalar's type in a JSON schema."""
+    if isinstance(value, bool):
+        return "boolean"
+    if isinstance(value, int | float):
+        return "number"
+    return "string"
+
+
+def _in_fields(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the part of an object whose fields are listed."""
+    content: dict[str, Any] = {}
+    for name, item in value.items():
+        if name not in fields:
+            continue
+        if isinstance(item, Mapping) and isinstance(fields[name], dict):
+            item = _in_fields(fields[name], item)
+        content[name] = item
+    return content
 
 
 def _count(fields: Mapping[str, Any]) -> int:
@@ -213,11 +249,10 @@ def _count(fields: Mapping[str, Any]) -> int:
 
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON schema of known fields."""
-    properties = {
-        name: _schema(kind) if isinstance(kind, dict) else {"type": kind}
-        for name, kind in fields.items()
-    }
+    """JSON schema of an object with these fields."""
+    properties = {}
+    for name, kind in fields.items():
+        properties[name] = _schema(kind) if isinstance(kind, dict) else {"type": kind}
     return {"type": "object", "properties": properties}
 
 
@@ -252,12 +287,12 @@ class LogWriter:
         """
         with os_errors_as(f"The folder {directory} cannot be created"):
             directory.mkdir(parents=True, exist_ok=True)
-        self._directory, self._name, self._run = directory, name, run
-        self._max_bytes, self._max_ns, self._open_file = (
-            max_bytes,
-            round(1e9 * max_seconds),
-            open_file,
-        )
+        self._directory = directory
+        self._name = name
+        self._run = run
+        self._max_bytes = max_bytes
+        self._max_ns = round(1e9 * max_seconds)
+        self._open_file = open_file
         self._number = 0
         self._file: IO[bytes] | None = None
         self._path = directory
@@ -280,11 +315,12 @@ class LogWriter:
         if self._file is None:
             self._begin(time)
         for entry in entries:
-            channel = self._channels.get(entry.channel)
-            if channel is None:
-                channel = self._channels[entry.channel] = self._register(entry.channel)
-            self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
-            self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
+            if entry.channel not in self._channels:
+                self._channels[entry.channel] = self._register(entry.channel)
+            channel_id = self._channels[entry.channel]
+            sequence = self._sequences.get(channel_id, 0) + 1
+            self._sequences[channel_id] = sequence
+            self._writer.add_message(channel_id, entry.time, entry.data, entry.time, sequence)
 
     def flush(self) -> None:
         """Flushes to the operating system; a killed writer loses only later entries.
@@ -301,7 +337,8 @@ class LogWriter:
         Raises:
           OSError: see `write`; the unfinished file keeps its suffix `.part`.
         """
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is None:
             return
         with file:
@@ -312,7 +349,8 @@ class LogWriter:
 
     def abandon(self) -> None:
         """Drops the file after an OSError, without writing to it."""
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is not None:
             with contextlib.suppress(OSError):
                 file.close()
@@ -342,9 +380,9 @@ class LogWriter:
 
     def _register(self, channel: Channel) -> int:
         """Returns the file's id of a channel, writing its schema first if needed."""
-        known = (channel.schema_name, channel.schema)
-        if known not in self._schemas:
-            self._schemas[known] = self._writer.register_schema(
+        key = (channel.schema_name, channel.schema)
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(
                 channel.schema_name, channel.schema_encoding, channel.schema
             )
-        return self._writer.register_channel(channel.topic, channel.encoding, self._schemas[known])
+        return self._writer.register_channel(channel.topic, channel.encoding, self._schemas[key])

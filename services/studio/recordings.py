@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.record.chunks import DamagedChunkError
+from congrasp.services.record.mcap_messages import intact_summary, messages_between
 from congrasp.services.record.reader import (
-    intact_summary,
     is_episode,
     log_files,
-    messages_between,
     read_records,
 )
 from congrasp.services.record.scene import EPISODE_SCHEMA

@@ -19,7 +19,8 @@ from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands import get_hand
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import SPEED, arm_file, load_arm
-from congrasp.services.arm.planner import ANGLE, POSITION, ArmPlanner, Path, follow
+from congrasp.services.arm.path_tracking import ANGLE, POSITION, Path, follow
+from congrasp.services.arm.planner import ArmPlanner
 from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions

@@ -21,7 +21,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.arm.description import load_arm
-from congrasp.services.arm.robot import Pose, build_robot, default_mount, moved_arm
+from congrasp.services.arm.moved_arm import moved_arm
+from congrasp.services.arm.robot import Pose, build_robot, default_mount
 from congrasp.services.export import frames, motion_file, urdf
 from congrasp.services.export.lerobot import camera_for, pictures
 from congrasp.services.export.motion_file import (
