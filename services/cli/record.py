@@ -6,6 +6,7 @@ import pathlib
 import secrets
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -15,8 +16,9 @@ from congrasp.common.transport.keys import Keys, process_name
 from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import LogFormat, log, logging_as
-from congrasp.services.record.live import LiveServer
-from congrasp.services.record.recorder import Recorder
+
+if TYPE_CHECKING:
+    from congrasp.services.record.recorder import Recorder
 
 _REFRESH_S = 0.5
 """Interval of the displayed summary."""
@@ -53,6 +55,9 @@ def record(
       congrasp record --connect tcp/127.0.0.1:7447 --run human
       congrasp record --run human --out recordings --live 8765
     """
+    from congrasp.services.record.live import LiveServer
+    from congrasp.services.record.recorder import Recorder
+
     output = _Output(log_format == "json")
     with contextlib.ExitStack() as stack:
         name = process_name("recorder")
@@ -125,7 +130,7 @@ class _Output:
 
 
 def _wait(
-    recorder: Recorder,
+    recorder: "Recorder",
     duration: float | None,
     stop: Stop,
     *,
@@ -150,7 +155,7 @@ def _wait(
         update(_summary(recorder))
 
 
-def _summary(recorder: Recorder) -> str:
+def _summary(recorder: "Recorder") -> str:
     """Numbers of messages and bytes so far."""
     size = sum(file.stat().st_size for file in recorder.files if file.exists())
     return (
