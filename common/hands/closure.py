@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
@@ -104,6 +103,9 @@ def widest_pose(hand: Hand) -> dict[str, float]:
     started at the open pose, minimises over the motors the squared missing gaps and changed
     offsets, summed over the other fingers.
     """
+    # Late, because the help of commands imports this module
+    from scipy.optimize import minimize
+
     lower, upper = motor_limits(hand)
     start = np.asarray(motor_positions(hand, hand.q_open), float)
     program = jax.jit(jax.value_and_grad(functools.partial(_cost, hand)))

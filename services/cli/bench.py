@@ -74,42 +74,51 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     return 0
 
 
-def scaling(  # noqa: PLR0913
-    ranks: tuple[int, ...] = (1, 2),
-    seconds: float = 90.0,
-    preset: str = "human",
-    environments: int = 0,
-    physics: PhysicsName = "auto",
-    actors: int | None = None,
-    deadline: float = 600.0,
-    out: pathlib.Path = pathlib.Path("scaling.json"),
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Scaling:
     """Measure trained steps per second of several learner ranks relative to one: weak scaling, a
     batch per rank.
 
     Starts real processes for each number of ranks in turn; starting, compiling and the first
     updates are not measured. On GPUs every rank needs a separate one.
 
-    Args:
-      ranks: Numbers of ranks, for example 1 2 4; efficiency is against the first.
-      seconds: Seconds of measurement, for each number of ranks.
-      preset: Named configuration of the run.
-      environments: Environments in one actor; 0: those of the preset.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      actors: Actor processes of each rank; by default none on GPUs, where each rank runs one in its
-        process, otherwise one.
-      deadline: Deadline of one number of ranks, s.
-      out: File for the results as JSON.
-
     Examples:
       congrasp bench scaling --ranks 1 2 4 8
       congrasp bench scaling --preset quickstart --physics native --seconds 30
     """
-    from congrasp.services.bench.training import bench_scaling
 
-    config = dataclasses.replace(get_preset(preset, environments=environments), physics=physics)
-    bench_scaling(config, ranks, seconds=seconds, actors=actors, deadline=deadline, out=out)
-    return 0
+    ranks: tuple[int, ...] = (1, 2)
+    """Numbers of ranks, for example 1 2 4; efficiency is against the first."""
+    seconds: float = 90.0
+    """Seconds of measurement, for each number of ranks."""
+    preset: str = "human"
+    """Named configuration of the run."""
+    environments: int = 0
+    """Environments in one actor; 0: those of the preset."""
+    physics: PhysicsName = "auto"
+    """Engine; auto takes warp on an NVIDIA GPU and native on a CPU."""
+    actors: int | None = None
+    """Actor processes of each rank; by default none on GPUs, where each rank runs one in its
+    process, otherwise one."""
+    deadline: float = 600.0
+    """Deadline of one number of ranks, s."""
+    out: pathlib.Path = pathlib.Path("scaling.json")
+    """File for the results as JSON."""
+
+    def __call__(self) -> int:
+        """Measures, prints and writes the results."""
+        from congrasp.services.bench.training import bench_scaling
+
+        preset = get_preset(self.preset, environments=self.environments)
+        bench_scaling(
+            dataclasses.replace(preset, physics=self.physics),
+            self.ranks,
+            seconds=self.seconds,
+            actors=self.actors,
+            deadline=self.deadline,
+            out=self.out,
+        )
+        return 0
 
 
 def startup(
@@ -144,4 +153,4 @@ def startup(
     return 0
 
 
-COMMANDS = {"physics": physics, "query": query, "scaling": scaling, "startup": startup}
+COMMANDS = {"physics": physics, "query": query, "scaling": Scaling, "startup": startup}

@@ -17,24 +17,15 @@ from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.io.inputs import distinct_names
 from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.captures import IMPORTERS
-from congrasp.services.cli.console import (
-    bars,
-    in_range,
-    save_drawing,
-    say,
-    show_facts,
-    show_table,
-    tracked,
-)
+from congrasp.services.cli.capture_report import REPORT, print_report
+from congrasp.services.cli.console import bars, in_range, save_drawing, show_facts, tracked
 
 if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
     from congrasp.common.objects.spec import GraspObject
+    from congrasp.services.assets.captures.options import Options
     from congrasp.services.assets.captures.report import Report
     from congrasp.services.cli.console import Track
-
-REPORT = "import.json"
-"""File next to imported sets with the outcome of each sequence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +71,9 @@ class Generate:
 
     def __call__(self) -> int:
         """Generates the sets, and prints where they are."""
-        from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
         from congrasp.common.task.sampling.set_file import save
         from congrasp.common.task.sampling.sets import make_sets
-        from congrasp.services.assets.objects.named import located, objects_of
 
         if not self.objects and self.count < 1:
             raise CongraspError(
@@ -93,32 +82,38 @@ class Generate:
         hand = get_hand(self.hand)
         with tracked() as track:
             track("Preparing objects", None)
-            found: list[GraspObject] = []
-            for text in self.objects:
-                found += objects_of(located(text, self.folder))
-            found += generate_many(self.count, self.first_seed, self.families)
-            for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
-                if obj.name != name:
-                    raise CongraspError(
-                        f"Several of the objects are called '{obj.name}'.",
-                        "Name each once; 'congrasp objects import A B --out DIR' gives different "
-                        "ones different names.",
-                    )
-            bank = (
-                _references(hand, self.policy, found, self.seed, track)
-                if self.references == "policy"
-                else None
-            )
+            objects = self._objects()
+            bank = None
+            if self.references == "policy":
+                bank = _references(hand, self.policy, objects, self.seed, track)
             track("Generating constraints", None)
-            for constraints in make_sets(hand, TaskConfig(hand=hand.name), found, self.seed, bank):
+            task = TaskConfig(hand=hand.name)
+            for constraints in make_sets(hand, task, objects, self.seed, bank):
                 save(constraints, self.out)
-        what = (
-            "The constraint set of 1 object is"
-            if len(found) == 1
-            else f"The sets of {len(found)} objects are"
-        )
-        print(f"{what} in {self.out}.")
+        subject = f"The sets of {len(objects)} objects are"
+        if len(objects) == 1:
+            subject = "The constraint set of 1 object is"
+        print(f"{subject} in {self.out}.")
         return 0
+
+    def _objects(self) -> "list[GraspObject]":
+        """Returns the requested objects; raises a CongraspError if two have the same name."""
+        from congrasp.common.objects.procedural import generate_many
+        from congrasp.services.assets.objects.named import located, objects_of
+
+        objects: list[GraspObject] = []
+        for text in self.objects:
+            objects += objects_of(located(text, self.folder))
+        objects += generate_many(self.count, self.first_seed, self.families)
+        names = [obj.name for obj in objects]
+        for name, distinct_name in zip(names, distinct_names(names), strict=True):
+            if name != distinct_name:
+                raise CongraspError(
+                    f"Several of the objects are called '{name}'.",
+                    "Name each once; 'congrasp objects import A B --out DIR' gives different ones "
+                    "different names.",
+                )
+        return objects
 
 
 def _references(
@@ -133,19 +128,20 @@ def _references(
     from congrasp.common.policy.pretrained import policy_file, reference_file
     from congrasp.services.evaluate.experiment import Experiment
 
-    bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
+    file = policy or reference_file(hand.name) or policy_file(None, hand.name)
+    bundle = bundles.load(file)
     if bundle.spec.hand_name != hand.name:
         raise CongraspError(
             f"The policy has the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
             f"Pass --hand {bundle.spec.hand_name}.",
         )
-    made = Experiment(bundle, objects, seed=seed, track=track).references_of(bundle)
-    whole = made.grasps[:, 0]
+    references = Experiment(bundle, objects, seed=seed, track=track).references_of(bundle)
+    on_whole_surface = references.grasps[:, 0]
     print(
-        f"Grasps per object: {whole.min()} to {whole.max()}; where there is none, the hand is "
-        f"closed around the object."
+        f"Grasps per object: {on_whole_surface.min()} to {on_whole_surface.max()}; where there is "
+        f"none, the hand is closed around the object."
     )
-    return made.bank
+    return references.bank
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,6 +197,36 @@ class Import:
         from congrasp.services.assets.captures.options import Options
         from congrasp.services.assets.captures.sequence import Meshes
 
+        self._check()
+        hand = get_hand(self.hand)
+        options = Options(self.headings, self.affordance, self.beyond, seed=self.seed)
+        importer = importlib.import_module(IMPORTERS[self.format])
+        with bars() as progress:
+            task = progress.add_task("Reading", total=None)
+
+            def show_activity(activity: str) -> None:
+                """Shows the current sequence or object."""
+                progress.update(task, description=activity, advance=1)
+
+            sequences = importer.read(self.path, Meshes(self.meshes), own_mano_model(self.mano))
+            objects, sets, report = import_sets(
+                sequences, hand, options, self.format, show_activity
+            )
+        if not report.kept and not report.dropped:
+            raise CongraspError(
+                f"{self.path} holds no sequence of {self.format}.",
+                f"Pass the folder with {importer.HOLDS}.",
+            )
+        catalogue = Catalogue(self.objects)
+        for obj, constraints in zip(objects, sets, strict=True):
+            catalogue.add(obj)
+            save(constraints, self.out)
+        self._write_report(report, hand.name, options)
+        print_report(report, hand.name, self.out, self.objects)
+        return 0 if report.kept else 2
+
+    def _check(self) -> None:
+        """Raises a CongraspError for an unknown format, a missing path, or an invalid option."""
         if self.format not in IMPORTERS:
             raise CongraspError(
                 f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}."
@@ -211,107 +237,18 @@ class Import:
             )
         in_range(0.0, unit="radians", beyond=self.beyond)
         check_output("--objects", self.objects, is_folder=True)
-        hand, options = (
-            get_hand(self.hand),
-            Options(self.headings, self.affordance, self.beyond, seed=self.seed),
-        )
-        importer = importlib.import_module(IMPORTERS[self.format])
-        with bars() as progress:
-            task = progress.add_task("Reading", total=None)
-            sequences = importer.read(self.path, Meshes(self.meshes), own_mano_model(self.mano))
-            objects, sets, report = import_sets(
-                sequences,
-                hand,
-                options,
-                self.format,
-                lambda doing: progress.update(task, description=doing, advance=1),
-            )
-        if not report.kept and not report.dropped:
-            raise CongraspError(
-                f"{self.path} holds no sequence of {self.format}.",
-                f"Pass the folder with {importer.HOLDS}.",
-            )
-        catalogue = Catalogue(self.objects)
-        for obj, made in zip(objects, sets, strict=True):
-            catalogue.add(obj)
-            save(made, self.out)
-        about = {
+
+    def _write_report(self, report: "Report", hand: str, options: "Options") -> None:
+        """Writes the settings, and the outcome of each sequence, to the folder of the sets."""
+        content = {
             "format": self.format,
             "path": str(self.path),
-            "hand": hand.name,
+            "hand": hand,
             **dataclasses.asdict(options),
+            "kept": report.kept,
+            "dropped": report.dropped,
         }
-        rows = {**about, "kept": report.kept, "dropped": report.dropped}
-        write_atomically(self.out / REPORT, json.dumps(rows, indent=2).encode())
-        _print_report(report, hand.name, self.out, self.objects)
-        return 0 if report.kept else 2
-
-
-def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
-    """Prints what was kept, what each rule dropped, and the locations of the results."""
-    kept, dropped = report.kept, report.dropped
-    say(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
-    if dropped:
-        show_table(
-            ("dropped", "why", "for example"),
-            [(str(n), rule, example) for rule, n, example in report.rules()],
-        )
-    if kept and hand != "human":
-        say(
-            f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, "
-            f"affordance and wrist "
-            "trajectory were kept; its fingers close around the object where the trajectory ends."
-        )
-    elif kept:
-        worst = max(kept, key=lambda row: row["residual_rad"])
-        mean = sum(row["residual_rad"] for row in kept) / len(kept)
-        say(
-            f"Finger angles differ by {mean:.3f} rad per bone on average, at most "
-            f"{worst['residual_rad']:.3f} rad "
-            f"({worst['sequence']})."
-        )
-    if kept:
-        if apart := [row for row in kept if row["moved_apart_rad"]]:
-            deep, moved = (
-                max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad")
-            )
-            mean = sum(row["moved_apart_rad"] for row in apart) / len(apart)
-            say(
-                f"Fingers of {len(apart)} overlapped, by up to {1e3 * deep['overlap_m']:.1f} mm "
-                f"({deep['sequence']}). They were separated: their farthest joint by {mean:.2f} "
-                f"rad on average, "
-                f"at most {moved['moved_apart_rad']:.2f} rad ({moved['sequence']})."
-            )
-        if later := [row["frames_after_touch"] for row in kept if row["frames_after_touch"]]:
-            say(
-                f"In {len(later)} of {len(kept)}, thumb and fingers oppose only after the first "
-                f"touch; the "
-                f"reference is taken then, {sum(later) / len(later):.0f} frames later on average."
-            )
-        above = sum(row["clear_of_table"] for row in kept)
-        sets = len({row["object"] for row in kept})
-        say(
-            f"The table leaves room for {above} of {len(kept)} in some resting pose of their "
-            f"objects."
-        )
-        for below, why in (
-            (True, "from below, which no episode does"),
-            (False, "too near to the table"),
-        ):
-            left = [
-                row["sequence"]
-                for row in kept
-                if not row["clear_of_table"] and row["from_below"] == below
-            ]
-            if left:
-                say(
-                    f"No episode is drawn from {len(left)}, whose hand comes {why}: "
-                    f"{', '.join(left)}."
-                )
-        training = sum(row["split"] == "training" for row in kept)
-        say(f"{training} sequences are for training, {len(kept) - training} held out.")
-        say(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
-    say(f"{out / REPORT} holds the outcome of each sequence.")
+        write_atomically(self.out / REPORT, json.dumps(content, indent=2).encode())
 
 
 def show(
@@ -341,8 +278,11 @@ def show(
     if png is not None:
         from congrasp.services.viz.constraint_sheet import constraint_sheet
 
-        best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-        save_drawing(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))
+        index = rest - 1
+        if not rest:
+            poses_per_rest = constraints.arrays["pose/allowed"].sum((0, 2))
+            index = int(poses_per_rest.argmax())
+        save_drawing(png, constraint_sheet(constraints, index, seed))
     return 0
 
 

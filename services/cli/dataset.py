@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import pathlib
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -11,6 +11,11 @@ from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.console import in_range, tracked
+
+if TYPE_CHECKING:
+    from congrasp.common.task.config import TaskConfig
+    from congrasp.services.assets.objects.named import ObjectAt
+    from congrasp.services.dataset.make import Recipe
 
 Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", "pushed"]
 
@@ -67,48 +72,15 @@ class Dataset:
 
     def __call__(self) -> int:
         """Makes the missing shards, and the card."""
-        from congrasp.actors.physics import resolve_physics
-        from congrasp.common.policy import bundle as bundles
-        from congrasp.common.policy.pretrained import policy_file
-        from congrasp.common.task.constraints import require_known
         from congrasp.services.dataset.card import write_card
-        from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
+        from congrasp.services.dataset.make import make, pools_of
         from congrasp.services.dataset.shards import CARD, Shards
-        from congrasp.services.evaluate.experiment import Experiment
-        from congrasp.services.evaluate.plan import ALIGNED
-        from congrasp.services.evaluate.pools import most_objects
         from congrasp.services.evaluate.results import provenance
-        from congrasp.services.evaluate.scores import known_rows
-        from congrasp.services.grasp.jobs import find_objects
 
         in_range(1, per_object=self.per_object)
         in_range(0, shard=self.shard, batch=self.batch)
-        turn, parts = _part(self.part)
-        found, errors = find_objects(self.objects, self.folder)
-        if errors or not found:
-            raise CongraspError(
-                errors[0].error if errors else "No objects were named.",
-                "Name meshes, folders or mug:0-99.",
-            )
-        file = policy_file(self.policy, self.hand)
-        bundle, engine = bundles.load(file), resolve_physics(self.physics)
-        in_range(0, most_objects(engine), "objects", shard=self.shard)
-        asked = tuple(dict.fromkeys(self.constraints)) or tuple(
-            known_rows(("single", "composed"), bundle.task)
-        )
-        require_known(
-            [name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task
-        )
-        recipe = Recipe(
-            experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),
-            policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
-            objects=found,
-            options=self.mesh,
-            per_object=self.per_object,
-            constraints=asked,
-            keep=tuple(name for name in dict.fromkeys(self.keep) if name != "all"),
-            shard=self.shard or shard_objects(self.per_object),
-        )
+        part, parts = _part(self.part)
+        recipe = self._recipe()
         pools = pools_of(recipe)
         shards = Shards(self.out, len(pools.make), recipe.columns)
         facts = {"licence": self.licence, **provenance()}
@@ -116,27 +88,88 @@ class Dataset:
         if (self.out / CARD).exists():
             # Drops the checksums of deleted shards: on a GPU a shard made again may differ.
             write_card(shards, recipe.about, facts)
-        wanted = [number for number in range(turn, shards.total, parts) if number not in finished]
+        of_part = range(part, shards.total, parts)
+        missing = [number for number in of_part if number not in finished]
         with tracked() as track:
-            total = min(len(found), pools.size * len(wanted)) * self.per_object
-            make(recipe, shards, pools, wanted, track("Episodes", total))
+            objects = min(len(recipe.objects), pools.size * len(missing))
+            advance = track("Episodes", objects * self.per_object)
+            make(recipe, shards, pools, missing, advance)
         card = write_card(shards, recipe.about, facts)
-        episodes, kept = (
-            sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept")
-        )
-        made = card["shards"]["finished"]
+        counts = card["counts"].values()
+        episodes = sum(count["episodes"] for count in counts)
+        kept_episodes = sum(count["kept"] for count in counts)
         print(
-            f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in "
-            f"{self.out}."
+            f"{kept_episodes:,} of {episodes:,} episodes are kept, in {card['shards']['finished']} "
+            f"of {shards.total} shards in {self.out}."
         )
         return 0
 
+    def _recipe(self) -> "Recipe":
+        """Returns the content of all shards: policy, objects, constraints, episodes of each.
+
+        Raises:
+          CongraspError: there is no such object, policy or constraint, or a shard is too large for
+            the engine.
+        """
+        from congrasp.actors.physics import resolve_physics
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.common.policy.pretrained import policy_file
+        from congrasp.services.dataset.make import Recipe, shard_objects
+        from congrasp.services.evaluate.experiment import Experiment
+        from congrasp.services.evaluate.pools import most_objects
+
+        objects = self._objects()
+        file = policy_file(self.policy, self.hand)
+        bundle = bundles.load(file)
+        engine = resolve_physics(self.physics)
+        in_range(0, most_objects(engine), "objects", shard=self.shard)
+        outcomes = dict.fromkeys(self.keep)
+        return Recipe(
+            experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),
+            policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+            objects=objects,
+            options=self.mesh,
+            per_object=self.per_object,
+            constraints=self._constraint_sets(bundle.task),
+            keep=tuple(outcome for outcome in outcomes if outcome != "all"),
+            shard=self.shard or shard_objects(self.per_object),
+        )
+
+    def _objects(self) -> "list[ObjectAt]":
+        """Returns the named objects; raises a CongraspError if one is missing, or none is named."""
+        from congrasp.services.grasp.jobs import find_objects
+
+        objects, errors = find_objects(self.objects, self.folder)
+        remedy = "Name meshes, folders or mug:0-99."
+        if errors:
+            raise CongraspError(errors[0].error, remedy)
+        if not objects:
+            raise CongraspError("No objects were named.", remedy)
+        return objects
+
+    def _constraint_sets(self, task: "TaskConfig") -> tuple[str, ...]:
+        """Returns the sampled sets of constraints, without repetition; raises a CongraspError for
+        one with a constraint that the policy does not know.
+        """
+        from congrasp.common.task.constraints import require_known
+        from congrasp.services.evaluate.plan import ALIGNED
+        from congrasp.services.evaluate.scores import known_rows
+
+        sets = tuple(dict.fromkeys(self.constraints))
+        if not sets:
+            sets = tuple(known_rows(("single", "composed"), task))
+        names = []
+        for constraint_set in sets:
+            names += constraint_set.removesuffix(ALIGNED).split("+")
+        require_known(names, task)
+        return sets
+
 
 def _part(text: str) -> tuple[int, int]:
-    """K - 1 and N of K/N."""
-    turn, slash, parts = text.partition("/")
-    if slash and turn.isdecimal() and parts.isdecimal() and 1 <= int(turn) <= int(parts):
-        return int(turn) - 1, int(parts)
+    """Returns K - 1 and N of a text K/N."""
+    part, slash, parts = text.partition("/")
+    if slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts):
+        return int(part) - 1, int(parts)
     raise CongraspError(f"--part is '{text}'.", "Write K/N with K from 1 to N: --part 3/20")
 
 

@@ -1,5 +1,6 @@
 """Policies and motions for other programs."""
 
+import dataclasses
 import pathlib
 from typing import Annotated, Literal
 
@@ -46,59 +47,63 @@ def policy(
     return 0
 
 
-def motion(  # noqa: PLR0913
-    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
-    to: Literal["glb", "usd", "bvh", "ros2", "lerobot"] = "glb",
-    out: pathlib.Path | None = None,
-    index: int = -1,
-    success: bool = False,
-    fps: float = 0.0,
-    camera: bool = False,
-    force: bool = False,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class ExportMotion:
     """Write a grasp motion for another program.
 
     glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a
     bag with joint trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for
     each motion. docs/exports.md describes each.
 
-    Args:
-      paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot
-        takes several.
-      to: The format.
-      out: The file or folder to write; by default one named after the object, such as mug.glb, in
-        the working directory.
-      index: Index of the recorded episode, from 0; -1 is the last.
-      success: Count only episodes that succeeded.
-      fps: Frames a second, such as 24 for a film; the motion's own 100 by default.
-      camera: Also record videos of the motions; only lerobot has videos.
-      force: Replace an existing file; a folder is never replaced.
-
     Examples:
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.services.export.motion_file import (
-        FORMATS,
-        at_rate,
-        default_name,
-        export_motions,
-        pick_motion,
-    )
 
-    if not paths:
-        raise CongraspError(
-            "No motion was given.",
-            "Pass a .npz of 'congrasp grasp', a recording or a run's folder.",
+    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    """Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes
+    several."""
+    to: Literal["glb", "usd", "bvh", "ros2", "lerobot"] = "glb"
+    """The format."""
+    out: pathlib.Path | None = None
+    """The file or folder to write; by default one named after the object, such as mug.glb, in the
+    working directory."""
+    index: int = -1
+    """Index of the recorded episode, from 0; -1 is the last."""
+    success: bool = False
+    """Count only episodes that succeeded."""
+    fps: float = 0.0
+    """Frames a second, such as 24 for a film; the motion's own 100 by default."""
+    camera: bool = False
+    """Also record videos of the motions; only lerobot has videos."""
+    force: bool = False
+    """Replace an existing file; a folder is never replaced."""
+
+    def __call__(self) -> int:
+        """Writes the motions, and prints the number of their frames."""
+        from congrasp.services.export.motion_file import (
+            FORMATS,
+            at_rate,
+            default_name,
+            export_motions,
+            pick_motion,
         )
-    if out and not out.exists():
-        check_output("--out", out, is_folder=not FORMATS[to])
-    motions = [pick_motion(path, index, success=success) for path in paths]
-    motions = [at_rate(motion, fps) for motion in motions] if fps else motions
-    target = out or default_name(motions[0], to)
-    export_motions(motions, to, target, camera=camera, force=force)
-    print(f"{target}: {sum(len(motion.time) for motion in motions)} frames")
-    return 0
+
+        if not self.paths:
+            raise CongraspError(
+                "No motion was given.",
+                "Pass a .npz of 'congrasp grasp', a recording or a run's folder.",
+            )
+        if self.out and not self.out.exists():
+            check_output("--out", self.out, is_folder=not FORMATS[self.to])
+        motions = [pick_motion(path, self.index, success=self.success) for path in self.paths]
+        if self.fps:
+            motions = [at_rate(motion, self.fps) for motion in motions]
+        target = self.out or default_name(motions[0], self.to)
+        export_motions(motions, self.to, target, camera=self.camera, force=self.force)
+        frames = sum(len(motion.time) for motion in motions)
+        print(f"{target}: {frames} frames")
+        return 0
 
 
 def layout(
@@ -126,4 +131,4 @@ def layout(
     return 0
 
 
-COMMANDS = {"policy": policy, "motion": motion, "layout": layout}
+COMMANDS = {"policy": policy, "motion": ExportMotion, "layout": layout}

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import shlex
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
@@ -20,7 +20,25 @@ from congrasp.services.cli.console import in_range, say, show_table
 from congrasp.services.ops.logs import announced
 
 if TYPE_CHECKING:
+    from congrasp.common.hands.skin import Skin
+    from congrasp.common.hands.spec import Hand
     from congrasp.services.assets.hands.model_files import Choices, Proposal
+
+
+_TRAININGS = pathlib.Path("runs", "hands")
+"""Folder of the trainings of hands."""
+
+
+class _ReportSize(NamedTuple):
+    """Default size of the evaluation of a trained hand."""
+
+    episodes: int
+    """Episodes of each row."""
+    objects: int
+
+
+_GPU_REPORT = _ReportSize(episodes=200, objects=64)
+_CPU_REPORT = _ReportSize(episodes=24, objects=12)
 
 
 def list_hands() -> int:
@@ -30,15 +48,13 @@ def list_hands() -> int:
     Examples:
       congrasp hands list
     """
-    from congrasp.common.policy.pretrained import pretrained_file
-
-    rows, missing = [], []
-    own, folder = own_hands(), hands_folder()
-    for name in [*HANDS, *own]:
+    rows = []
+    errors = []
+    for name in [*HANDS, *own_hands()]:
         try:
             hand = get_hand(name)
         except CongraspError as error:
-            missing.append(str(error))
+            errors.append(str(error))
             continue
         row = (
             name,
@@ -47,16 +63,22 @@ def list_hands() -> int:
             f"{sum(link.mass for link in hand.links):.2f} kg",
             f"{max(motor.torque_limit for motor in hand.motors):.1f} N.m",
             f"x {hand.object_scale:g}",
-            "none"
-            if (file := pretrained_file(name)) is None
-            else "own"
-            if file.parent == folder
-            else "pretrained",
+            _policy_kind(name),
         )
         rows.append(row)
     show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)
-    print("\n".join([*missing, f"Custom hands are the files in {hands_folder()}."]))
+    print("\n".join([*errors, f"Custom hands are the files in {hands_folder()}."]))
     return 0
+
+
+def _policy_kind(hand: str) -> str:
+    """Origin of the policy that commands use for a hand: the package, or the user's folder."""
+    from congrasp.common.policy.pretrained import pretrained_file
+
+    file = pretrained_file(hand)
+    if file is None:
+        return "none"
+    return "own" if file.parent == hands_folder() else "pretrained"
 
 
 def sheet(
@@ -77,73 +99,96 @@ def sheet(
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
 
-    found = [get_hand(name) for name in hands]
-    files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
-    meshes = [
-        load_meshes(file, hand) if hand.text else {}
-        for file, hand in zip(files, found, strict=True)
-    ]
-    skins = [
-        skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)
-    ]
-    save_png(out, hand_sheets.hands_sheet(found, skins))
+    specs = [get_hand(name) for name in hands]
+    skins = [_skin(name, hand) for name, hand in zip(hands, specs, strict=True)]
+    save_png(out, hand_sheets.hands_sheet(specs, skins))
     print(out)
     return 0
 
 
-def import_hand(  # noqa: PLR0913
-    file: Annotated[pathlib.Path, tyro.conf.Positional],
-    name: str = "",
-    palm: str = "",
-    thumb: str = "",
-    object_scale: float = 0.0,
-    collision: Literal["capsules", "own"] = "capsules",
-    out: pathlib.Path | None = None,
-    png: pathlib.Path | None = None,
-) -> int:
+def _skin(name: str, hand: "Hand") -> "Skin | None":
+    """Skin of the meshes next to a custom hand's file; None if it has none."""
+    if not hand.text:
+        return None
+    file = own_hands().get(name, pathlib.Path(name))
+    meshes = load_meshes(file, hand)
+    if not meshes:
+        return None
+    return skin_of_meshes(hand, meshes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Import:
     """Import a hand from a URDF or MJCF file: missing values are proposed, listed and drawn.
 
     The result is one JSON file, which every command takes as --hand, by its name or its path; the
     visual meshes are stored next to it. Check the picture, and correct the file where a proposal is
     wrong: poses, fingertips, gains, couplings and capsules are all in it.
 
-    Args:
-      file: The hand's URDF or MJCF, a right or left hand of hinges.
-      name: Its name; that of the file by default.
-      palm: Body of the palm; by default the one from which most fingers branch.
-      thumb: The last body of the finger that opposes the others; by default one called thumb, or
-        the one that best faces the others.
-      object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1
-        for a human hand's.
-      collision: Collision shapes in physics: own uses the file's boxes, cylinders, balls,
-        ellipsoids and capsules, and capsules for links that collide by meshes.
-      out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands
-        list' names it).
-      png: The picture; by default next to the file.
-
     Examples:
       congrasp hands import hand.urdf
       congrasp hands import hand.xml --name mine --palm palm_link
     """
-    from congrasp.services.assets.hands import model_files
 
-    check_output("--out", out or hands_folder(), is_folder=out is None)
-    if out is not None and out.suffix != SUFFIX:
-        raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
-    choices = model_files.Choices(name, palm, thumb, object_scale, collision == "own")
-    with announced(f"Reading {file}"):
-        proposal = model_files.import_hand(file, choices)
-    _keep(proposal, out, png)
-    called = proposal.hand.name if out is None else out
-    direct = shell_command("congrasp", "hands", "train", called)
-    general = shell_command("congrasp", "train", "--hand", called, "--physics", "native")
-    print(f"Try: {direct}, or {general}")
-    return 0
+    file: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The hand's URDF or MJCF, a right or left hand of hinges."""
+    name: str = ""
+    """Its name; that of the file by default."""
+    palm: str = ""
+    """Body of the palm; by default the one from which most fingers branch."""
+    thumb: str = ""
+    """The last body of the finger that opposes the others; by default one called thumb, or the one
+    that best faces the others."""
+    object_scale: float = 0.0
+    """Factor on the objects that it learns to grasp; by default from its opening, 1 for a human
+    hand's."""
+    collision: Literal["capsules", "own"] = "capsules"
+    """Collision shapes in physics: own uses the file's boxes, cylinders, balls, ellipsoids and
+    capsules, and capsules for links that collide by meshes."""
+    out: pathlib.Path | None = None
+    """The file to write; by default NAME.json in the folder of your own hands ('congrasp hands
+    list' names it)."""
+    png: pathlib.Path | None = None
+    """The picture; by default next to the file."""
+
+    def __call__(self) -> int:
+        """Writes the hand's file and picture, and prints how to train it."""
+        from congrasp.services.assets.hands.model_files import Choices, import_hand
+
+        self._check_out()
+        choices = Choices(
+            self.name, self.palm, self.thumb, self.object_scale, self.collision == "own"
+        )
+        with announced(f"Reading {self.file}"):
+            proposal = import_hand(self.file, choices)
+        _store(proposal, self.out, self.png)
+        reference = proposal.hand.name if self.out is None else self.out
+        one_hand = shell_command("congrasp", "hands", "train", reference)
+        any_hand = shell_command("congrasp", "train", "--hand", reference, "--physics", "native")
+        print(f"Try: {one_hand}, or {any_hand}")
+        return 0
+
+    def _check_out(self) -> None:
+        """Raises a CongraspError for a file or folder that cannot be written."""
+        if self.out is None:
+            check_output("--out", hands_folder(), is_folder=True)
+            return
+        check_output("--out", self.out, is_folder=False)
+        if self.out.suffix != SUFFIX:
+            raise CongraspError(
+                f"--out {self.out} does not end in {SUFFIX}.", "Hand files are JSON."
+            )
 
 
-def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
-    """Writes a hand's file and picture, by default to the folder of custom hands, and prints a
-    description.
+def _store(
+    proposal: "Proposal", out: pathlib.Path | None = None, png: pathlib.Path | None = None
+) -> None:
+    """Writes a hand's file and picture, and prints a description.
+
+    Args:
+      proposal: the imported hand.
+      out: the file; by default in the folder of custom hands.
+      png: the picture; by default next to the file.
     """
     from congrasp.services.assets.hands.summary import describe
     from congrasp.services.viz import hand_sheets
@@ -190,17 +235,17 @@ def check(
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
 
-    found = get_hand(hand)
-    picture = png or pathlib.Path(f"{found.name}-check.png")
+    spec = get_hand(hand)
+    picture = png or pathlib.Path(f"{spec.name}-check.png")
     check_output("--png", picture, is_folder=False)
-    checked = self_check.check_hand(found, recipe(found).task, cores())
-    for finding in checked.findings:
+    result = self_check.check_hand(spec, recipe(spec).task, cores())
+    for finding in result.findings:
         print(finding)
-    save_png(picture, hand_sheets.check_sheet(found, checked.grips))
+    save_png(picture, hand_sheets.check_sheet(spec, result.grips))
     if json is not None:
-        write_findings(json, checked.findings)
+        write_findings(json, result.findings)
     print(picture)
-    return int(checked.failed)
+    return int(result.failed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,21 +300,24 @@ class Train:
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        check_output("--out", self.out or pathlib.Path("runs", "hands"), is_folder=True)
-        full = accelerators.detect()[0] != "cpu"
+        check_output("--out", self.out or _TRAININGS, is_folder=True)
+        platform, *_ = accelerators.detect()
+        full = platform != "cpu"
         # The stages are separate processes, each with the whole GPU memory
         jax.config.update("jax_platforms", "cpu")
-        reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
-        found = get_hand(reference)
+        choices = Choices(self.name, self.palm, self.thumb, self.object_scale)
+        reference = _imported(self.hand, choices)
+        hand = get_hand(reference)
+        size = _GPU_REPORT if full else _CPU_REPORT
         request = Request(
-            hand=found,
+            hand=hand,
             reference=reference,
-            out=self.out or pathlib.Path("runs", "hands", found.name),
+            out=self.out or _TRAININGS / hand.name,
             full=full,
             anyway=self.anyway,
             physics=self.physics,
-            episodes=self.episodes or (200 if full else 24),
-            pool=self.pool or (64 if full else 12),
+            episodes=self.episodes or size.episodes,
+            pool=self.pool or size.objects,
             options=shlex.split(self.training),
             patience=60.0 * self.patience,
         )
@@ -278,8 +326,10 @@ class Train:
         return 0
 
 
-def _taken(hand: str, choices: "Choices") -> str:
-    """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
+def _imported(hand: str, choices: "Choices") -> str:
+    """Returns the name or file of a hand for other commands; imports a URDF or MJCF, unless there
+    is a custom hand of its name.
+    """
     from congrasp.services.assets.hands.model_files import import_hand
 
     file = pathlib.Path(hand)
@@ -287,19 +337,18 @@ def _taken(hand: str, choices: "Choices") -> str:
         return hand
     proposal = import_hand(file, choices)
     name = proposal.hand.name
-    if name in own_hands():
-        print(
-            f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it."
-        )
+    existing = own_hands().get(name)
+    if existing is not None:
+        print(f"The hand '{name}' is {existing}; 'congrasp hands import' would replace it.")
     else:
-        _keep(proposal, None, None)
+        _store(proposal)
     return name
 
 
 COMMANDS = {
     "list": list_hands,
     "sheet": sheet,
-    "import": import_hand,
+    "import": Import,
     "check": check,
     "train": Train,
 }

@@ -21,6 +21,9 @@ _QUIET = ("", "None", "False")
 """Defaults that are not shown, because the help describes them."""
 _LARGEST_SEED = 10**15
 _CONTINUED = re.compile(r"\s*\n\s*")
+"""Line end within the text of a field."""
+_CONTINUED_PARAMETER = re.compile(r"\n    (?=\S)")
+"""Line end within the text of a parameter, whose further lines have an indentation of four."""
 
 
 def of_command(
@@ -49,8 +52,10 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
         if rest and rest[0] in commands:
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
         deferred = {name: _deferred(command) for name, command in commands.items()}
-        first = [line for command in commands.values() for line in examples(command)[:1]]
-        with _epilog(first, rest):
+        first_examples = []
+        for command in commands.values():
+            first_examples += examples(command)[:1]
+        with _epilog(first_examples, rest):
             return tyro.extras.subcommand_cli_from_dict(
                 deferred, prog=prog, description=description, args=rest
             )
@@ -60,26 +65,27 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
 
 def examples(command: Command) -> list[str]:
     """Returns the command lines in the section `Examples` of a command's docstring."""
-    found = docstring_parser.parse(inspect.getdoc(command) or "").examples
-    return [
-        line.strip()
-        for example in found
-        for line in (example.description or "").splitlines()
-        if line.strip()
-    ]
+    docstring = docstring_parser.parse(inspect.getdoc(command) or "")
+    lines = []
+    for example in docstring.examples:
+        lines += (example.description or "").splitlines()
+    return [line.strip() for line in lines if line.strip()]
 
 
 @contextlib.contextmanager
 def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
-    """Prints examples after the help, which a parser prints when it exits without an error; with
-    other arguments it prints scripts of shells.
+    """Prints examples after the help, which the parser prints before it exits without an error.
+
+    It exits so also after the script of a shell, which has no examples.
     """
     try:
         yield
     except SystemExit as end:
-        asks_for_help = not {"-h", "--help"}.isdisjoint(arguments)
-        if not end.code and lines and asks_for_help:
-            print("\n".join(("Examples:", *(f"  {line}" for line in lines))))
+        is_help = "-h" in arguments or "--help" in arguments
+        if not end.code and lines and is_help:
+            print("Examples:")
+            for line in lines:
+                print(f"  {line}")
         raise
 
 
@@ -89,48 +95,68 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(_run, command, *args, **options)
 
-    hints = {
-        name: _described(
-            name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else [])
-        )
-        for name, hint in typing.get_type_hints(command, include_extras=True).items()
-    }
+    hints = {}
+    for name, hint in typing.get_type_hints(command, include_extras=True).items():
+        hints[name] = _described(name, hint)
+        if dataclasses.is_dataclass(hint):
+            hints[name] = Annotated[hints[name], tyro.conf.arg(name="")]
     signature = inspect.signature(command)
-    taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
-    vars(bind)["__signature__"] = signature.replace(parameters=taken)
-    bind.__name__, bind.__annotations__ = command.__name__, {**hints, "return": Any}
-    # A parameter's text on one line
-    text = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")
-    fields = (
-        [f"  {name}: {help}" for name, help in _meanings(command).items()]
-        if isinstance(command, type)
-        else []
-    )
-    bind.__doc__ = "\n".join([text, "", "Args:", *fields] if fields else [text])
+    parameters = []
+    for name, parameter in signature.parameters.items():
+        parameters.append(parameter.replace(annotation=hints[name]))
+    # tyro reads the options from these
+    vars(bind)["__signature__"] = signature.replace(parameters=parameters)
+    bind.__name__ = command.__name__
+    bind.__annotations__ = {**hints, "return": Any}
+    bind.__doc__ = _help(command)
     return bind
+
+
+def _help(command: Command) -> str:
+    """Docstring of a command in the form that tyro parses, with each parameter's text on one
+    line.
+    """
+    text = _CONTINUED_PARAMETER.sub(" ", inspect.getdoc(command) or "")
+    fields = _meanings(command) if isinstance(command, type) else {}
+    if not fields:
+        return text
+    arguments = [f"  {name}: {meaning}" for name, meaning in fields.items()]
+    return "\n".join([text, "", "Args:", *arguments])
 
 
 def _run(command: Command, *args: Any, **options: Any) -> Any:
     """Calls a function, or a command whose fields are its options."""
-    return command(*args, **options)() if isinstance(command, type) else command(*args, **options)
+    if isinstance(command, type):
+        bound = command(*args, **options)
+        return bound()
+    return command(*args, **options)
 
 
-def _described(name: str, hint: Any, *more: Any) -> Any:
+def _described(name: str, hint: Any) -> Any:
     """Returns a parameter's type, with the display of its values and default, and the range of
     seeds.
     """
-    kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
-    marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
-    for mark in (
-        marks
-    ):  # a type that is known only when a command line is parsed, such as the engines' names
-        kind = made() if (made := getattr(mark, "constructor_factory", None)) else kind
-    metavar = None
-    if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
-        metavar = f"{_value(typing.get_args(kind)[0])} ..."
-    return Annotated[
-        (kind, *marks, *more, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))
-    ]
+    kind = hint
+    marks: list[Any] = []
+    if typing.get_origin(hint) is Annotated:
+        kind, *marks = typing.get_args(hint)
+    if name == "seed" or name.endswith("_seed"):
+        marks.append(_SEED)
+    for mark in marks:
+        # A type that is known only when a command line is parsed, such as the engines' names
+        factory = getattr(mark, "constructor_factory", None)
+        if factory is not None:
+            kind = factory()
+    display = tyro.conf.arg(metavar=_metavar(kind), help_behavior_hint=_hint)
+    return Annotated[(kind, *marks, display)]
+
+
+def _metavar(kind: Any) -> str | None:
+    """Display form of the values of a tuple of any length; None: tyro's form."""
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple and arguments[-1] is Ellipsis:
+        return f"{_value(arguments[0])} ..."
+    return None
 
 
 def _seed(words: list[str]) -> int:
@@ -175,19 +201,18 @@ def _dataclass(
     if not dataclasses.is_dataclass(info.type):
         return None
     hints = typing.get_type_hints(info.type, include_extras=True)
-    source = info.default if dataclasses.is_dataclass(info.default) else info.type
-    return tyro.constructors.StructConstructorSpec(
-        instantiate=info.type,
-        fields=tuple(
-            tyro.constructors.StructFieldSpec(
-                field.name,
-                _option(field, hints[field.name]),
-                getattr(source, field.name, tyro.MISSING),
-                functools.partial(_meanings(info.type).get, field.name),
-            )
-            for field in dataclasses.fields(info.type)
-        ),
-    )
+    defaults = info.default if dataclasses.is_dataclass(info.default) else info.type
+    meanings = _meanings(info.type)
+    options = []
+    for field in dataclasses.fields(info.type):
+        option = tyro.constructors.StructFieldSpec(
+            name=field.name,
+            type=_option(field, hints[field.name]),
+            default=getattr(defaults, field.name, tyro.MISSING),
+            helptext=functools.partial(meanings.get, field.name),
+        )
+        options.append(option)
+    return tyro.constructors.StructConstructorSpec(instantiate=info.type, fields=tuple(options))
 
 
 def _option(field: "dataclasses.Field[Any]", hint: Any) -> Any:
@@ -200,10 +225,10 @@ def _option(field: "dataclasses.Field[Any]", hint: Any) -> Any:
 @functools.cache
 def _meanings(kind: type) -> Mapping[str, str]:
     """Help of the fields of a class, each on one line: the string under it."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__[:-1]):
-        params = docstring_parser.parse_from_object(base).params
-        found |= {
-            one.arg_name: _CONTINUED.sub(" ", one.description) for one in params if one.description
-        }
-    return types.MappingProxyType(found)
+    meanings: dict[str, str] = {}
+    bases = kind.__mro__[:-1]
+    for base in reversed(bases):
+        for field in docstring_parser.parse_from_object(base).params:
+            if field.description:
+                meanings[field.arg_name] = _CONTINUED.sub(" ", field.description)
+    return types.MappingProxyType(meanings)

@@ -1,7 +1,9 @@
 """`congrasp query`: one query of a policy server, or a latency test."""
 
+import dataclasses
+import json
 import pathlib
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -10,70 +12,97 @@ from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.cli.console import in_range
 from congrasp.services.client.policy_client import PolicyClient
 
+if TYPE_CHECKING:
+    from congrasp.services.serve.load import Example
 
-def query(  # noqa: PLR0913
-    connect: str = SERVER_URL,
-    name: str = "policy",
-    object_seed: int = 1_000_000,
-    repeat: int = 1,
-    concurrency: int = 1,
-    states: int = 1,
-    rate: float = 0.0,
-    timeout: float = 1.0,
-    certs: pathlib.Path | None = None,
-    health: bool = False,
-    json: Annotated[bool, tyro.conf.arg(name="json")] = False,
-) -> int:
+
+@dataclasses.dataclass(frozen=True)
+class Query:
     """Query a policy server for one action at the start of an episode, or measure its latency.
-
-    Args:
-      connect: The server's endpoint.
-      name: Name of the served run.
-      object_seed: Seed of the procedural object and of the heading.
-      repeat: Total number of queries.
-      concurrency: Number of concurrent clients, each with a separate connection.
-      states: States in one query, up to 64; each gets an answer.
-      rate: Queries a second of each client; 0 sends the next after each answer.
-      timeout: Deadline of one query, s.
-      certs: Folder of a client's certificate (congrasp certs).
-      health: Only check whether the server is ready; the exit code is 0 if it is, else 4.
-      json: Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded.
 
     Examples:
       congrasp query --connect tcp/127.0.0.1:7457
       congrasp query --repeat 1000 --concurrency 4 --json
       congrasp query --repeat 4000 --concurrency 200 --rate 2
     """
-    import json as json_module
 
-    in_range(1, repeat=repeat, concurrency=concurrency, states=states)
-    in_range(0, rate=rate)
-    if health:
-        with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
-            found = client.health()
-        print(json_module.dumps(found))
-        return 0 if found["ready"] else TransportError.exit_code
-    from congrasp.services.serve.load import Load, Target, example_episode, measure, one_answer
+    connect: str = SERVER_URL
+    """The server's endpoint."""
+    name: str = "policy"
+    """Name of the served run."""
+    object_seed: int = 1_000_000
+    """Seed of the procedural object and of the heading."""
+    repeat: int = 1
+    """Total number of queries."""
+    concurrency: int = 1
+    """Number of concurrent clients, each with a separate connection."""
+    states: int = 1
+    """States in one query, up to 64; each gets an answer."""
+    rate: float = 0.0
+    """Queries a second of each client; 0 sends the next after each answer."""
+    timeout: float = 1.0
+    """Deadline of one query, s."""
+    certs: pathlib.Path | None = None
+    """Folder of a client's certificate (congrasp certs)."""
+    health: bool = False
+    """Only check whether the server is ready; the exit code is 0 if it is, else 4."""
+    json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded."""
 
-    with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
-        episode = example_episode(object_seed, str(client.health()["hand"]))
-    with PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs) as client:
-        if repeat == states == 1 and not json:
-            print(one_answer(client, episode))
-            return 0
-    target = Target(connect, name, timeout, certs)
-    result = measure(target, episode, Load(repeat, concurrency, states, rate))
-    if json:
-        print(json_module.dumps(result))
-    else:
-        latency = "p50 {p50_ms:.2f} ms, p99 {p99_ms:.2f} ms, {answers_per_s:.0f} answers/s".format(
-            **result
+    def __call__(self) -> int:
+        """Queries the server, and prints the answer or the latency."""
+        in_range(1, repeat=self.repeat, concurrency=self.concurrency, states=self.states)
+        in_range(0, rate=self.rate)
+        if self.health:
+            return self._print_health()
+        from congrasp.services.serve.load import one_answer
+
+        episode = self._episode()
+        with self._client(hand=episode.hand) as client:
+            is_single = self.repeat == 1 and self.states == 1
+            if is_single and not self.json:
+                print(one_answer(client, episode))
+                return 0
+        return self._print_latency(episode)
+
+    def _client(self, **options: Any) -> PolicyClient:
+        """Returns a client of the server."""
+        return PolicyClient(
+            self.connect, self.name, timeout=self.timeout, certs=self.certs, **options
         )
-        lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
-        print(
-            f"{repeat} queries of {states} state(s) from {concurrency} client(s): {latency}, {lost}"
-        )
-    return 0 if result["failed"] == 0 else 1
+
+    def _print_health(self) -> int:
+        """Prints the state of the server; returns the exit code."""
+        with self._client(wait=self.timeout) as client:
+            health = client.health()
+        print(json.dumps(health))
+        return 0 if health["ready"] else TransportError.exit_code
+
+    def _episode(self) -> "Example":
+        """Returns an example episode of the server's hand."""
+        from congrasp.services.serve.load import example_episode
+
+        with self._client() as client:
+            hand = str(client.health()["hand"])
+            return example_episode(self.object_seed, hand)
+
+    def _print_latency(self, episode: "Example") -> int:
+        """Measures and prints the latency; returns the exit code."""
+        from congrasp.services.serve.load import Load, Target, measure
+
+        target = Target(self.connect, self.name, self.timeout, self.certs)
+        load = Load(self.repeat, self.concurrency, self.states, self.rate)
+        result = measure(target, episode, load)
+        if self.json:
+            print(json.dumps(result))
+        else:
+            print(
+                f"{self.repeat} queries of {self.states} state(s) from {self.concurrency} "
+                f"client(s): p50 {result['p50_ms']:.2f} ms, p99 {result['p99_ms']:.2f} ms, "
+                f"{result['answers_per_s']:.0f} answers/s, {result['failed']:.0f} failed, "
+                f"{result['overloaded']:.0f} overloaded"
+            )
+        return 0 if result["failed"] == 0 else 1
 
 
-COMMAND = query
+COMMAND = Query

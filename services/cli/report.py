@@ -65,33 +65,44 @@ class Report:
         from congrasp.services.evaluate.scores import write_json
 
         in_range(1, episodes=self.episodes, pool=self.pool)
-        run_dir = self.source if self.source is not None and self.source.is_dir() else None
+        run_dir = None
+        if self.source is not None and self.source.is_dir():
+            run_dir = self.source
         file = _policy_of_run(run_dir) if run_dir else policy_file(self.source, self.hand)
-        checked = None if self.check is None else _checked(self.check)
+        hand_check = _hand_check(self.check) if self.check is not None else None
         with tracked() as track:
-            made = report_on(
-                Experiment(
-                    bundles.load(file),
-                    objects_of(self.objects, track=track)
-                    if self.objects
-                    else exam_pool("figures", self.pool),
-                    episodes=self.episodes,
-                    physics=resolve_physics(self.physics),
-                    seed=self.seed,
-                    track=track,
-                ),
+            bundle = bundles.load(file)
+            if self.objects:
+                objects = objects_of(self.objects, track=track)
+            else:
+                objects = exam_pool("figures", self.pool)
+            experiment = Experiment(
+                bundle,
+                objects,
+                episodes=self.episodes,
+                physics=resolve_physics(self.physics),
+                seed=self.seed,
+                track=track,
+            )
+            evaluation = report_on(
+                experiment,
                 file.name,
                 self.out,
                 subject=self._subject(file),
                 objects=self.objects,
                 run_dir=run_dir,
-                check=checked,
+                check=hand_check,
             )
         if self.json is not None:
-            about = {"policy": str(file), "content": bundles.content_hash(file.read_bytes())}
-            about |= {name: getattr(self, name) for name in ("episodes", "pool", "seed")}
-            write_json(made.rows, self.json, about)
-        for error in made.left_out:
+            about = {
+                "policy": str(file),
+                "content": bundles.content_hash(file.read_bytes()),
+                "episodes": self.episodes,
+                "pool": self.pool,
+                "seed": self.seed,
+            }
+            write_json(evaluation.rows, self.json, about)
+        for error in evaluation.left_out:
             print(f"Left out: {error}")
         print(f"The report is in {self.out}: open it in a browser.")
         return 0
@@ -103,7 +114,7 @@ class Report:
         return f"--hand {self.hand}"
 
 
-def _checked(file: pathlib.Path) -> "HandCheck":
+def _hand_check(file: pathlib.Path) -> "HandCheck":
     """Returns the self-check of a file, with its picture."""
     from congrasp.services.assets.hands.findings import read_findings
     from congrasp.services.evaluate.report import HandCheck

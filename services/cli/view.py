@@ -68,7 +68,8 @@ class View:
             starting.enter_context(
                 announced("Loading the policies and compiling the studio's rules")
             )
-            # Ctrl-C interrupts the start, which may compile for a minute
+            # Signals are handled only then: Ctrl-C interrupts the start, which may compile for a
+            # minute.
             with view._page() as url, on_signal() as stop:
                 starting.close()
                 print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
@@ -77,7 +78,7 @@ class View:
         return stop.exit_code
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":
-        """The page of a run: of its learner if that responds, else of its newest policy."""
+        """Returns the page of a run's learner if that responds, else of its newest policy."""
         from congrasp.learner.run_directory import POLICY_FILE, learner_url, open_run
 
         if self.connect or self.policy or self.recordings or self.run != _RUN:
@@ -85,15 +86,25 @@ class View:
                 f"The folder {run_dir} is in place of --connect, --run, --policy and --recordings.",
                 "Give either the folder or these.",
             )
-        run, connect, policy = open_run(run_dir).name, learner_url(run_dir), run_dir / POLICY_FILE
-        page = dataclasses.replace(self, run=run, recordings=run_dir)
-        try:
-            if connect:
-                urls.connect(connect, "observer", certs=self.certs).close()
-                return dataclasses.replace(page, connect=connect)
-        except TransportError:
+        name = open_run(run_dir).name
+        page = dataclasses.replace(self, run=name, recordings=run_dir)
+        endpoint = learner_url(run_dir)
+        if endpoint and self._is_live(endpoint):
+            return dataclasses.replace(page, connect=endpoint)
+        if endpoint:
             print(f"No response from the learner of {run_dir}: the page shows its files.")
-        return dataclasses.replace(page, policy=policy if policy.is_file() else None)
+        policy = run_dir / POLICY_FILE
+        if not policy.is_file():
+            return page
+        return dataclasses.replace(page, policy=policy)
+
+    def _is_live(self, endpoint: str) -> bool:
+        """Returns True if a learner accepts a connection."""
+        try:
+            urls.connect(endpoint, "observer", certs=self.certs).close()
+        except TransportError:
+            return False
+        return True
 
     @contextlib.contextmanager
     def _page(self) -> Iterator[str]:
@@ -109,34 +120,45 @@ class View:
         host = f"[{self.host}]" if ":" in self.host else self.host
         check_exposure(f"tcp/{host}:{self.port}", None, insecure=self.insecure)
         with contextlib.ExitStack() as stack:
-            window, hands = None, grasping.of_file(self.policy) if self.policy else None
+            window = None
+            loaders = None
+            if self.policy:
+                loaders = grasping.of_file(self.policy)
             if self.connect or self.recordings:
-                window = training.opened_window(self.run if self.connect else "", self.recordings)
+                followed_run = self.run if self.connect else ""
+                window = training.opened_window(followed_run, self.recordings)
             if window is not None and self.connect:
-                watching = stack.enter_context(
+                observer = stack.enter_context(
                     urls.connect(self.connect, "observer", certs=self.certs)
                 )
-                stack.callback(training.Follower(watching, window).close)
-                hands = self._of_run(watching, stack)
-            shown = hands or grasping.pretrained()
-            yield stack.enter_context(
-                open_page(shown, self.objects, window, self.host, self.port, self.allow_host)
-            )
+                follower = training.Follower(observer, window)
+                stack.callback(follower.close)
+                loaders = self._loaders_of_run(observer, stack)
+            if not loaders:
+                loaders = grasping.pretrained()
+            page = open_page(loaders, self.objects, window, self.host, self.port, self.allow_host)
+            yield stack.enter_context(page)
 
-    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> "Loaders | None":
-        """The policy of a run; None if there is only an observer's certificate."""
+    def _loaders_of_run(self, observer: Transport, stack: contextlib.ExitStack) -> "Loaders | None":
+        """Returns the loaders of a run's policy; None if there is only an observer's certificate.
+
+        Args:
+          observer: connection to the learner, used without certificates.
+          stack: closes the connection with a server's certificate.
+        """
         from congrasp.services.studio.grasping import of_run
 
-        pulling = watching
+        transport = observer
         if self.certs is not None:
             try:
-                pulling = stack.enter_context(
+                transport = stack.enter_context(
                     urls.connect(self.connect, "server", certs=self.certs, run=self.run)
                 )
             except CongraspError as error:
                 log("warning", f"{error} The studio grasps with the pretrained policies.")
                 return None
-        return of_run(pulling, self.run, urls.name_on_wire("studio", self.certs, "server"))
+        name = urls.name_on_wire("studio", self.certs, "server")
+        return of_run(transport, self.run, name)
 
 
 COMMAND = View

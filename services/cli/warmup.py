@@ -1,25 +1,17 @@
 """`congrasp warmup`: compiled programs ahead of time, and the caches of one machine for others."""
 
-import contextlib
-import importlib.util
-import io
-import json
-import os
 import pathlib
-import tarfile
-from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.files import cache_folder, check_output, replacement, write_atomically
+from congrasp.common.io.files import check_output
 from congrasp.common.runtime.engines import PhysicsName
+from congrasp.services.cli.cache_archive import export_caches, import_caches
 from congrasp.services.ops.lifetime import on_signal
-
-_MANIFEST = "caches.json"
 
 
 def warmup(
@@ -70,7 +62,8 @@ def warmup(
             "--import and --export were given together.", "Run one after the other."
         )
     if source is not None:
-        console.print(f"{import_caches(source)} files of {source} are in the caches.", markup=False)
+        count = import_caches(source)
+        console.print(f"{count} files of {source} are in the caches.", markup=False)
         return 0
     if export is not None:
         check_output("--export", export, is_folder=False)
@@ -81,127 +74,6 @@ def warmup(
     if export is not None and not stop.exit_code:
         export_caches(export)
     return stop.exit_code
-
-
-def export_caches(path: pathlib.Path) -> None:
-    """Writes everything in the caches of compiled programs, kernels and banks into a tar file.
-
-    Raises:
-      CongraspError: the file cannot be written.
-    """
-    with replacement(path) as file, tarfile.open(fileobj=file, mode="w") as archive:
-        manifest = tarfile.TarInfo(_MANIFEST)
-        text = json.dumps(_machine()).encode()
-        manifest.size = len(text)
-        archive.addfile(manifest, io.BytesIO(text))
-        for name, folder in _folders().items():
-            for member in sorted(folder.rglob("[!.]*")):
-                if not member.is_file() or member.is_symlink():
-                    continue
-                # Another process may remove it meanwhile.
-                with contextlib.suppress(FileNotFoundError):
-                    inside = member.relative_to(folder)
-                    archive.add(member, f"{name}/{inside}", recursive=False)
-
-
-def import_caches(path: pathlib.Path) -> int:
-    """Adds the files of `export_caches` to the caches of this machine, and returns their number.
-
-    Raises:
-      CongraspError: the file cannot be read, is not of this command, or was made for other versions
-        or another device.
-    """
-    folders, members = _folders(), dict[tarfile.TarInfo, pathlib.Path]()
-    with _opened(path) as archive:
-        for member in archive.getmembers():
-            if member.name == _MANIFEST:
-                continue
-            name, _, inside = member.name.partition("/")
-            if name == "jax" and name not in folders:
-                raise CongraspError(
-                    "The cache of compiled programs cannot be written.",
-                    "Set JAX_COMPILATION_CACHE_DIR.",
-                )
-            if name not in folders or not _is_inside(member, inside, folders[name]):
-                raise CongraspError(
-                    f"{path} has an entry that is no file of a cache: {member.name!a:.80}.", _REMEDY
-                )
-            members[member] = folders[name] / inside
-        for member, target in members.items():
-            if not target.exists():
-                write_atomically(target, _content(archive, member))
-    return len(members)
-
-
-def _is_inside(member: tarfile.TarInfo, name: str, folder: pathlib.Path) -> bool:
-    """True if a member is a regular file that has this name in the folder, and no link leads out of
-    there.
-    """
-    target = folder / name
-    if (
-        not member.isreg()
-        or member.sparse
-        or ".." in target.parts
-        or f"{folder}/{name}" != str(target)
-    ):
-        return False
-    return target.resolve().is_relative_to(folder.resolve())
-
-
-_REMEDY = "Pass a file that 'congrasp warmup --export' wrote."
-
-
-@contextlib.contextmanager
-def _opened(path: pathlib.Path) -> Iterator[tarfile.TarFile]:
-    """A file of `export_caches` that is for this machine."""
-    try:
-        with tarfile.open(path, "r:") as archive:
-            made_for = json.loads(_content(archive, archive.getmember(_MANIFEST)))
-            for what, value in _machine().items():
-                if made_for[what] != value:
-                    raise CongraspError(
-                        f"{path} was made for {what} {made_for[what]!a:.80}, but this machine has "
-                        f"{value}.",
-                        "Run 'congrasp warmup' here instead.",
-                    )
-            yield archive
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.", _REMEDY) from None
-    except (tarfile.TarError, ValueError, KeyError, TypeError):
-        raise CongraspError(f"{path} is not a file of caches, or is damaged.", _REMEDY) from None
-
-
-def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    """Content of a regular file."""
-    file = archive.extractfile(member) if member.isreg() else None
-    if file is None:
-        raise ValueError(f"{member.name} is no file")
-    return file.read()
-
-
-def _machine() -> dict[str, Any]:
-    """Versions and device for which programs and kernels are compiled."""
-    import jax
-
-    warp = importlib.util.find_spec("warp") and importlib.import_module("warp")
-    return {
-        "JAX": jax.__version__,
-        "Warp": warp.config.version if warp else None,
-        "device": jax.local_devices()[0].device_kind,
-    }
-
-
-def _folders() -> dict[str, pathlib.Path]:
-    """Folders of the caches by their names in a file."""
-    folders = {"banks": cache_folder("banks")}
-    if programs := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        folders["jax"] = pathlib.Path(programs)
-    if importlib.util.find_spec("warp"):
-        warp = importlib.import_module("warp")
-        warp.config.log_level = warp.LOG_WARNING
-        warp.init()
-        folders["warp"] = pathlib.Path(warp.config.kernel_cache_dir)
-    return folders
 
 
 COMMAND = warmup

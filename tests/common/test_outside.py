@@ -228,7 +228,7 @@ def command_line():
     from congrasp.common.config import RunConfig
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
-    from congrasp.services.cli import main
+    from congrasp.services.cli import main, parse_errors
     from congrasp.services.grasp.parse import read_request
 
     train = [
@@ -243,7 +243,7 @@ def command_line():
             main.load(command)(["--help"])
         for word in words:
             assert word in said.getvalue(), word
-    parsed = main._parsed("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
+    parsed = parse_errors.parse("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
     assert list(request.constraints) == ["heading", "level"] and request.constraints["level"][

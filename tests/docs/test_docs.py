@@ -21,7 +21,7 @@ import tyro
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields
-from congrasp.services.cli import main, parser
+from congrasp.services.cli import main, parse_errors, parser
 from congrasp.services.viz.metric_titles import TITLES
 from tests.base_install import run_in_base_install, steady_server
 
@@ -62,7 +62,7 @@ def test_every_command_line_parses(line):
         words = words[: words.index(stop)] if stop in words else words
     assert words[0] in main.COMMANDS
     if len(words) > 1 and words[1] != "--help":
-        main._parsed(words[0], main.load(words[0]), words[1:])
+        parse_errors.parse(words[0], main.load(words[0]), words[1:])
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_every_help_page_ends_with_examples_that_parse(command):
     for line in lines:
         program, name, *rest = shlex.split(line)
         assert program == "congrasp"
-        main._parsed(name, main.load(name), rest)
+        parse_errors.parse(name, main.load(name), rest)
 
 
 def test_help_pages_speak_to_people(capsys):

@@ -13,7 +13,7 @@ import pytest
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.services.cli import warmup
+from congrasp.services.cli import cache_archive, warmup
 from congrasp.services.train import learn as training
 
 
@@ -67,8 +67,8 @@ def machine(tmp_path, monkeypatch):
 
     def become(name, version="1.2"):
         folders = {kind: tmp_path / name / "caches" / kind for kind in ("jax", "warp")}
-        monkeypatch.setattr(warmup, "_folders", lambda: folders)
-        monkeypatch.setattr(warmup, "_machine", lambda: {"JAX": version, "device": "GPU"})
+        monkeypatch.setattr(cache_archive, "_folders", lambda: folders)
+        monkeypatch.setattr(cache_archive, "_machine", lambda: {"JAX": version, "device": "GPU"})
         return tmp_path / name
 
     return become
@@ -154,14 +154,14 @@ def _link(kind, target):
 def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, member):
     file, here = _written(tmp_path / "caches.tar", "jax/program", member), machine("a")
     with pytest.raises(CongraspError, match="no file of a cache"):
-        warmup.import_caches(file)
+        cache_archive.import_caches(file)
     assert not here.exists()  # not even the members before it
 
 
 def test_caches_of_other_versions_and_files_of_other_kinds_are_one_line(machine, tmp_path):
     machine("a")
     with pytest.raises(CongraspError, match=r"made for JAX '1.1', but this machine has 1.2"):
-        warmup.import_caches(
+        cache_archive.import_caches(
             _written(tmp_path / "old.tar", manifest={"JAX": "1.1", "device": "GPU"})
         )
     (tmp_path / "text").write_text("no archive")
@@ -173,8 +173,8 @@ def test_caches_of_other_versions_and_files_of_other_kinds_are_one_line(machine,
         archive.addfile(tarfile.TarInfo("jax/program"))
     for path in (tmp_path / "text", tmp_path / "plain.tar", *other):
         with pytest.raises(CongraspError, match="is not a file of caches, or is damaged"):
-            warmup.import_caches(path)
+            cache_archive.import_caches(path)
     with pytest.raises(CongraspError, match=r"cannot be read: No such file"):
-        warmup.import_caches(tmp_path / "missing.tar")
+        cache_archive.import_caches(tmp_path / "missing.tar")
     with pytest.raises(CongraspError, match="cannot be read: Is a directory"):
-        warmup.import_caches(tmp_path)
+        cache_archive.import_caches(tmp_path)

@@ -11,7 +11,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.cli import main
+from congrasp.services.cli import main, parse_errors
 from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
@@ -267,7 +267,7 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
 )
 def test_its_command_lines_are_those_of_train(policy):
     arguments = [*training_options(policy), "--environments", "4096"]
-    train = main._parsed("train", main.load("train"), arguments)
+    train = parse_errors.parse("train", main.load("train"), arguments)
     config = train.keywords["config"]
     assert (config.task.hand, config.environments) == (policy.hand, 4096)
     assert train.keywords["method"] == (None if policy.method == "ours" else policy.method)

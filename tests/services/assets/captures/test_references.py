@@ -44,7 +44,7 @@ from congrasp.services.assets.captures.references import (
 from congrasp.services.assets.captures.report import Report
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.assets.captures.surface import Surface
-from congrasp.services.cli.constraints import _print_report
+from congrasp.services.cli.capture_report import print_report
 from tests.scenes import pointing
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
@@ -378,7 +378,7 @@ def test_the_report_names_them(capsys):
         row("push", clear=False, below=False, overlap=0.003, moved=0.2),
         row("dig", clear=False, below=True),
     ]
-    _print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
+    print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
     said = capsys.readouterr().out
     assert "room for 1 of 4" in said
     assert "In 2 of 4, thumb and fingers oppose only after the first touch" in said
