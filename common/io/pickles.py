@@ -15,7 +15,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file, read_npz
+from congrasp.common.io.arrays import read_npz
+from congrasp.common.io.inputs import read_file
 from congrasp.common.runtime.environment import child_environment
 
 MAX_BYTES = 512 << 20
@@ -88,7 +89,7 @@ def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of an NPZ file by name; those of pickles inside are named as in `read_pickle`.
 
     Raises:
-      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.inputs`, or holds
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.arrays`, or holds
         anything but plain values and arrays.
     """
     arrays = read_npz(path, "Download the file again.", pickled=True)

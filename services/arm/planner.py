@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.inputs import numbers_in
+from congrasp.common.io.arrays import numbers_in
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm import ArmOptions

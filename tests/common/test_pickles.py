@@ -14,7 +14,7 @@ import scipy.sparse
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io import pickles
-from congrasp.common.io.inputs import read_npz
+from congrasp.common.io.arrays import read_npz
 from congrasp.common.io.pickles import read_pickle, read_pickles
 from tests.children import python
 from tests.limits import limited
