@@ -66,11 +66,17 @@ def parse_alive(key: str) -> Alive | None:
 
 def matches(expression: str, key: str) -> bool:
     """True if an expression matches a key: `*` matches one part, `**` any number of parts."""
-    pattern = "".join(
-        "(?:/[^/]+)*" if part == "**" else "/[^/]+" if part == "*" else "/" + re.escape(part)
-        for part in expression.split("/")
-    )
+    pattern = "".join(_part_pattern(part) for part in expression.split("/"))
     return re.fullmatch(pattern, "/" + key) is not None
+
+
+def _part_pattern(part: str) -> str:
+    """Regular expression for one part of an expression, with the slash before it."""
+    if part == "**":
+        return "(?:/[^/]+)*"
+    if part == "*":
+        return "/[^/]+"
+    return "/" + re.escape(part)
 
 
 def below(key: str) -> str:
