@@ -400,20 +400,20 @@ class Sessions:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
     def watch_revocations(
-        self, credentials: Credentials, period: float, known: frozenset[str] | None
+        self, credentials: Credentials, period: float, revoked: frozenset[str] | None
     ) -> None:
         """Checks for revoked certificates in a thread, until the sessions are closed.
 
         Args:
           credentials: credentials of this process.
           period: seconds between two checks.
-          known: the certificates that were revoked when a listener's sessions were opened; None if
-            they connect.
+          revoked: the certificates that were revoked when a listener's sessions were opened; None
+            if they connect.
         """
-        if known is None:
+        if revoked is None:
             self.start(heed_revocations, self, credentials, period)
         else:
-            self.start(follow_revocations, self, credentials, known, period)
+            self.start(follow_revocations, self, credentials, revoked, period)
 
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""
@@ -458,7 +458,7 @@ os.register_at_fork(after_in_child=_abandon_all)
 
 
 def follow_revocations(
-    sessions: Sessions, credentials: Credentials, known: frozenset[str], period: float
+    sessions: Sessions, credentials: Credentials, revoked: frozenset[str], period: float
 ) -> None:
     """Reopens a listener's sessions whenever the list of revoked certificates changes, until they
     are closed.
@@ -466,19 +466,19 @@ def follow_revocations(
     Args:
       sessions: sessions of the listener.
       credentials: credentials of the listener.
-      known: the list when they were opened.
+      revoked: the list when they were opened.
       period: seconds between two checks.
     """
     while not sessions.closed.wait(period):
         try:
-            listed = credentials.revoked()
-            if listed == known:
+            current = credentials.revoked()
+            if current == revoked:
                 continue
             _log.warning(
                 "The list of revoked certificates has changed: all connections are reopened."
             )
             sessions.reopen()
-            known = listed
+            revoked = current
         except CongraspError as error:  # retried at the next check
             _log.error("The list of revoked certificates is not in effect: %s", error)
 
