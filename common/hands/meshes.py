@@ -13,8 +13,8 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.arrays import read_npz
 from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import read_npz
 
 SUFFIX = ".visual.npz"
 MAX_FACES = 3000

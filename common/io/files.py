@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # commands that read no message start without NumPy
 
 _log = logging.getLogger(__name__)
 
-
 _NO_SYNC = (
     errno.EINVAL,
     errno.ENOTSUP,
@@ -84,7 +83,9 @@ def replacement(path: pathlib.Path) -> Iterator[BinaryIO]:
 
 
 def _unwritten(path: pathlib.Path, error: OSError) -> CongraspError:
-    """Error of a file that was not written; it names an earlier one where there is one."""
+    """Returns the error of a file that was not written; it mentions an earlier file if there is
+    one.
+    """
     remedy = "Free space or choose another folder."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         remedy = "Choose another folder."
@@ -105,15 +106,14 @@ def check_output(option: str, path: pathlib.Path, *, is_folder: bool) -> None:
     """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other
     one of these.
     """
-    if path.exists() and path.is_dir() != is_folder:
-        found, remedy = (
-            ("file", "Pass a folder; it need not exist.")
-            if is_folder
-            else ("folder", "Pass a file in it.")
-        )
-        raise CongraspError(f"{option} is the {found} {path}.", remedy)
-    places = [path] * is_folder + list(path.absolute().parents)
-    parent = next(place for place in places if os.path.lexists(place))
+    if is_folder and path.exists() and not path.is_dir():
+        raise CongraspError(f"{option} is the file {path}.", "Pass a folder; it need not exist.")
+    if not is_folder and path.is_dir():
+        raise CongraspError(f"{option} is the folder {path}.", "Pass a file in it.")
+    folders = list(path.absolute().parents)
+    if is_folder:
+        folders.insert(0, path)
+    parent = next(folder for folder in folders if os.path.lexists(folder))
     if not parent.is_dir():
         raise CongraspError(
             f"{option} is {path}, but {parent} is a file or a link to nothing.",
@@ -204,11 +204,10 @@ def source_digest(*packages: ModuleType) -> str:
     cache entries.
     """
     digest = hashlib.sha256()
-    for folder in (folder for package in packages for folder in package.__path__):
-        for file in sorted(
-            file for kind in ("*.py", "*.json") for file in pathlib.Path(folder).rglob(kind)
-        ):
-            digest.update(file.read_bytes())
+    for package in packages:
+        for folder in map(pathlib.Path, package.__path__):
+            for file in sorted([*folder.rglob("*.py"), *folder.rglob("*.json")]):
+                digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -234,5 +233,5 @@ def keep(path: pathlib.Path, message: "Message", most: int) -> None:
     with contextlib.suppress(CongraspError, OSError):
         write_atomically(path, encode(message))
         files = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda file: file.stat().st_mtime)
-        for old in files[:-most]:
-            old.unlink(missing_ok=True)
+        for unused in files[:-most]:
+            unused.unlink(missing_ok=True)

@@ -30,11 +30,12 @@ MAX_NUMBER = 1 << 53
 """Exclusive bound of the integers in a journal, since JSON readers do not represent larger ones
 exactly.
 """
-_KEPT_SECONDS = 30 * 86400.0
+_MAX_UNUSED_S = 30 * 86400.0
+"""Time after which a journal in the user's folder is removed, since its last line."""
 _CHECK = ', "crc32": "{}"}}\n'
 _CHECK_BYTES = len(_CHECK.format("00000000"))
-_END = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
-_MAX_LINE = 1 << 22
+_CHECK_PATTERN = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
+_MAX_LINE_BYTES = 1 << 22
 
 
 class Journal:
@@ -51,14 +52,16 @@ class Journal:
         Raises:
           CongraspError: the file cannot be opened.
         """
-        self._path, self._warn = path, warn
+        self._path = path
+        self._warn = warn
         self._lock = threading.Lock()
         with os_errors_as(f"The journal {path} cannot be opened"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._cut, self._after = _end_of(path)
             self._file = open_to_append(path)
             self._end = EndWriter(path)
-        self._lost, self._refused = int(self._cut), False
+        self._lost = int(self._cut)
+        self._refused = False
 
     def write(self, **entry: Any) -> None:
         """Appends a line; lines that the disk refuses are counted in the next written one, as
@@ -72,7 +75,8 @@ class Journal:
                 self._cut = self._file.write(line) < len(line)
                 reason = "No space left" if self._cut else ""
             except OSError as error:
-                self._cut, reason = True, error.strerror or str(error)
+                self._cut = True
+                reason = error.strerror or str(error)
             if reason and not self._refused:
                 self._warn(
                     f"{self._path} could not be written ({reason}); what happens meanwhile is not "
@@ -123,8 +127,8 @@ def user_journal(
 
 
 def _remove_old(folder: pathlib.Path) -> None:
-    """Removes the folders of runs whose journals have not been written for `_KEPT_SECONDS`."""
-    oldest = time.time() - _KEPT_SECONDS
+    """Removes the folders of runs whose journals have not been written for `_MAX_UNUSED_S`."""
+    oldest = time.time() - _MAX_UNUSED_S
     for run in folder.iterdir():
         if run.is_symlink() or not run.is_dir():
             continue
@@ -166,34 +170,44 @@ def read_journal(
       CongraspError: the file cannot be read.
     """
     entries: list[dict[str, Any] | None] = []
-    lost = damaged = missing = unchecked = run = 0
-    before, cut = "", False
+    lost = damaged = missing = unchecked = 0
+    damaged_run = 0  # damaged lines since the last intact one
+    before = ""
+    cut = False
     end = read_end(path)  # first, since a running process writes more lines meanwhile
     checks = set[str]()
     with os_errors_as(f"The journal {path} cannot be read"), open_file(path) as file:
-        while line := file.readline(_MAX_LINE):
+        while line := file.readline(_MAX_LINE_BYTES):
             if not line.strip(b"\n"):
                 continue
             cut = not line.endswith(b"\n")
             entry, check = _parse(line)
             if entry is None or not is_entry(entry):
-                run += 1
+                damaged_run += 1
                 entries.append(None)
                 continue
             after = entry.pop("after", None)
             unchecked += after is None
-            if after not in (None, before) and not run:
+            if after not in (None, before) and not damaged_run:
                 missing += 1
                 entries.append(None)
             before = check
             checks.add(check)
             # The disk took a part of the first line that it refused: `lost` counts that one, too.
             refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
-            lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
+            lost += refused
+            damaged += max(0, damaged_run - bool(refused))
+            damaged_run = 0
             entries.append(entry)
-    cut = cut and run > 0
+    cut = cut and damaged_run > 0
     missing += not entries or _lacks_end(end, checks, is_cut=cut)
-    return JournalLines(entries, lost + cut, damaged + run - cut, missing, unchecked)
+    return JournalLines(
+        entries=entries,
+        lost=lost + cut,
+        damaged=damaged + damaged_run - cut,
+        missing=missing,
+        unchecked=unchecked,
+    )
 
 
 def _lacks_end(end: JournalEnd | None, checks: set[str], *, is_cut: bool) -> bool:
@@ -215,10 +229,14 @@ def has_fields(entry: dict[str, Any], **types: type) -> bool:
 
 def is_rows(value: Any, *types: type) -> bool:
     """True if a value is a list of rows whose columns have these types."""
-    return isinstance(value, list) and all(
-        isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types))
-        for row in value
-    )
+    return isinstance(value, list) and all(_is_row(row, types) for row in value)
+
+
+def _is_row(value: Any, types: tuple[type, ...]) -> bool:
+    """True if a value is a list of one value of each type."""
+    if not isinstance(value, list) or len(value) != len(types):
+        return False
+    return all(map(is_value, value, types))
 
 
 def is_value(value: Any, kind: type) -> bool:
@@ -235,12 +253,12 @@ def _end_of(path: pathlib.Path) -> tuple[bool, str]:
     is_cut = False
     checks = set[str]()
     with open_file(path) as file:
-        while line := file.readline(_MAX_LINE):
+        while line := file.readline(_MAX_LINE_BYTES):
             is_cut = not line.endswith(b"\n")
-            found = _END.fullmatch(line[-_CHECK_BYTES:])
-            if is_cut or found is None:
+            check = _CHECK_PATTERN.fullmatch(line[-_CHECK_BYTES:])
+            if is_cut or check is None:
                 continue
-            last = found[1].decode()
+            last = check[1].decode()
             checks.add(last)
     noted = read_end(path)
     if is_cut:
@@ -281,9 +299,7 @@ def _parse(line: bytes) -> tuple[dict[str, Any] | None, str]:
         entry = json.loads(line)
     except (ValueError, RecursionError):
         return None, check
-    whole = (
-        isinstance(entry, dict)
-        and entry.pop("crc32", None)
-        and line.endswith(_CHECK.format(check).encode())
-    )
-    return (entry if whole else None), check
+    is_intact = line.endswith(_CHECK.format(check).encode())
+    if not is_intact or not isinstance(entry, dict) or not entry.pop("crc32", None):
+        return None, check
+    return entry, check

@@ -70,7 +70,8 @@ def _dtype(kind: Any) -> np.dtype[Any]:
     name = str(kind.arguments[0])
     if not _NUMBER.fullmatch(name):
         raise pickle.UnpicklingError(f"has an array of {name[:20]!r}, not of numbers")
-    return np.dtype(name).newbyteorder(">" if kind.state and kind.state[1] == ">" else "<")
+    is_big_endian = bool(kind.state) and kind.state[1] == ">"
+    return np.dtype(name).newbyteorder(">" if is_big_endian else "<")
 
 
 def _encode(text: str, _: str) -> bytes:
@@ -81,9 +82,8 @@ def _encode(text: str, _: str) -> bytes:
 def _numbers(data: Any, kind: Any, shape: Any, order: str) -> np.ndarray:
     """Array of a buffer, which Python 2 wrote as text."""
     buffer = data.encode("latin-1") if isinstance(data, str) else data
-    return np.frombuffer(buffer, _dtype(kind)).reshape(
-        tuple(shape), order="F" if order == "F" else "C"
-    )
+    flat = np.frombuffer(buffer, _dtype(kind))
+    return flat.reshape(tuple(shape), order="F" if order == "F" else "C")
 
 
 def _scalar(kind: Any, data: Any) -> Any:
@@ -116,39 +116,48 @@ def _tensor(
     flat: Any, start: int, shape: tuple[int, ...], steps: tuple[int, ...], *_: Any
 ) -> np.ndarray:
     """PyTorch's tensor, a view of its storage; NumPy refuses one that reaches beyond it."""
-    size = flat.itemsize
-    return np.ndarray(shape, flat.dtype, flat, start * size, [step * size for step in steps])
+    offset_bytes = start * flat.itemsize
+    steps_bytes = [step * flat.itemsize for step in steps]
+    return np.ndarray(shape, flat.dtype, flat, offset_bytes, steps_bytes)
 
 
-_NUMPY = {"_reconstruct": _Array, "scalar": _scalar}
-_ALLOWED: dict[str, Any] = {
-    **{
-        f"numpy.{core}.multiarray.{name}": made
-        for core in ("core", "_core")
-        for name, made in _NUMPY.items()
-    },
-    **{f"numpy.{core}.numeric._frombuffer": _numbers for core in ("core", "_core")},
-    **{"numpy.ndarray": _Part, "numpy.dtype": _Dtype, "_codecs.encode": _encode},
-    **{
-        f"scipy.sparse.{mark}{form}.{form}_{kind}": made
-        for form, made in _SPARSE.items()
-        for mark in ("", "_")
-        for kind in ("matrix", "array")
-    },
-    **{"chumpy.ch.Ch": _Variable, "chumpy.reordering.Select": _Selection},
-    **{f"{module}._reconstructor": _rebuilt for module in ("copy_reg", "copyreg")},
-    **{
-        f"{module}.{kind.__name__}": kind
-        for module in ("__builtin__", "builtins")
-        for kind in (set, object)
-    },
-    **{"torch._utils._rebuild_tensor_v2": _tensor, "torch.storage._load_from_bytes": _storage},
-    **{"torch.DoubleStorage": "<f8", "torch.FloatStorage": "<f4", "torch.HalfStorage": "<f2"},
-    **{"torch.LongStorage": "<i8", "torch.IntStorage": "<i4", "torch.ShortStorage": "<i2"},
-    **{"torch.ByteStorage": "<u1", "torch.BoolStorage": "?", "collections.OrderedDict": dict},
-}
+def _allowed_names() -> dict[str, Any]:
+    """Returns the stand-in of each name that a pickle may contain."""
+    allowed: dict[str, Any] = {
+        "numpy.ndarray": _Part,
+        "numpy.dtype": _Dtype,
+        "_codecs.encode": _encode,
+        "collections.OrderedDict": dict,
+        "chumpy.ch.Ch": _Variable,
+        "chumpy.reordering.Select": _Selection,
+        "torch._utils._rebuild_tensor_v2": _tensor,
+        "torch.storage._load_from_bytes": _storage,
+        "torch.DoubleStorage": "<f8",
+        "torch.FloatStorage": "<f4",
+        "torch.HalfStorage": "<f2",
+        "torch.LongStorage": "<i8",
+        "torch.IntStorage": "<i4",
+        "torch.ShortStorage": "<i2",
+        "torch.ByteStorage": "<u1",
+        "torch.BoolStorage": "?",
+    }
+    for core in ("core", "_core"):  # NumPy 1 and 2
+        allowed[f"numpy.{core}.multiarray._reconstruct"] = _Array
+        allowed[f"numpy.{core}.multiarray.scalar"] = _scalar
+        allowed[f"numpy.{core}.numeric._frombuffer"] = _numbers
+    for form, stand_in in _SPARSE.items():
+        for module in (f"scipy.sparse.{form}", f"scipy.sparse._{form}"):
+            allowed[f"{module}.{form}_matrix"] = stand_in
+            allowed[f"{module}.{form}_array"] = stand_in
+    for module in ("copy_reg", "copyreg"):  # Python 2 and 3
+        allowed[f"{module}._reconstructor"] = _rebuilt
+    for module in ("__builtin__", "builtins"):
+        allowed[f"{module}.set"] = set
+        allowed[f"{module}.object"] = object
+    return allowed
 
 
+_ALLOWED = _allowed_names()
 _PLAIN = (bool, int, float, str, bytes, np.generic)
 
 
@@ -178,31 +187,44 @@ def _resolved(part: Any) -> Any:
     """Array, or plain value, that an object stands for; None if it stands for none."""
     match part:
         case _Array():
-            _, shape, kind, fortran, data = part.state
-            if kind.arguments[0] in ("O8", "O"):
-                return _resolved(data[0]) if shape == () else data
-            return _numbers(data, kind, shape, "F" if fortran else "C")
+            return _array(part)
         case _Sparse():
-            state, values = part.state, _resolved(part.state["data"])
-            if isinstance(part, _SPARSE["coo"]):
-                places = tuple(
-                    map(
-                        _resolved,
-                        state["coords"] if "coords" in state else (state["row"], state["col"]),
-                    )
-                )
-            else:
-                inner, starts = _resolved(state["indices"]), _resolved(state["indptr"])
-                places = inner, np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-            dense = np.zeros(state["_shape"], values.dtype)
-            np.add.at(dense, places[::-1] if isinstance(part, _SPARSE["csr"]) else places, values)
-            return dense
+            return _dense(part)
         case _Variable():
             return _resolved(part.state["x"])
         case _Selection():
-            whole, index = _resolved(part.state["a"]), _resolved(part.state["idxs"])
-            return whole.ravel()[index].reshape(part.state["preferred_shape"])
-    return None if isinstance(part, _Part) else part
+            variable = _resolved(part.state["a"])
+            index = _resolved(part.state["idxs"])
+            return variable.ravel()[index].reshape(part.state["preferred_shape"])
+        case _Part():
+            return None
+    return part
+
+
+def _array(part: _Array) -> Any:
+    """Array of numbers; of an array of objects its element, or the list of its elements."""
+    _, shape, kind, is_fortran, data = part.state
+    if kind.arguments[0] in ("O8", "O"):
+        return _resolved(data[0]) if shape == () else data
+    return _numbers(data, kind, shape, "F" if is_fortran else "C")
+
+
+def _dense(part: _Sparse) -> np.ndarray:
+    """Dense array of a SciPy matrix; values at the same place are added."""
+    state = part.state
+    values = _resolved(state["data"])
+    if isinstance(part, _SPARSE["coo"]):
+        coordinates = state["coords"] if "coords" in state else (state["row"], state["col"])
+        places = tuple(map(_resolved, coordinates))
+    else:
+        minor = _resolved(state["indices"])
+        starts = _resolved(state["indptr"])
+        major = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        is_by_rows = isinstance(part, _SPARSE["csr"])
+        places = (major, minor) if is_by_rows else (minor, major)
+    dense = np.zeros(state["_shape"], values.dtype)
+    np.add.at(dense, places, values)
+    return dense
 
 
 def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
@@ -210,10 +232,10 @@ def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
     value = _resolved(value)
     if isinstance(value, dict):
         for key, item in value.items():
-            if isinstance(key, str | bytes):
-                yield from _arrays(
-                    f"{name}/{key if isinstance(key, str) else key.decode('latin-1')}", item
-                )
+            if isinstance(key, bytes):
+                yield from _arrays(f"{name}/{key.decode('latin-1')}", item)
+            elif isinstance(key, str):
+                yield from _arrays(f"{name}/{key}", item)
         return
     if value is None:
         yield name, np.empty(0)
@@ -234,17 +256,20 @@ def _rows(value: Any) -> Any:
     return value
 
 
+def _limit(kind: int, limit: int) -> None:
+    """Lowers a limit of this process."""
+    hard = resource.getrlimit(kind)[1]
+    if hard != resource.RLIM_INFINITY:
+        limit = min(limit, hard)
+    resource.setrlimit(kind, (limit, limit))
+
+
 def main(pickles: str, answer: str, memory: str, seconds: str, size: str) -> None:
     """Writes the arrays of all pickles, under names that begin with the pickle's number."""
-    for kind, limit in (
-        (resource.RLIMIT_AS, int(memory)),
-        (resource.RLIMIT_CPU, int(seconds)),
-        (resource.RLIMIT_FSIZE, int(size)),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        hard = resource.getrlimit(kind)[1]
-        most = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
-        resource.setrlimit(kind, (most, most))
+    _limit(resource.RLIMIT_AS, int(memory))
+    _limit(resource.RLIMIT_CPU, int(seconds))
+    _limit(resource.RLIMIT_FSIZE, int(size))
+    _limit(resource.RLIMIT_CORE, 0)
     arrays: dict[str, np.ndarray] = {}
     try:
         with zipfile.ZipFile(pickles) as archive:

@@ -23,8 +23,10 @@ import psutil
 from congrasp.common.runtime.environment import child_environment
 
 Result = TypeVar("Result")
-_WORTH_IT = 64  # calls; below this, starting processes takes longer than it saves
-_MOST_WORKERS = 16
+_MIN_CALLS = 64  # with fewer, starting processes takes longer than it saves
+_MIN_CALLS_PER_WORKER = 16
+_MAX_WORKERS = 16
+_CALLS_PER_CHUNK = 4  # sent to a worker at a time
 _PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constraints")
 """Modules imported once, before the workers fork; workers import anything else their functions
 need.
@@ -33,6 +35,7 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM
 """Environment of processes that share the cores: each would otherwise start a thread for every
 core, for products so small that the threads cost several times the work."""
 _GROUPS = pathlib.Path("/sys/fs/cgroup")
+"""Folder of the kernel's control groups."""
 _MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
 
 
@@ -40,31 +43,27 @@ def cores() -> int:
     """Number of cores available to this process, by its affinity and the quotas of its control
     groups, rounded up.
     """
-    affinity = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    quotas = (
-        text.split() for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us")
-    )
-    shares = [int(quota) / int(period) for quota, period in quotas if quota not in ("max", "-1")]
-    return max(1, math.ceil(min([affinity, *shares])))
+    if hasattr(os, "sched_getaffinity"):
+        available: float = len(os.sched_getaffinity(0))
+    else:
+        available = os.cpu_count() or 1
+    for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us"):
+        quota, period = text.split()
+        if quota not in ("max", "-1"):
+            available = min(available, int(quota) / int(period))
+    return max(1, math.ceil(available))
 
 
 def memory() -> int:
     """Bytes of memory available to this process: free ones, and what the limits of its control
     groups leave.
     """
-    limits = _limits("memory", "memory.max", "memory.limit_in_bytes")
     used = psutil.Process().memory_info().rss
-    return max(
-        0,
-        min(
-            [
-                psutil.virtual_memory().available,
-                *(int(text) - used for text in limits if text != "max"),
-            ]
-        ),
-    )
+    available = psutil.virtual_memory().available
+    for limit in _limits("memory", "memory.max", "memory.limit_in_bytes"):
+        if limit != "max":
+            available = min(available, int(limit) - used)
+    return max(0, available)
 
 
 def memory_kills() -> int:
@@ -89,9 +88,9 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
             _, controllers, group = line.split(":", 2)
             if controllers and controller not in controllers.split(","):
                 continue
-            mount, files = (
-                (_GROUPS / controller, separate) if controllers else (_GROUPS, (unified,))
-            )
+            is_version_1 = bool(controllers)
+            mount = _GROUPS / controller if is_version_1 else _GROUPS
+            files = separate if is_version_1 else (unified,)
             path = pathlib.PurePath(group.lstrip("/"))
             for folder in (path, *path.parents):
                 with contextlib.suppress(OSError):
@@ -111,11 +110,12 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
     """
     rows = list(zip(*columns, strict=True))
     workers = _workers(len(rows))
-    results = _helper().results(workers, function, rows) if workers else [None] * len(rows)
-    return [
-        function(*row) if found is None else found[0]
-        for row, found in zip(rows, results, strict=True)
-    ]
+    if not workers:
+        return [function(*row) for row in rows]
+    results: list[Result] = []
+    for row, outcome in zip(rows, _helper().results(workers, function, rows), strict=True):
+        results.append(function(*row) if outcome is None else outcome[0])
+    return results
 
 
 def prepare_workers(calls: int) -> None:
@@ -126,8 +126,10 @@ def prepare_workers(calls: int) -> None:
 
 def _workers(calls: int) -> int:
     """Number of processes for `calls` calls; 0 if they would cost more than they save."""
-    workers = min(cores(), _MOST_WORKERS, calls // (_WORTH_IT // 4))
-    return workers if calls >= _WORTH_IT and workers > 1 else 0
+    if calls < _MIN_CALLS:
+        return 0
+    workers = min(cores(), _MAX_WORKERS, calls // _MIN_CALLS_PER_WORKER)
+    return workers if workers > 1 else 0
 
 
 class _Helper:
@@ -167,26 +169,23 @@ class _Helper:
     def _connected(self) -> multiprocessing.connection.Connection:
         """The connection to the process, which starts if necessary."""
         if self._running is None:
-            here, there = multiprocessing.connection.Pipe()
-            paths, number = [str(path) for path in sys.path], there.fileno()
-            with there:
+            connection, helper_connection = multiprocessing.connection.Pipe()
+            paths = [str(path) for path in sys.path]
+            descriptor = helper_connection.fileno()
+            code = (
+                f"import sys; sys.path[:] = {paths}; from {__name__} import serve; "
+                f"serve({descriptor})"
+            )
+            environment = child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore")
+            with helper_connection:
                 process = subprocess.Popen(
-                    [
-                        multiprocessing.spawn.get_executable(),
-                        "-P",
-                        "-c",
-                        f"import sys; sys.path[:] = {paths}; from {__name__} import serve; "
-                        f"serve({number})",
-                    ],
+                    [multiprocessing.spawn.get_executable(), "-P", "-c", code],
                     stdin=subprocess.DEVNULL,
-                    pass_fds=[number],
+                    pass_fds=[descriptor],
                     start_new_session=True,  # Ctrl-C on a terminal reaches only the caller
-                    env={
-                        **_ONE_THREAD,
-                        **child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore"),
-                    },
+                    env={**_ONE_THREAD, **environment},
                 )
-            self._running = process, here
+            self._running = (process, connection)
         return self._running[1]
 
     def _stop(self) -> None:
@@ -243,7 +242,8 @@ def _results(
     os.chdir(folder)
     context = multiprocessing.get_context("fork")
     with concurrent.futures.ProcessPoolExecutor(workers, context, _end_with, (descriptor,)) as pool:
-        return list(pool.map(_call, [(function, row) for row in rows], chunksize=4))
+        calls = [(function, row) for row in rows]
+        return list(pool.map(_call, calls, chunksize=_CALLS_PER_CHUNK))
 
 
 def _call(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> tuple[Result] | None:

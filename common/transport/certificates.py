@@ -60,19 +60,20 @@ def read(path: pathlib.Path) -> Certificate:
     Raises:
       CongraspError: the file cannot be read, or is not a certificate of this project.
     """
-    made = load(path)
-    names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    certificate = load(path)
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if not names:
-        units = made.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
-        return Certificate(None, str(units[0].value) if units else "", (), made.not_valid_after_utc)
+        units = certificate.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
+        run = str(units[0].value) if units else ""
+        return Certificate(None, run, (), certificate.not_valid_after_utc)
     identity = parse_identity(str(names[0].value))
     if identity is None:
         raise not_ours(path, str(names[0].value))
     hosts: list[str] = []
-    for extension in made.extensions:
+    for extension in certificate.extensions:
         if isinstance(extension.value, x509.SubjectAlternativeName):
             hosts = [str(name.value) for name in extension.value]
-    return Certificate(identity, identity.run, tuple(hosts), made.not_valid_after_utc)
+    return Certificate(identity, identity.run, tuple(hosts), certificate.not_valid_after_utc)
 
 
 def find(folder: pathlib.Path, role: str) -> Credentials:

@@ -23,9 +23,9 @@ def check_name(what: str, name: str) -> str:
         and `-`.
     """
     if not _NAME.fullmatch(name):
+        article = "an" if what[0] in "aeiou" else "a"
         raise CongraspError(
-            f"{ascii(name)[:70]} cannot be the name of {'an' if what[0] in 'aeiou' else 'a'} "
-            f"{what}.",
+            f"{ascii(name)[:70]} cannot be the name of {article} {what}.",
             "Use 1 to 64 letters, digits, '_', '.' and '-'.",
         )
     return name
@@ -33,18 +33,25 @@ def check_name(what: str, name: str) -> str:
 
 def process_name(role: str) -> str:
     """Default name of this process: the names of the machine and of the process."""
-    return re.sub(r"[^\w.-]", "-", f"{platform.node() or role}-{os.getpid()}", flags=re.ASCII)[
-        -64:
-    ].lstrip(".-")
+    name = f"{platform.node() or role}-{os.getpid()}"
+    valid = re.sub(r"[^\w.-]", "-", name, flags=re.ASCII)
+    return valid[-64:].lstrip(".-")
 
 
 def flow(key: str) -> Flow:
     """Flow of a key or key expression, determined by the part below the run."""
-    part, *rest = (*key.split("/")[2:], "")
-    if part in ("rollout", "weights"):
-        # The announcement is tiny and urgent, the weights themselves are neither.
-        return "control" if (part, rest[0]) == ("weights", "announce") else "bulk"
-    return "log" if part == "log" else "policy" if part == "policy" else "control"
+    parts = key.split("/")[2:]
+    # The announcement is tiny and urgent, the weights themselves are neither.
+    if parts[:2] == ["weights", "announce"]:
+        return "control"
+    kind = parts[0] if parts else ""
+    if kind in ("rollout", "weights"):
+        return "bulk"
+    if kind == "log":
+        return "log"
+    if kind == "policy":
+        return "policy"
+    return "control"
 
 
 class Alive(NamedTuple):
@@ -66,11 +73,17 @@ def parse_alive(key: str) -> Alive | None:
 
 def matches(expression: str, key: str) -> bool:
     """True if an expression matches a key: `*` matches one part, `**` any number of parts."""
-    pattern = "".join(
-        "(?:/[^/]+)*" if part == "**" else "/[^/]+" if part == "*" else "/" + re.escape(part)
-        for part in expression.split("/")
-    )
+    pattern = "".join(_part_pattern(part) for part in expression.split("/"))
     return re.fullmatch(pattern, "/" + key) is not None
+
+
+def _part_pattern(part: str) -> str:
+    """Regular expression for one part of an expression, with the slash before it."""
+    if part == "**":
+        return "(?:/[^/]+)*"
+    if part == "*":
+        return "/[^/]+"
+    return "/" + re.escape(part)
 
 
 def below(key: str) -> str:

@@ -75,7 +75,8 @@ class MemoryTransport(Transport):
 
     def __init__(self, hub: MemoryHub, on_close: Callable[[], None] = lambda: None):
         """Creates an endpoint; `on_close` is called once, when it closes."""
-        self._hub, self._on_close = hub, on_close
+        self._hub = hub
+        self._on_close = on_close
         self._servers: list[_Server] = []
         self._subscriptions: list[Subscription] = []
         self._tokens: list[str] = []
@@ -232,13 +233,14 @@ def connect_in_memory(name: str, wait: float) -> MemoryTransport:
     `wait` seconds.
     """
 
-    def found() -> MemoryHub | None:
+    def listening_hub() -> MemoryHub | None:
         hub = _named.get(name)
         return hub if hub and hub.listening else None
 
     with _listening:
-        if hub := _listening.wait_for(found, wait):
-            return MemoryTransport(hub)
+        hub = _listening.wait_for(listening_hub, wait)
+    if hub:
+        return MemoryTransport(hub)
     raise TransportError(
         f"No response from memory/{name}.", "It can only be reached within its process."
     )
@@ -308,7 +310,8 @@ class PairTransport(Transport):
 
     def __init__(self, first: Transport, second: Transport):
         """Combines two transports; `query` and `subscribe` use only the first."""
-        self._first, self._both = first, (first, second)
+        self._first = first
+        self._both = (first, second)
 
     def serve(self, key: str, handler: Answerer, **options: Any) -> None:
         """See `Transport.serve`; each of the two has separate workers."""

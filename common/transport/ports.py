@@ -21,10 +21,12 @@ LEARNER_URL = "tcp/127.0.0.1:7447"
 SERVER_URL = "tcp/127.0.0.1:7457"
 """Default address of a policy server."""
 _URL = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
-_LOWEST, _COUNT = 15000, 15000
-"""First port for free ports: below the system's range for outgoing connections (from 32768 on
-Linux), which cannot take them."""
-_ATTEMPTS = 1000
+_FIRST_FREE_PORT = 15000
+"""First port of the range for `free_port`."""
+_FREE_PORTS = 15000
+"""Length of that range: it ends below the system's range for outgoing connections (from 32768 on
+Linux), which cannot take these ports."""
+_MAX_ATTEMPTS = 1000
 _LAST_PORT = 65535
 _lock = threading.Lock()
 _reserved: set[int] = set()
@@ -138,8 +140,9 @@ def free_port(count: int = len(FLOWS)) -> int:
       OSError: no such ports are free.
     """
     file = _reservations()
-    for _ in range(_ATTEMPTS):
-        ports = range(start := _LOWEST + secrets.randbelow(_COUNT - count), start + count)
+    for _ in range(_MAX_ATTEMPTS):
+        start = _FIRST_FREE_PORT + secrets.randbelow(_FREE_PORTS - count)
+        ports = range(start, start + count)
         with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
             for port in ports:
                 stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
@@ -169,7 +172,7 @@ def _reserve(file: int, ports: range) -> None:
 def _report_no_locks() -> None:
     """Logs once that other processes do not see which ports this one will use.
 
-    Two that choose the same port at the same moment are then get the error of a port in use.
+    If two choose the same port at the same moment, one of them gets the error of a port in use.
     """
     _log.warning(
         "%s is on a file system without locks: ports are not reserved. Set TMPDIR to a local one.",
@@ -182,14 +185,16 @@ def _reservations() -> int:
     """Descriptor of this user's lock file, open until the process ends: closing it would release
     every lock.
 
-    Where no such file can be opened, that of a file of this process alone.
+    Where no such file can be opened, it is that of a file that only this process has.
     """
-    for folder in filter(None, (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir())):
+    for folder in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()):
+        if not folder:
+            continue
         path = pathlib.Path(folder) / f"congrasp-ports-{os.getuid()}"
         with contextlib.suppress(OSError):
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             if os.fstat(file).st_uid == os.getuid():
                 return file
             os.close(file)  # of another user, who could lock all of it
-    with tempfile.TemporaryFile() as own:
-        return os.dup(own.fileno())
+    with tempfile.TemporaryFile() as private_file:
+        return os.dup(private_file.fileno())

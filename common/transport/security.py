@@ -31,8 +31,11 @@ LISTENERS = ("learner", "server")
 """Roles to whose certificates others connect."""
 NUMBERS = 256
 """Number of certificates of a role."""
-CA_FILE, CERTIFICATE_FILE, KEY_FILE, REVOKED_FILE = "ca.crt", "tls.crt", "tls.key", "revoked"
-_PROBE_SECONDS = 1.0
+CA_FILE = "ca.crt"
+CERTIFICATE_FILE = "tls.crt"
+KEY_FILE = "tls.key"
+REVOKED_FILE = "revoked"
+_PROBE_TIMEOUT_S = 1.0
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z-]+)/(?P<host>\[[^]]*\]|[^/:]*)(:(?P<port>\d+))?.*")
 
 
@@ -52,9 +55,14 @@ class Identity(NamedTuple):
 
 def parse_identity(common_name: str) -> Identity | None:
     """Parses a common name; returns None if it is not an identity."""
-    run, role, number = ("", "", *common_name.rsplit(".", 2))[-3:]
-    fits = run and role in ROLES and number.isascii() and number.isdigit() and int(number) < NUMBERS
-    return Identity(run, role, int(number)) if fits else None
+    parts = common_name.rsplit(".", 2)
+    if len(parts) != 3:
+        return None
+    run, role, digits = parts
+    if not run or role not in ROLES or not (digits.isascii() and digits.isdigit()):
+        return None
+    number = int(digits)
+    return Identity(run, role, number) if number < NUMBERS else None
 
 
 def not_ours(path: pathlib.Path, common_name: str) -> CongraspError:
@@ -103,13 +111,13 @@ class Credentials:
                 f"The credentials in {self.folder} cannot be used.",
                 "Issue new ones with 'congrasp certs issue'.",
             ) from None
-        names = [
-            value for entry in decoded["subject"] for key, value in entry if key == "commonName"
-        ]
-        found = parse_identity(names[0]) if names else None
-        if found is None:
+        names: list[str] = []
+        for entry in decoded["subject"]:
+            names += [value for key, value in entry if key == "commonName"]
+        identity = parse_identity(names[0]) if names else None
+        if identity is None:
             raise not_ours(self.certificate, "".join(names))
-        return found
+        return identity
 
     def revoked(self) -> frozenset[str]:
         """Common names in the list of revoked certificates; empty without a list.
@@ -134,10 +142,13 @@ class Credentials:
         """Common names that may listen to these credentials: the learner's, in some flows also the
         server's.
         """
-        run, revoked = self.identity.run, self.revoked()
         roles = LISTENERS if name == "policy" else LISTENERS[:1]
-        names = [str(Identity(run, role, number)) for role in roles for number in range(NUMBERS)]
-        return [one for one in names if one not in revoked]
+        run = self.identity.run
+        revoked = self.revoked()
+        names: list[str] = []
+        for role in roles:
+            names += [str(Identity(run, role, number)) for number in range(NUMBERS)]
+        return [common_name for common_name in names if common_name not in revoked]
 
     def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
         """Zenoh configuration of the session of one flow that listens or connects with these
@@ -152,13 +163,15 @@ class Credentials:
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         }
-        settings: dict[str, Any] = {"transport/link/protocols": ["tls"], "transport/link/tls": tls}
-        rules = (
-            _access_control(self.identity, name, self.revoked())
-            if listens
-            else _only(self._listeners(name))
-        )
-        return {**settings, "access_control": rules}
+        if listens:
+            access = _access_control(self.identity, name, self.revoked())
+        else:
+            access = _only(self._listeners(name))
+        return {
+            "transport/link/protocols": ["tls"],
+            "transport/link/tls": tls,
+            "access_control": access,
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,19 +230,21 @@ class Limit:
     another too soon is dropped. 0 for no limit."""
 
 
-_SMALL, _LOG = 64 << 10, 16 << 20
+_MAX_QUERY_BYTES = 64 << 10
+_MAX_ACT_BYTES = 1 << 20
+_MAX_LOG_BYTES = 16 << 20
 LIMITS: tuple[Limit, ...] = (
-    Limit("config", _SMALL, 100.0),
-    Limit("status", _SMALL, 100.0),
-    Limit("weights/latest/**", _SMALL, 0.0),  # counted per peer by the hub
-    Limit("ticket/*", _SMALL, 0.0),  # counted per actor by the hub
+    Limit("config", _MAX_QUERY_BYTES, 100.0),
+    Limit("status", _MAX_QUERY_BYTES, 100.0),
+    Limit("weights/latest/**", _MAX_QUERY_BYTES, 0.0),  # counted per peer by the hub
+    Limit("ticket/*", _MAX_QUERY_BYTES, 0.0),  # counted per actor by the hub
     *(
-        Limit(f"log/{channel}/**", _LOG, 100.0)
+        Limit(f"log/{channel}/**", _MAX_LOG_BYTES, 100.0)
         for channel in ("metrics", "event", "version", "episode", "rollout")
     ),
     # The policy server's queue refuses excess with a message.
-    Limit("policy/act/**", 1 << 20, 0.0),
-    Limit("policy/health", _SMALL, 100.0),
+    Limit("policy/act/**", _MAX_ACT_BYTES, 0.0),
+    Limit("policy/health", _MAX_QUERY_BYTES, 100.0),
 )
 """Rollouts are limited by their size and by the learner's hub."""
 
@@ -285,7 +300,7 @@ def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | N
         return None
     host = match["host"].strip("[]")
     try:
-        with socket.create_connection((host, int(match["port"])), _PROBE_SECONDS) as raw:
+        with socket.create_connection((host, int(match["port"])), _PROBE_TIMEOUT_S) as raw:
             return _handshake(raw, host, endpoint, credentials)
     except OSError:
         return None
@@ -297,7 +312,8 @@ def _handshake(
     """Returns the error of a TLS handshake if it is caused by the certificates."""
     context = ssl.create_default_context()
     if credentials is None:
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
     else:
         try:
             context = ssl.create_default_context(cafile=str(credentials.ca))
@@ -323,19 +339,23 @@ def _handshake(
             what, "Use certificates of one authority, and pass --host with the host when issuing."
         )
     except ssl.SSLError as error:
-        if "ALERT" not in (error.reason or ""):
+        reason = error.reason or ""
+        if "ALERT" not in reason:
             return None
-        why = (
-            "expired"
-            if "EXPIRED" in error.reason
-            else "missing"
-            if "REQUIRED" in error.reason
-            else "not accepted"
-        )
-        where = credentials.certificate if credentials else "none"
+        certificate = credentials.certificate if credentials else "none"
         return CongraspError(
-            f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority."
+            f"{endpoint} refuses the certificate ({certificate}): {_alert_text(reason)}.",
+            "Issue one with its authority.",
         )
+
+
+def _alert_text(reason: str) -> str:
+    """Reason of a peer's TLS alert against a certificate, as a predicate."""
+    if "EXPIRED" in reason:
+        return "expired"
+    if "REQUIRED" in reason:
+        return "missing"
+    return "not accepted"
 
 
 def _is_loopback(endpoint: str) -> bool:
@@ -374,32 +394,33 @@ def _only(names: list[str]) -> dict[str, Any]:
     }
 
 
-def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> dict[str, Any]:
+def _access_control(listener: Identity, name: Flow, revoked: Set[str]) -> dict[str, Any]:
     """Access control of a listener in one flow: the rights of each certificate; everything else is
     denied.
     """
+    # Clients of a server use other names for the policy
+    run = listener.run if listener.role == "learner" else "*"
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
 
-    def allow(who: str, names: list[str], rights: Rights) -> None:
-        allowed = list(_rules(who, rights, name_of_flow, run))
+    def allow(subject: str, names: list[str], rights: Rights) -> None:
+        allowed = list(_rules(subject, rights, name, run))
         if not allowed or not names:
             return
         rules.extend(allowed)
-        subjects.append({"id": who, "cert_common_names": names})
-        policies.append({"rules": [rule["id"] for rule in allowed], "subjects": [who]})
+        subjects.append({"id": subject, "cert_common_names": names})
+        policies.append({"rules": [rule["id"] for rule in allowed], "subjects": [subject]})
 
-    # Clients of a server use other names for the policy
-    run = mine.run if mine.role == "learner" else "*"
-    for other, rights in RIGHTS.get(mine.role, {}).items():
-        shared, own = _split(rights)
-        peers = [Identity(mine.run, other, number) for number in range(NUMBERS)]
+    for role, rights in RIGHTS.get(listener.role, {}).items():
+        shared, named = _split(rights)
+        peers = [Identity(listener.run, role, number) for number in range(NUMBERS)]
         peers = [peer for peer in peers if str(peer) not in revoked]
-        allow(other, [str(peer) for peer in peers], shared)
-        if own != Rights():
-            for peer in peers:
-                allow(str(peer), [str(peer)], _filled(own, numbered(peer.number, "$*")))
+        allow(role, [str(peer) for peer in peers], shared)
+        if named == Rights():
+            continue
+        for peer in peers:
+            allow(str(peer), [str(peer)], _filled(named, numbered(peer.number, "$*")))
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -409,25 +430,28 @@ def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> di
     }
 
 
-def _rules(who: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str, Any]]:
-    """Zenoh rules of one flow: for incoming messages, and for outgoing replies."""
+def _rules(subject: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str, Any]]:
+    """Yields the Zenoh rules of one flow: for incoming messages, and for outgoing replies."""
     kinds = (
         (rights.ask, "query", "reply"),
         (rights.publish, "put", None),
         (rights.hear, "declare_subscriber", "put"),
         (rights.show, "liveliness_token", None),
     )
-    for parts, comes, goes in kinds:
+    for parts, incoming, outgoing in kinds:
         keys = _of_flow(parts, name, run)
-        for direction, message in (("ingress", comes), ("egress", goes)):
-            if keys and message:
-                yield {
-                    "id": f"{who} {direction} {comes}",
-                    "permission": "allow",
-                    "flows": [direction],
-                    "messages": [message],
-                    "key_exprs": keys,
-                }
+        if not keys:
+            continue
+        for direction, message in (("ingress", incoming), ("egress", outgoing)):
+            if message is None:
+                continue
+            yield {
+                "id": f"{subject} {direction} {incoming}",
+                "permission": "allow",
+                "flows": [direction],
+                "messages": [message],
+                "key_exprs": keys,
+            }
 
 
 def _of_flow(parts: Iterable[str], name: Flow, run: str = "*") -> list[str]:
@@ -438,37 +462,31 @@ def _of_flow(parts: Iterable[str], name: Flow, run: str = "*") -> list[str]:
 
 def _split(rights: Rights) -> tuple[Rights, Rights]:
     """Splits rights into those shared by a role and those restricted to names."""
-    parts = dataclasses.asdict(rights)
-    return (
-        Rights(
-            **{
-                kind: tuple(key for key in keys if "{name}" not in key)
-                for kind, keys in parts.items()
-            }
-        ),
-        Rights(
-            **{kind: tuple(key for key in keys if "{name}" in key) for kind, keys in parts.items()}
-        ),
-    )
+    shared: dict[str, tuple[str, ...]] = {}
+    named: dict[str, tuple[str, ...]] = {}
+    for kind, keys in dataclasses.asdict(rights).items():
+        shared[kind] = tuple(key for key in keys if "{name}" not in key)
+        named[kind] = tuple(key for key in keys if "{name}" in key)
+    return Rights(**shared), Rights(**named)
 
 
 def _filled(rights: Rights, name: str) -> Rights:
     """Replaces `{name}` in rights by a name."""
-    parts = dataclasses.asdict(rights)
-    return Rights(
-        **{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()}
-    )
+    filled: dict[str, tuple[str, ...]] = {}
+    for kind, keys in dataclasses.asdict(rights).items():
+        filled[kind] = tuple(key.replace("{name}", name) for key in keys)
+    return Rights(**filled)
 
 
 def limits(name: Flow, *, rates: bool) -> dict[str, Any]:
     """Zenoh configuration of the size and rate limits of a listener in one flow."""
-    both = {"flows": ["ingress"], "messages": ["query", "put"]}
-    found = [(key, limit) for limit in LIMITS for key in _of_flow([limit.keys], name)]
-    sizes = [
-        {"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in found
-    ]
-    often = [{"key_expr": key, "freq": limit.rate} for key, limit in found if limit.rate and rates]
-    return {
-        "low_pass_filter": sizes,
-        "downsampling": [{"id": "rates", **both, "rules": often}] if often else [],
-    }
+    scope = {"flows": ["ingress"], "messages": ["query", "put"]}
+    size_rules: list[dict[str, Any]] = []
+    rate_rules: list[dict[str, Any]] = []
+    for limit in LIMITS:
+        for key in _of_flow([limit.keys], name):
+            size_rules.append({"id": key, **scope, "key_exprs": [key], "size_limit": limit.size})
+            if rates and limit.rate:
+                rate_rules.append({"key_expr": key, "freq": limit.rate})
+    downsampling = [{"id": "rates", **scope, "rules": rate_rules}] if rate_rules else []
+    return {"low_pass_filter": size_rules, "downsampling": downsampling}

@@ -163,7 +163,7 @@ def _open_memory(endpoint: Endpoint) -> Transport:
 
 def _open_zenoh(endpoint: Endpoint) -> Transport:
     require_not_inherited("Zenoh")
-    from congrasp.common.transport.zenoh_transport import ZenohTransport
+    from congrasp.common.transport.zenoh_transport import MessageLimits, ZenohTransport
 
     credentials = find_credentials(endpoint.certs, endpoint.role, endpoint.run)
     if endpoint.listens:
@@ -173,7 +173,7 @@ def _open_zenoh(endpoint: Endpoint) -> Transport:
             listen=[endpoint.url],
             flows=flows,
             credentials=credentials,
-            longest_rollout=endpoint.longest_rollout,
+            limits=MessageLimits(rollout=endpoint.longest_rollout),
         )
     flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
     return ZenohTransport(

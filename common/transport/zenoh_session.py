@@ -43,23 +43,24 @@ _BLOCK_US: dict[Flow, int] = {
     "log": 1_000_000,
     "policy": 2_000_000,
 }
-_OVERHEAD = 64 << 10  # bytes of Zenoh's overhead for a message
-_ATTEMPT = 1.0  # seconds of one attempt to connect; signals are handled between two
-_CLOSE = (
-    2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
-)
-_REOPEN = 10.0  # deadline of reopening, s
+_OVERHEAD_BYTES = 64 << 10  # of Zenoh for a message
+_ATTEMPT_S = 1.0  # of one attempt to connect; signals are handled between two
+_CLOSE_TIMEOUT_S = 2.0
+"""Time for closing; with thousands of tokens on a busy machine it takes more than a second."""
+_REOPEN_TIMEOUT_S = 10.0
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
 """Microseconds that a reply waits for room in its reader's link; then replies are dropped until
 there is room.
 """
 _ROOM_LONG_US = 200_000  # total wait of a chunk's fragments, microseconds
-# Batches of 64 KiB queued for a link: an acknowledgement fits in addition to a chunk of a long
-# reply
-_QUEUE = 8
-_ACCEPT_MS = 5000  # deadline of a connection's handshake, ms
-_PENDING = 4096  # most connections in a handshake, but at most a quarter of the open files
-_FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
+_MAX_QUEUED_BATCHES = 8
+"""Batches of 64 KiB queued for a link: an acknowledgement fits in addition to a chunk of a long
+reply.
+"""
+_ACCEPT_TIMEOUT_MS = 5000  # of a connection's handshake
+_MAX_HANDSHAKES = 4096  # at a time, but at most a quarter of the open files
+_MAX_FILES = 16384
+"""Limit of the process's open files, if the system allows it: each connection is one."""
 _CLOSERS = 64  # threads of a listener that accept and close connections and wait for their data
 # Of the user; read at the first session
 _RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"
@@ -77,8 +78,10 @@ _FORM = re.compile(
     rf"\((?!.*\b(\w+):\(.*\b\1:\()(?:{_POOL}:(?:RuntimeParamHelper)?{_SETTINGS}(?:,|(?=\))))*\)"
 )
 _FILLING = re.compile(r"/\*.*?\*/|//[^\n]*|\s+", re.DOTALL)
-# Most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
-_SESSIONS = 1000
+_MAX_PEERS = 1000
+"""Limit of the connected peers, but at most a quarter of the open files: Zenoh panics if none is
+left.
+"""
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""
 _log = logging.getLogger(__name__)
@@ -100,29 +103,29 @@ def configuration(
         what = f"ZENOH_RUNTIME is {ascii(_RUNTIME)[:80]}, which Zenoh cannot read."
         raise CongraspError(what, "Unset it, or write for example '(tx: (worker_threads: 2))'.")
     longest = min(max_message, LONGEST.get(name, max_message))
-    files = _open_files() if listens else _FILES
+    max_files = _open_files() if listens else _MAX_FILES
     answers = {"id": "patience", "messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"]}
     settings = {
         "mode": "peer" if listens else "client",
         "listen/endpoints": endpoints if listens else [],
         "connect/endpoints": [] if listens else endpoints,
-        "connect/timeout_ms": int(1000 * _ATTEMPT),
+        "connect/timeout_ms": int(1000 * _ATTEMPT_S),
         "connect/exit_on_failure": True,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,  # leaks in the receiver (zenoh #2787)
-        "transport/unicast/accept_timeout": _ACCEPT_MS,
-        "transport/unicast/accept_pending": min(_PENDING, files // 4),
-        "transport/unicast/max_sessions": min(_SESSIONS, files // 4),
+        "transport/unicast/accept_timeout": _ACCEPT_TIMEOUT_MS,
+        "transport/unicast/accept_pending": min(_MAX_HANDSHAKES, max_files // 4),
+        "transport/unicast/max_sessions": min(_MAX_PEERS, max_files // 4),
         "transport/link/tx/lease": _LEASE_MS[name],
-        "transport/link/tx/queue/size/data": _QUEUE,
+        "transport/link/tx/queue/size/data": _MAX_QUEUED_BATCHES,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _ROOM_US[name],
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (
             _ROOM_LONG_US
         ),
-        "transport/link/rx/max_message_size": longest + _OVERHEAD,
+        "transport/link/rx/max_message_size": longest + _OVERHEAD_BYTES,
         "qos/network": [{**answers, "overwrite": {"congestion_control": "drop"}}],
         **(limits(name, rates=credentials is not None) if listens else {}),
         **(credentials.settings(name, listens=listens) if credentials else {}),
@@ -138,23 +141,22 @@ def configuration(
 
 @functools.cache
 def _open_files() -> int:
-    """Files that this process may have open; raises the limit to `_FILES` where the system allows
-    it, else warns.
+    """Files that this process may have open; raises the limit to `_MAX_FILES` where the system
+    allows it, else warns.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
-    if soft != resource.RLIM_INFINITY and soft < most:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-    if most < _FILES:
+    limit = _MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, _MAX_FILES)
+    if soft != resource.RLIM_INFINITY and soft < limit:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+    if limit < _MAX_FILES:
         _log.warning(
             "This process may open %d files: more than %d silent connections keep new peers out. "
-            "Raise the hard limit "
-            "to %d (ulimit -n, LimitNOFILE=).",
-            most,
-            most // 4,
-            _FILES,
+            "Raise the hard limit to %d (ulimit -n, LimitNOFILE=).",
+            limit,
+            limit // 4,
+            _MAX_FILES,
         )
-    return most
+    return limit
 
 
 def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
@@ -191,7 +193,7 @@ def connect(
             session = _open(config)
             break
         except zenoh.ZError as error:
-            refusals = [refusal(one, credentials) for one in endpoints]
+            refusals = [refusal(endpoint, credentials) for endpoint in endpoints]
             if all(refusals) and refusals[0]:
                 raise refusals[0] from None
             if time.monotonic() >= deadline:
@@ -202,16 +204,26 @@ def connect(
                 raise TransportError(
                     f"Cannot connect to {where}: {first_line(error)}.", remedy
                 ) from None
-    shown = [link.auth_identifier for link in session.info.links()] if credentials else []
-    if credentials and shown and not any(credentials.expects(name, one) for one in shown):
-        session.close()
-        raise CongraspError(
-            f"{', '.join(endpoints)} presents the certificate {ascii(shown[0])[:90]}, which may "
-            f"not listen for "
-            f"{credentials.identity}.",
-            "Connect to a learner or server of the same run whose certificate is not revoked.",
-        )
+    if credentials:
+        _check_listener(session, endpoints, name, credentials)
     return session
+
+
+def _check_listener(
+    session: zenoh.Session, endpoints: list[str], name: Flow, credentials: Credentials
+) -> None:
+    """Closes a session and raises a CongraspError if no connected certificate may listen to us."""
+    common_names = [link.auth_identifier for link in session.info.links()]
+    if not common_names:
+        return
+    if any(credentials.expects(name, common_name) for common_name in common_names):
+        return
+    session.close()
+    raise CongraspError(
+        f"{', '.join(endpoints)} presents the certificate {ascii(common_names[0])[:90]}, which may "
+        f"not listen for {credentials.identity}.",
+        "Connect to a learner or server of the same run whose certificate is not revoked.",
+    )
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:
@@ -252,7 +264,9 @@ class _Declaration:
         declare: Callable[[zenoh.Session], Any],
         works: tuple[Callable[[Any], None], ...],
     ):
-        self.name, self.declare, self.works = name, declare, works
+        self.name = name
+        self.declare = declare
+        self.works = works
         self.entity: Any = None
 
 
@@ -328,13 +342,12 @@ class Sessions:
             self._open.clear()
             for session in sessions:
                 session.close()
-            join(self._threads, time.monotonic() + _REOPEN)
+            join(self._threads, time.monotonic() + _REOPEN_TIMEOUT_S)
             for name, opener in self._openers.items():
                 if not self.closed.is_set():
                     self._open[name] = opener()
-            if (
-                self.closed.is_set()
-            ):  # by another thread, which only saw the sessions open at that time
+            # Another thread that closed them only saw the sessions open at that time.
+            if self.closed.is_set():
                 self.close()
                 return
             for declaration in self._declarations:
@@ -349,7 +362,8 @@ class Sessions:
             target=function, args=arguments, daemon=True, name=f"zenoh-{what}"
         )
         thread.start()
-        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
+        alive = [other for other in self._threads if other.is_alive()]
+        self._threads = [*alive, thread]
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
@@ -371,8 +385,8 @@ class Sessions:
         if self._opened != forks.generation():
             return
         self.closed.set()
-        deadline = time.monotonic() + _CLOSE
-        if self._reopening.acquire(timeout=_CLOSE):
+        deadline = time.monotonic() + _CLOSE_TIMEOUT_S
+        if self._reopening.acquire(timeout=_CLOSE_TIMEOUT_S):
             self._reopening.release()
         sessions = list(self._open.values())
         self._open.clear()
@@ -386,28 +400,27 @@ class Sessions:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
     def watch_revocations(
-        self, credentials: Credentials, period: float, known: frozenset[str] | None
+        self, credentials: Credentials, period: float, revoked: frozenset[str] | None
     ) -> None:
         """Checks for revoked certificates in a thread, until the sessions are closed.
 
         Args:
           credentials: credentials of this process.
           period: seconds between two checks.
-          known: the certificates that were revoked when a listener's sessions were opened; None if
-            they connect.
+          revoked: the certificates that were revoked when a listener's sessions were opened; None
+            if they connect.
         """
-        if known is None:
+        if revoked is None:
             self.start(heed_revocations, self, credentials, period)
         else:
-            self.start(follow_revocations, self, credentials, known, period)
+            self.start(follow_revocations, self, credentials, revoked, period)
 
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""
-        return {
-            str(link.auth_identifier)
-            for session in list(self._open.values())
-            for link in session.info.links()
-        }
+        common_names: set[str] = set()
+        for session in list(self._open.values()):
+            common_names |= {str(link.auth_identifier) for link in session.info.links()}
+        return common_names
 
     def abandon(self) -> None:
         """Keeps all of Zenoh's objects alive to the end of a fork: the destructor of a session
@@ -445,7 +458,7 @@ os.register_at_fork(after_in_child=_abandon_all)
 
 
 def follow_revocations(
-    sessions: Sessions, credentials: Credentials, known: frozenset[str], period: float
+    sessions: Sessions, credentials: Credentials, revoked: frozenset[str], period: float
 ) -> None:
     """Reopens a listener's sessions whenever the list of revoked certificates changes, until they
     are closed.
@@ -453,19 +466,19 @@ def follow_revocations(
     Args:
       sessions: sessions of the listener.
       credentials: credentials of the listener.
-      known: the list when they were opened.
+      revoked: the list when they were opened.
       period: seconds between two checks.
     """
     while not sessions.closed.wait(period):
         try:
-            listed = credentials.revoked()
-            if listed == known:
+            current = credentials.revoked()
+            if current == revoked:
                 continue
             _log.warning(
                 "The list of revoked certificates has changed: all connections are reopened."
             )
             sessions.reopen()
-            known = listed
+            revoked = current
         except CongraspError as error:  # retried at the next check
             _log.error("The list of revoked certificates is not in effect: %s", error)
 
@@ -481,9 +494,10 @@ def heed_revocations(sessions: Sessions, credentials: Credentials, period: float
     while not sessions.closed.wait(period):
         try:
             with sessions.inside(), contextlib.suppress(zenoh.ZError):
-                if found := sorted(sessions.peers() & credentials.revoked()):
+                revoked_peers = sorted(sessions.peers() & credentials.revoked())
+                if revoked_peers:
                     sessions.failure = CongraspError(
-                        f"The listener's certificate {found[0]} is revoked.",
+                        f"The listener's certificate {revoked_peers[0]} is revoked.",
                         "Connect again once it has a new one (congrasp certs issue).",
                     )
         except CongraspError as error:  # retried at the next check
@@ -504,13 +518,15 @@ def listen_to(samples: Any, subscription: Subscription, max_message: int) -> Non
     """Moves samples to a subscription, with the number of lost ones before each."""
     last: dict[str, tuple[bytes, int]] = {}
     for sample in received(samples):
-        key, lost = str(sample.key_expr), 0
+        key = str(sample.key_expr)
+        lost = 0
         stamp = sample.attachment.to_bytes() if sample.attachment else b""
         if len(stamp) == STAMP.size:
             sender, count = STAMP.unpack(stamp)
-            known_sender, known_count = last.get(key, (sender, count - 1))
-            lost = max(0, count - known_count - 1) if sender == known_sender else 0
-            last[key] = sender, count
+            last_sender, last_count = last.get(key, (sender, count - 1))
+            if sender == last_sender:
+                lost = max(0, count - last_count - 1)
+            last[key] = (sender, count)
         subscription.push(key, functools.partial(_decoded, sample.payload, max_message), lost)
 
 
@@ -527,10 +543,13 @@ def watch_tokens(
     When the session is reopened, all known tokens are reported as gone first; otherwise peers that
     left meanwhile would not be noticed.
     """
-    shown: set[str] = set()
+    tokens: set[str] = set()
 
     def report(key: str, alive: bool) -> None:
-        (shown.add if alive else shown.discard)(key)
+        if alive:
+            tokens.add(key)
+        else:
+            tokens.discard(key)
         try:
             on_change(key, alive)
         except Exception:
@@ -539,5 +558,5 @@ def watch_tokens(
     for sample in received(samples):
         report(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
     if not closed.is_set():
-        for key in sorted(shown):
+        for key in sorted(tokens):
             report(key, False)

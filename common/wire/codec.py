@@ -13,7 +13,7 @@ import functools
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,12 @@ MAX_MESSAGE = 256 << 20
 """Default limit of a message's length in bytes."""
 MAX_HEADER = 1 << 20
 """Limit of a header's length in bytes."""
-_BEGIN, _DIGITS = b'{"__metadata__":{"checksum":"', 8
+_LENGTH_BYTES = 8
+"""Length of the number of bytes of the header, at the beginning."""
+_HEADER_START = b'{"__metadata__":{"checksum":"'
+_CHECKSUM_DIGITS = 8
+_ALIGNMENT_BYTES = 8
+"""The data section begins at a multiple of this."""
 _MAX_DIMENSIONS = 8
 _MAX_ITEMS = 1 << 40
 _DTYPES = {
@@ -62,7 +67,7 @@ class Message:
 
 
 class SharedMessage(Message):
-    """A message that is sent more than once; its bytes are encoded on first use and kept."""
+    """A message that is sent more than once; its bytes are encoded on first use and stored."""
 
     @functools.cached_property
     def encoded(self) -> bytes:
@@ -87,8 +92,10 @@ def _encode(message: Message) -> bytes:
     arrays = {name: _portable(name, array) for name, array in message.arrays.items()}
     # Wide dtypes first, so that every array starts at a multiple of its item's size.
     order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
-    header: dict[str, Any] = {"__metadata__": {"checksum": "0" * _DIGITS, "meta": meta}}
-    parts, offset, crc = [], 0, 0
+    header: dict[str, Any] = {"__metadata__": {"checksum": "0" * _CHECKSUM_DIGITS, "meta": meta}}
+    parts = []
+    offset = 0
+    crc = 0
     for name in order:
         array = arrays[name]
         end = offset + array.nbytes
@@ -97,18 +104,20 @@ def _encode(message: Message) -> bytes:
             "shape": array.shape,
             "data_offsets": [offset, end],
         }
-        parts.append(array.reshape(-1).view(np.uint8).data)
-        crc = crc32(parts[-1], crc)
+        part = array.reshape(-1).view(np.uint8).data
+        parts.append(part)
+        crc = crc32(part, crc)
         offset = end
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
+    text += b" " * (-len(text) % _ALIGNMENT_BYTES)
     if len(text) > MAX_HEADER:
         raise CongraspError(
             f"A message's header has {len(text)} bytes.",
             f"The limit is {MAX_HEADER}: send less metadata.",
         )
-    text = b"%s%08x%s" % (_BEGIN, crc32(text, crc), text[len(_BEGIN) + _DIGITS :])
-    return b"".join([len(text).to_bytes(8, "little"), text, *parts])
+    after_checksum = text[len(_HEADER_START) + _CHECKSUM_DIGITS :]
+    text = b"%s%08x%s" % (_HEADER_START, crc32(text, crc), after_checksum)
+    return b"".join([len(text).to_bytes(_LENGTH_BYTES, "little"), text, *parts])
 
 
 def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
@@ -124,29 +133,42 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     """
     if len(data) > max_bytes:
         raise CongraspError(f"The message has {len(data)} bytes; the limit is {max_bytes}.")
-    if len(data) < 8:
+    text, section = _split(data)
+    _check_checksum(text, section)
+    header = _parse_header(text)
+    meta = _parse_metadata(header.pop("__metadata__"))
+    message = SharedMessage(_arrays(header, section), meta)
+    vars(message)["encoded"] = data
+    return message
+
+
+def _split(data: bytes) -> tuple[bytes, memoryview]:
+    """Returns the text of a message's header, and its data section."""
+    if len(data) < _LENGTH_BYTES:
         raise CongraspError(f"The message is cut: it has only {len(data)} bytes.")
-    length = int.from_bytes(data[:8], "little")
+    length = int.from_bytes(data[:_LENGTH_BYTES], "little")
     if length > MAX_HEADER:
         raise CongraspError(
             f"The message's header claims {length} bytes; the limit is {MAX_HEADER}."
         )
-    if 8 + length > len(data):
+    end = _LENGTH_BYTES + length
+    if end > len(data):
         raise CongraspError(
-            f"The message is cut inside its header: {len(data)} bytes of {8 + length} or more."
+            f"The message is cut inside its header: {len(data)} bytes of {end} or more."
         )
-    text, section = data[8 : 8 + length], memoryview(data)[8 + length :]
-    if not text.startswith(_BEGIN):
+    return data[_LENGTH_BYTES:end], memoryview(data)[end:]
+
+
+def _check_checksum(text: bytes, section: memoryview) -> None:
+    """Raises a CongraspError if header or data section differ from what was sent."""
+    if not text.startswith(_HEADER_START):
         raise CongraspError("The message does not begin with its checksum.")
-    digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
-    crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc32(section))
-    if text[digits] != b"%08x" % crc:
+    start = len(_HEADER_START)
+    end = start + _CHECKSUM_DIGITS
+    unsigned = text[:start] + b"0" * _CHECKSUM_DIGITS + text[end:]
+    crc = crc32(unsigned, crc32(section))
+    if text[start:end] != b"%08x" % crc:
         raise CongraspError("The message does not match its checksum.")
-    header = _header(text)
-    meta = _metadata(header.pop("__metadata__"))
-    message = SharedMessage(_arrays(header, section), meta)
-    vars(message)["encoded"] = data
-    return message
 
 
 def finite(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -179,9 +201,9 @@ def _portable(name: str, value: Any) -> np.ndarray:
     dtype.
     """
     array = np.asarray(value)
-    array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).reshape(
-        array.shape
-    )
+    little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+    # `ascontiguousarray` makes a scalar one-dimensional.
+    array = np.ascontiguousarray(little_endian).reshape(array.shape)
     if array.dtype not in _NAMES:
         raise CongraspError(
             f"The array {name!r} has dtype {array.dtype}.", f"Messages hold {', '.join(_DTYPES)}."
@@ -191,7 +213,8 @@ def _portable(name: str, value: Any) -> np.ndarray:
     return array
 
 
-def _header(text: bytes) -> dict[str, Any]:
+def _parse_header(text: bytes) -> dict[str, Any]:
+    """Parses a JSON object without repeated keys, and without numbers that are not finite."""
     try:
         header = json.loads(
             text.decode(),
@@ -207,6 +230,7 @@ def _header(text: bytes) -> dict[str, Any]:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Object of these pairs; raises a CongraspError for a repeated key."""
     result = dict(pairs)
     if len(result) < len(pairs):
         raise CongraspError("The message's header has a key twice.")
@@ -214,7 +238,9 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _number(text: str) -> float:
-    if not math.isfinite(number := float(text)):
+    """Finite number of a text; raises a CongraspError for another."""
+    number = float(text)
+    if not math.isfinite(number):
         raise CongraspError(
             f"The message's header holds {text[:30]}, which is not a number in range."
         )
@@ -222,50 +248,42 @@ def _number(text: str) -> float:
 
 
 def _no_constant(name: str) -> Any:
+    """Raises a CongraspError: Python's NaN and Infinity are not JSON."""
     raise CongraspError(f"The message's header holds {name}, which is not JSON.")
 
 
-def _metadata(entry: Any) -> dict[str, Any]:
+def _parse_metadata(entry: Any) -> dict[str, Any]:
     """Parses the metadata."""
-    if (
-        not isinstance(entry, dict)
-        or entry.keys() != {"checksum", "meta"}
-        or not isinstance(entry["meta"], str)
-    ):
+    if not isinstance(entry, dict) or entry.keys() != {"checksum", "meta"}:
         raise CongraspError("The message lacks its metadata.")
-    return _header(entry["meta"].encode(errors="replace"))
+    meta = entry["meta"]
+    if not isinstance(meta, str):
+        raise CongraspError("The message lacks its metadata.")
+    return _parse_header(meta.encode(errors="replace"))
+
+
+class _Entry(NamedTuple):
+    """Description of an array in the header."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    begin: int
+    """First byte in the data section."""
+    end: int
+    """Byte after the last one."""
 
 
 def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray]:
-    entries = sorted(
-        ((name, *_entry(name, entry)) for name, entry in header.items()),
-        key=lambda entry: entry[3:],
-    )
-    arrays, position = {}, 0
-    for name, dtype, shape, begin, end in entries:
-        if begin != position:
-            raise CongraspError(
-                f"The array {_short(name)} starts at byte {begin}, not at {position}: a gap or an "
-                f"overlap."
-            )
-        if end - begin != math.prod(shape) * dtype.itemsize:
-            raise CongraspError(
-                f"The array {_short(name)} has {end - begin} bytes, which is not {dtype} times "
-                f"{shape}."
-            )
-        if end > len(section):
-            raise CongraspError(
-                f"The message is cut: the array {_short(name)} ends at {end} of {len(section)} "
-                f"bytes."
-            )
-        is_bool = dtype.kind == "b"
-        array = np.frombuffer(section[begin:end], np.uint8 if is_bool else dtype)
-        if is_bool:
-            if array.size and array.max() > 1:
-                raise CongraspError(f"The array {_short(name)} has booleans other than 0 and 1.")
-            array = array.view(bool)
-        arrays[name] = array.reshape(shape)
-        position = end
+    """Returns views of the arrays in a data section, which they must fill without gaps."""
+    entries = [_parse_entry(name, entry) for name, entry in header.items()]
+    entries.sort(key=lambda entry: (entry.begin, entry.end))
+    arrays = {}
+    position = 0
+    for entry in entries:
+        _check_range(entry, position, len(section))
+        arrays[entry.name] = _view(entry, section)
+        position = entry.end
     if position != len(section):
         raise CongraspError(
             f"The message has {len(section) - position} bytes that belong to no array."
@@ -273,23 +291,52 @@ def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray
     return arrays
 
 
-def _entry(name: str, entry: Any) -> tuple[np.dtype, tuple[int, ...], int, int]:
-    """Dtype, shape and byte range of a header's entry."""
+def _check_range(entry: _Entry, position: int, section_bytes: int) -> None:
+    """Raises a CongraspError if an array does not begin at `position`, its length is not that of
+    its dtype and shape, or it ends outside the data section.
+    """
+    name, dtype, shape, begin, end = entry
+    if begin != position:
+        raise CongraspError(
+            f"The array {_short(name)} starts at byte {begin}, not at {position}: a gap or an "
+            f"overlap."
+        )
+    if end - begin != math.prod(shape) * dtype.itemsize:
+        raise CongraspError(
+            f"The array {_short(name)} has {end - begin} bytes, which is not {dtype} times {shape}."
+        )
+    if end > section_bytes:
+        raise CongraspError(
+            f"The message is cut: the array {_short(name)} ends at {end} of {section_bytes} bytes."
+        )
+
+
+def _view(entry: _Entry, section: memoryview) -> np.ndarray:
+    """Returns an array as a view of the data section."""
+    data = section[entry.begin : entry.end]
+    if entry.dtype.kind != "b":
+        return np.frombuffer(data, entry.dtype).reshape(entry.shape)
+    array = np.frombuffer(data, np.uint8)
+    if array.size and array.max() > 1:
+        raise CongraspError(f"The array {_short(entry.name)} has booleans other than 0 and 1.")
+    return array.view(bool).reshape(entry.shape)
+
+
+def _parse_entry(name: str, entry: Any) -> _Entry:
+    """Parses an array's entry of the header."""
     if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
         raise CongraspError(
             f"The array {_short(name)} is not described by dtype, shape and data_offsets."
         )
-    dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+    dtype = entry["dtype"]
+    shape = entry["shape"]
+    offsets = entry["data_offsets"]
     if not isinstance(dtype, str) or dtype not in _DTYPES:
         raise CongraspError(
             f"The array {_short(name)} has dtype {_short(dtype)}.",
             f"Messages hold {', '.join(_DTYPES)}.",
         )
-    if (
-        not _is_counts(shape)
-        or len(shape) > _MAX_DIMENSIONS
-        or math.prod(size or 1 for size in shape) >= _MAX_ITEMS
-    ):
+    if not _is_shape(shape):
         raise CongraspError(
             f"The array {_short(name)} has shape {_short(shape)}, which is not valid."
         )
@@ -298,13 +345,22 @@ def _entry(name: str, entry: Any) -> tuple[np.dtype, tuple[int, ...], int, int]:
             f"The array {_short(name)} has data_offsets {_short(offsets)}, which is not a valid "
             f"range."
         )
-    return _DTYPES[dtype], tuple(shape), offsets[0], offsets[1]
+    begin, end = offsets
+    return _Entry(name, _DTYPES[dtype], tuple(shape), begin, end)
+
+
+def _is_shape(value: Any) -> bool:
+    """True if a value is a shape within the limits."""
+    if not _is_counts(value) or len(value) > _MAX_DIMENSIONS:
+        return False
+    return math.prod(size or 1 for size in value) < _MAX_ITEMS
 
 
 def _is_counts(value: Any) -> bool:
-    return isinstance(value, list) and all(
-        type(item) is int and 0 <= item < _MAX_ITEMS for item in value
-    )
+    """True if a value is a list of integers from zero to below `_MAX_ITEMS`."""
+    if not isinstance(value, list):
+        return False
+    return all(type(item) is int and 0 <= item < _MAX_ITEMS for item in value)
 
 
 def _short(value: Any) -> str:

@@ -29,8 +29,8 @@ LONGEST_TEXT = 4096
 """
 REAL = ("float32", "float64")
 _INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or NaN
-_BLOCK = 1 << 16
-_COUNTS = 1 << 53
+_BLOCK_VALUES = 1 << 16  # checked at a time, so that temporary arrays are small
+_MAX_COUNT = 1 << 53  # larger integers are not exact in JSON
 _INDEX = ("int32", "int64")
 
 
@@ -253,48 +253,83 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
         rule.
     """
     for name, kind in spec.meta.items():
-        value = message.meta.get(name)
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise CongraspError(
-                f"The {spec.kind}'s meta entry '{name}' is {ascii(value)[:60]}, not "
-                f"{_type_name(kind)}."
-            )
-        if isinstance(value, str) and name != "hand" and len(value) > LONGEST_TEXT:
-            raise CongraspError(
-                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters; the limit is "
-                f"{LONGEST_TEXT}."
-            )
-        if isinstance(value, int) and abs(value) > _COUNTS:
-            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is too large for a count.")
-    for name, array_spec in spec.arrays.items():
-        if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
-            raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
-    known = dict(sizes)
+        _check_entry(f"The {spec.kind}'s meta entry '{name}'", name, message.meta.get(name), kind)
+    _check_completeness(message, spec)
+    symbol_sizes = dict(sizes)
     for name, array in message.arrays.items():
-        folder, below, _ = name.partition("/")
-        known_spec = spec.arrays.get(name) or spec.arrays.get(f"{folder}/*" if below else "")
-        if known_spec is None:
+        array_spec = _spec_of(name, spec)
+        if array_spec is None:
             raise CongraspError(f"The {spec.kind} has an unknown array {ascii(name)[:60]}.")
-        _check(f"The {spec.kind}'s array {ascii(name)[:60]}", array, known_spec, known)
-    return known
+        what = f"The {spec.kind}'s array {ascii(name)[:60]}"
+        _check_array(what, array, array_spec, symbol_sizes)
+    return symbol_sizes
 
 
-def _check(what: str, array: Any, spec: ArraySpec, known: dict[str, int]) -> None:
+def _check_entry(what: str, name: str, value: Any, kind: type | tuple[type, ...]) -> None:
+    """Raises a CongraspError if an entry of the metadata has another type or exceeds a limit."""
+    is_unexpected_bool = isinstance(value, bool) and kind is not bool
+    if not isinstance(value, kind) or is_unexpected_bool:
+        raise CongraspError(f"{what} is {ascii(value)[:60]}, not {_type_name(kind)}.")
+    if isinstance(value, str) and name != "hand" and len(value) > LONGEST_TEXT:
+        raise CongraspError(f"{what} has {len(value)} characters; the limit is {LONGEST_TEXT}.")
+    if isinstance(value, int) and abs(value) > _MAX_COUNT:
+        raise CongraspError(f"{what} is too large for a count.")
+
+
+def _check_completeness(message: Message, spec: MessageSpec) -> None:
+    """Raises a CongraspError if a required array is missing."""
+    for name, array_spec in spec.arrays.items():
+        is_required = not array_spec.optional and not name.endswith("/*")
+        if is_required and name not in message.arrays:
+            raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
+
+
+def _spec_of(name: str, spec: MessageSpec) -> ArraySpec | None:
+    """Specification of an array, under its name or its folder's; None if it is unknown."""
+    array_spec = spec.arrays.get(name)
+    if array_spec is not None:
+        return array_spec
+    folder, slash, _ = name.partition("/")
+    return spec.arrays.get(f"{folder}/*") if slash else None
+
+
+def _check_array(what: str, array: Any, spec: ArraySpec, sizes: dict[str, int]) -> None:
+    """Checks an array's dtype, shape and values.
+
+    Args:
+      what: subject of the error's sentence.
+      array: the array; a device array is not checked for finite values.
+      spec: its specification.
+      sizes: sizes by symbol; symbols that occur for the first time are added.
+
+    Raises:
+      CongraspError: the array is invalid.
+    """
     if str(array.dtype) not in spec.dtypes:
         raise CongraspError(f"{what} has dtype {array.dtype}, not {' or '.join(spec.dtypes)}.")
-    if spec.shape is not None:
-        fits = len(array.shape) == len(spec.shape) and all(
-            size == (known.setdefault(symbol, size) if isinstance(symbol, str) else symbol)
-            for symbol, size in zip(spec.shape, array.shape, strict=True)
-        )
-        if not fits:
-            rule = ", ".join(
-                f"{s}={known[s]}" if isinstance(s, str) and s in known else str(s)
-                for s in spec.shape
-            )
-            raise CongraspError(f"{what} has shape {tuple(array.shape)}, not ({rule}).")
+    if spec.shape is not None and not _fits(array.shape, spec.shape, sizes):
+        rule = ", ".join(_axis_text(axis, sizes) for axis in spec.shape)
+        raise CongraspError(f"{what} has shape {tuple(array.shape)}, not ({rule}).")
     if isinstance(array, np.ndarray) and not is_finite(array):
         raise CongraspError(f"{what} has values that are not finite.")
+
+
+def _fits(shape: tuple[int, ...], rule: tuple[str | int, ...], sizes: dict[str, int]) -> bool:
+    """True if a shape has these sizes and symbols; adds new symbols to `sizes`."""
+    if len(shape) != len(rule):
+        return False
+    for axis, size in zip(rule, shape, strict=True):
+        required = sizes.setdefault(axis, size) if isinstance(axis, str) else axis
+        if size != required:
+            return False
+    return True
+
+
+def _axis_text(axis: str | int, sizes: dict[str, int]) -> str:
+    """Size of an axis for an error, with its symbol if it has one."""
+    if isinstance(axis, str) and axis in sizes:
+        return f"{axis}={sizes[axis]}"
+    return str(axis)
 
 
 def is_finite(array: np.ndarray) -> bool:
@@ -303,13 +338,16 @@ def is_finite(array: np.ndarray) -> bool:
         return bool(np.isfinite(array).all())
     bits = array.reshape(-1).view(np.uint16)
     return all(
-        (bits[start : start + _BLOCK] & 0x7FFF).max() < _INFINITE_HALF
-        for start in range(0, len(bits), _BLOCK)
+        (bits[start : start + _BLOCK_VALUES] & 0x7FFF).max() < _INFINITE_HALF
+        for start in range(0, len(bits), _BLOCK_VALUES)
     )
 
 
 def _type_name(kind: type | tuple[type, ...]) -> str:
-    return kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
+    """Names of the allowed types for an error."""
+    if isinstance(kind, type):
+        return kind.__name__
+    return " or ".join(alternative.__name__ for alternative in kind)
 
 
 class RolloutHeader(NamedTuple):
@@ -348,13 +386,12 @@ def validate_rollout(
       CongraspError: the rollout is invalid; the text names the array or the entry, and the violated
         rule.
     """
-    validate(
-        message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes
-    )
+    spec = dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES})
+    validate(message, spec, **form.sizes)
     header = RolloutHeader(*(message.meta[name] for name in ROLLOUT.meta))
     check_name("actor", header.actor)
     check_name("incarnation", header.incarnation)
-    if not (0 <= header.sequence < _COUNTS and 0 <= header.version < _COUNTS):
+    if not (0 <= header.sequence < _MAX_COUNT and 0 <= header.version < _MAX_COUNT):
         raise CongraspError("The rollout's meta entries 'sequence' and 'version' must be counts.")
     if header.steps != form.steps * form.worlds:
         raise CongraspError(

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
-from congrasp.common.io.inputs import numbers_in, read_npz
+from congrasp.common.io.arrays import numbers_in, read_npz
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.hands.compile import robot_spec
 from congrasp.services.assets.hands.reading import confined

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.inputs import numbers_in
+from congrasp.common.io.arrays import numbers_in
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm

@@ -22,8 +22,9 @@ import numpy as np
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.spec import Hand, capsule_ends
+from congrasp.common.io.arrays import check_arrays, read_npz
 from congrasp.common.io.files import check_free, write_atomically
-from congrasp.common.io.inputs import check_arrays, file_name, read_npz
+from congrasp.common.io.inputs import file_name
 from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file, runs_back
+from congrasp.common.io.arrays import runs_back
+from congrasp.common.io.inputs import read_file
 from congrasp.services.grasp.csv_header import (
     Columns,
     clock_columns,

@@ -14,7 +14,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.inputs import numbers_in
+from congrasp.common.io.arrays import numbers_in
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import CONSTRAINTS

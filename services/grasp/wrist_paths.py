@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import check_arrays, read_npz
+from congrasp.common.io.arrays import check_arrays, read_npz
 from congrasp.services.grasp.bvh import read_bvh
 from congrasp.services.grasp.csv_paths import HUGE, UNIT_LENGTH, read_csv
 

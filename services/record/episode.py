@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import check_arrays
+from congrasp.common.io.arrays import check_arrays
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.wire.codec import Message

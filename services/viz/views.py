@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import MATERIALS, skin_of
-from congrasp.common.io.inputs import numbers_in
+from congrasp.common.io.arrays import numbers_in
 from congrasp.common.task.constraints.markers import Polyline
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import markers

@@ -14,7 +14,7 @@ import scipy.sparse
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io import pickles
-from congrasp.common.io.inputs import read_npz
+from congrasp.common.io.arrays import read_npz
 from congrasp.common.io.pickles import read_pickle, read_pickles
 from tests.children import python
 from tests.limits import limited
@@ -235,8 +235,8 @@ _TENSOR = Reduced(
     ],
 )
 def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
-    monkeypatch.setattr(pickles, "SECONDS", 1)
-    monkeypatch.setattr(pickles, "MEMORY", 1 << 30)
+    monkeypatch.setattr(pickles, "_MAX_PROCESSOR_S", 1)
+    monkeypatch.setattr(pickles, "_MAX_MEMORY_BYTES", 1 << 30)
     said = limited(parse, data)
     assert said.startswith("CongraspError: a.pkl") and re.search(word, said), said
 

@@ -21,7 +21,7 @@ from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
-from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.transport.zenoh_transport import MessageLimits, ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from tests.socket_transport import SocketListener, SocketTransport
 from tests.waits import eventually, together
@@ -345,7 +345,7 @@ def test_damaged_and_oversized_messages_are_refused():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     damaged = []
     with (
-        ZenohTransport(listen=[endpoint], max_message=1 << 20) as server,
+        ZenohTransport(listen=[endpoint], limits=MessageLimits(message=1 << 20)) as server,
         ZenohTransport(connect=[endpoint]) as client,
     ):
         server.serve(

@@ -176,7 +176,8 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
 TAKER = """
 import json, sys
 from congrasp.common.transport import ports
-ports._LOWEST, ports._COUNT = {lowest}, 61  # sixty to choose from, so that one would soon be chosen twice
+ports._FIRST_FREE_PORT = {lowest}
+ports._FREE_PORTS = 61  # sixty to choose from, so that one would soon be chosen twice
 for line in sys.stdin:
     print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
 """

@@ -10,8 +10,9 @@ import numpy as np
 
 from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.arrays import check_arrays
 from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import check_arrays, file_name, read_file
+from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.task.normals import estimated_normals

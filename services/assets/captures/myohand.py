@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.mano import ManoModel
-from congrasp.common.io.inputs import runs_back
+from congrasp.common.io.arrays import runs_back
 from congrasp.common.io.pickles import read_archive
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.sequence import (
