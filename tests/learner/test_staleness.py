@@ -16,8 +16,9 @@ from tests.waits import together
 A, B = ("a", "1"), ("b", "1")
 
 
-def manager(max_staleness=1, batch=2, **options):
-    return StalenessManager(max_staleness, batch, **options)
+def manager(max_staleness=1, batch=2, clock=lambda: 0.0, **options):
+    """A manager whose clock stands still: real durations of microseconds would decide on places."""
+    return StalenessManager(max_staleness, batch, clock=clock, **options)
 
 
 def test_tickets_worked_out_by_hand():
