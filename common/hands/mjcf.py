@@ -203,7 +203,7 @@ class _Servo(NamedTuple):
     """A position servo, with gains in SI units of its joint or tendon."""
 
     kind: mujoco.mjtTrn
-    """Whether it moves a joint or a tendon."""
+    """Type of the transmission: a joint or a tendon."""
     kp: float
     kv: float
     limit: float

@@ -18,7 +18,7 @@ from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.sensors import SENSORS, get_sensor
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import collate
-from congrasp.learner.hub.admission import task_ranges
+from congrasp.learner.hub.task_ranges import task_ranges
 from congrasp.services.serve.inference import LocalPolicy
 from congrasp.services.train.command import untrained
 from tests import task as suite

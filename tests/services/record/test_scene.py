@@ -447,28 +447,32 @@ def test_a_mesh_of_many_faces_is_left_as_it_is():
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 
 
-def test_a_colour_is_a_mean_of_those_nearby():
-    """At distances of 1 and 2 m, 1.5 on average: exp(-(1 / 1.5)^2) = .6412 to exp(-(2 / 1.5)^2) =
-    .1690, so 79.1 %.
+def test_a_colour_is_a_mean_of_similar_ones():
+    """At distances of 1 and 2 m, 1.5 on average, weights are exp(-(1 / 1.5)^2) = .6412 and
+    exp(-(2 / 1.5)^2) = .1690; colours 10 apart are similar to exp(-10^2 / (2 x 24^2)) = .9169.
     """
-    colours = Colours(
-        np.array([[0, 0, -1], [0, 0, 2]], np.float32), np.array([RED, BLUE], np.uint8)
-    )
-    np.testing.assert_array_equal(colours_at(np.zeros((1, 3)), colours), [[202, 0, 53]])
+    points = np.array([[0, 0, -1], [0, 0, 2]], np.float32)
+    here = np.zeros((1, 3))
+    similar = Colours(points, np.array([(200, 0, 0), (190, 0, 0)], np.uint8))
+    # (.6412 x 200 + .1690 x .9169 x 190) / (.6412 + .1690 x .9169) = 198.05
+    np.testing.assert_array_equal(colours_at(here, similar), [[198, 0, 0]])
+    different = Colours(points, np.array([RED, BLUE], np.uint8))
+    np.testing.assert_array_equal(colours_at(here, different), [RED])
 
 
-def test_an_edge_between_two_colours_has_no_teeth():
-    """Along the edge the colour hardly changes, a centimetre away it is pure."""
+def test_an_edge_between_two_colours_is_sharp():
+    """On the edge colours are pure, and two points' spacing away they are all that of their side."""
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(0, 0.1, (8000, 2)), np.zeros(8000)].astype(np.float32)
     colours = Colours(points, np.where(points[:, :1] < 0.05, RED, BLUE).astype(np.uint8))
     along = np.linspace(0.01, 0.09, 300)
-    red = [
-        colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0].astype(float)
-        for x in (0.04, 0.05)
-    ]
-    assert (red[0] == 255).all() and abs(red[1].mean() - 127.5) < 20
-    assert red[1].std() < 60  # of the nearest points alone 127
+
+    def red_at(x):
+        return colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0]
+
+    assert set(red_at(0.05).tolist()) == {0, 255}
+    assert (red_at(0.048) == 255).all()
+    assert (red_at(0.052) == 0).all()
 
 
 def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
