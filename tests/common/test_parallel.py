@@ -55,6 +55,8 @@ _SCRIPTS = {
     """,
 }
 _INTERRUPTED = f"""
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job may ignore it
 try:
     {_SPREAD.strip().replace(chr(10), chr(10) + "    ")}
 except KeyboardInterrupt:
