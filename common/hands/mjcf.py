@@ -154,26 +154,19 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
 def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
     """Adds the six joints of the virtual wrist with their actuators."""
     gains = hand.wrist
+    joint = mujoco.mjtTrn.mjTRN_JOINT
+    slide = _Servo(joint, gains.slide_kp, gains.slide_kv, gains.slide_limit)
+    hinge = _Servo(joint, gains.hinge_kp, gains.hinge_kv, gains.hinge_limit)
     slides = WRIST_JOINTS[:3]
     hinges = WRIST_JOINTS[3:]
     for axis, name in zip(np.eye(3), slides, strict=True):
-        body.add_joint(
-            name=name,
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=axis,
-            armature=gains.slide_armature,
-        )
-        servo = _Servo(mujoco.mjtTrn.mjTRN_JOINT, gains.slide_kp, gains.slide_kv, gains.slide_limit)
-        _add_servo(spec, name, servo)
+        kind = mujoco.mjtJoint.mjJNT_SLIDE
+        body.add_joint(name=name, type=kind, axis=axis, armature=gains.slide_armature)
+        _add_servo(spec, name, slide)
     for axis, name in zip(np.eye(3), hinges, strict=True):
-        body.add_joint(
-            name=name,
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=axis,
-            armature=gains.hinge_armature,
-        )
-        servo = _Servo(mujoco.mjtTrn.mjTRN_JOINT, gains.hinge_kp, gains.hinge_kv, gains.hinge_limit)
-        _add_servo(spec, name, servo)
+        kind = mujoco.mjtJoint.mjJNT_HINGE
+        body.add_joint(name=name, type=kind, axis=axis, armature=gains.hinge_armature)
+        _add_servo(spec, name, hinge)
 
 
 def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:

@@ -10,11 +10,11 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.services.cli.console import in_range, tracked
-from congrasp.services.evaluate.lineup import Entrant, read_entrants
+from congrasp.services.evaluate.lineup import Entrant, PolicyKey, read_entrants
 from congrasp.services.evaluate.paper.comparison import summary
 from congrasp.services.evaluate.paper.evaluation import PartSettings
 from congrasp.services.evaluate.paper.page import JSON, LATEX, PAGE, page_template
-from congrasp.services.evaluate.paper.parts import BASELINES, RequiredPolicy, required_policies
+from congrasp.services.evaluate.paper.parts import BASELINES, required_policies
 from congrasp.services.evaluate.paper.reproduction import Request, reproduce
 from congrasp.services.ops.lifetime import command
 from congrasp.services.train import accelerators
@@ -150,11 +150,9 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
         )
 
 
-def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
+def _given(texts: tuple[str, ...], needed: list[PolicyKey]) -> dict[PolicyKey, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-    given = {
-        RequiredPolicy(entrant.hand, entrant.method): entrant for entrant in read_entrants(texts)
-    }
+    given = {entrant.key: entrant for entrant in read_entrants(texts)}
     for policy, entrant in given.items():
         if policy not in needed:
             raise CongraspError(

@@ -21,7 +21,7 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io import files as cached
+from congrasp.common.io import files
 from congrasp.common.objects import store
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import scale_objects
@@ -272,7 +272,7 @@ class Experiment:
         """Code, policy and settings."""
         packages = (congrasp.common, congrasp.actors, congrasp.services.evaluate)
         return (
-            cached.source_digest(*packages),
+            files.source_digest(*packages),
             jax.__version__,
             mujoco.__version__,
             self.task,
@@ -313,11 +313,13 @@ class Experiment:
         """
         plans = [self.plan(variation) for variation in variations]
         advance = self.track("Episodes", sum(plan.total for plan in plans))
-        files: list[pathlib.Path | None] = [None] * len(variations)
+        row_files: list[pathlib.Path | None] = [None] * len(variations)
         if stored is not None:
-            files = [stored / f"{self._name(variation)}.safetensors" for variation in variations]
+            row_files = [
+                stored / f"{self._name(variation)}.safetensors" for variation in variations
+            ]
         results: list[Result | None] = []
-        for variation, file in zip(variations, files, strict=True):
+        for variation, file in zip(variations, row_files, strict=True):
             results.append(self._stored_result(variation, file))
         missing = [n for n, result in enumerate(results) if result is None]
         for task, group in itertools.groupby(missing, lambda n: variations[n].task(self.task)):
@@ -327,14 +329,14 @@ class Experiment:
                     progress = functools.partial(advance_from, advance, finished)
                     result = self._run(running, variations[n], plans[n], progress, keep)
                     results[n] = result
-                    file = files[n]
+                    file = row_files[n]
                     if file is not None:
-                        cached.keep(file, Message(result.sample.arrays()), len(files))
+                        files.keep(file, Message(result.sample.arrays()), len(row_files))
         return [result for result in results if result is not None]
 
     def _stored_result(self, variation: Variation, file: pathlib.Path | None) -> Result | None:
         """Returns the result of a row from its file, without kept episodes; None without one."""
-        message = None if file is None else cached.read_kept(file)
+        message = None if file is None else files.read_kept(file)
         if message is None:
             return None
         sample = Sample.of(message.arrays)

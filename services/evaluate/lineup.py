@@ -39,6 +39,11 @@ class PolicyKey(NamedTuple):
     hand: str
     method: str
 
+    @property
+    def name(self) -> str:
+        """Name of its run in a reproduction, and in texts."""
+        return f"{self.hand}-{self.method}"
+
 
 class Entrant(NamedTuple):
     """A policy with its method; its task is that of the method."""

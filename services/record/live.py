@@ -39,7 +39,6 @@ _UNREAD, _UNREAD_SECONDS = (
     4 << 20,
     10.0,
 )
-_SOCKET_BUFFER = 256 << 10  # bytes of the system's buffer for each connection
 _TOPICS = 4096  # open channels; beyond this the one that was silent for longest is closed
 _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 

@@ -8,8 +8,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy.pretrained import pretrained_file
 from congrasp.common.task.methods import get_method
 from congrasp.services.evaluate.experiment import Track
-from congrasp.services.evaluate.lineup import Entrant, read_entrant
-from congrasp.services.evaluate.paper.parts import BASELINES, RequiredPolicy, required_policies
+from congrasp.services.evaluate.lineup import Entrant, PolicyKey, read_entrant
+from congrasp.services.evaluate.paper.parts import BASELINES, required_policies
 from congrasp.services.evaluate.paper.reproduction import AvailablePolicies, Training
 from congrasp.services.train import background
 from congrasp.services.train.presets import FULL
@@ -23,7 +23,7 @@ class PolicyRequest:
     """Hands; the first is that of all methods but the full system."""
     methods: tuple[str, ...]
     """Methods compared with the full system."""
-    given: Mapping[RequiredPolicy, Entrant]
+    given: Mapping[PolicyKey, Entrant]
     """Policies that need no training."""
     pretrained: bool
     """Uses pretrained policies instead of training."""
@@ -34,12 +34,12 @@ class PolicyRequest:
     timeout_s: float = 14400.0
     """Limit of each training, s."""
 
-    def run_dir(self, policy: RequiredPolicy) -> pathlib.Path:
+    def run_dir(self, policy: PolicyKey) -> pathlib.Path:
         """Run directory of a policy's training."""
         return self.runs / policy.name
 
 
-def policies_to_train(request: PolicyRequest) -> list[RequiredPolicy]:
+def policies_to_train(request: PolicyRequest) -> list[PolicyKey]:
     """Returns the policies that would have to be trained."""
     if request.pretrained:
         return []
@@ -57,8 +57,8 @@ def get_policies(request: PolicyRequest, track: Track) -> AvailablePolicies:
       CongraspError: a policy file cannot be read.
     """
     failures = train_all(request, policies_to_train(request), track)
-    entrants: dict[RequiredPolicy, Entrant] = {}
-    absent: dict[RequiredPolicy, str] = {}
+    entrants: dict[PolicyKey, Entrant] = {}
+    absent: dict[PolicyKey, str] = {}
     for policy in required_policies(request.hands, request.methods):
         entrant = _entrant(request, policy)
         if entrant is not None:
@@ -71,22 +71,22 @@ def get_policies(request: PolicyRequest, track: Track) -> AvailablePolicies:
             absent[policy] = "it was not trained"
     for method in BASELINES:
         if method not in request.methods:
-            absent[RequiredPolicy(request.hands[0], method)] = "not requested"
+            absent[PolicyKey(request.hands[0], method)] = "not requested"
     return AvailablePolicies(
         entrants, absent, _trainings(request, list(entrants)), list(failures.values())
     )
 
 
 def train_all(
-    request: PolicyRequest, policies: Sequence[RequiredPolicy], track: Track
-) -> dict[RequiredPolicy, str]:
+    request: PolicyRequest, policies: Sequence[PolicyKey], track: Track
+) -> dict[PolicyKey, str]:
     """Trains policies in turn, each in a separate run, resuming from its last checkpoint if there
     is one.
 
     Returns:
       Reasons for failed trainings; the others succeeded.
     """
-    failures: dict[RequiredPolicy, str] = {}
+    failures: dict[PolicyKey, str] = {}
     for policy in policies:
         run_dir = request.run_dir(policy)
         track(f"Training {policy.name} (log: {run_dir}.log)", None)
@@ -99,7 +99,7 @@ def train_all(
     return failures
 
 
-def training_options(policy: RequiredPolicy) -> list[str]:
+def training_options(policy: PolicyKey) -> list[str]:
     """Options of `congrasp train` for a policy's run."""
     options = ["--preset", FULL, "--hand", policy.hand]
     if policy.method != "ours":
@@ -107,7 +107,7 @@ def training_options(policy: RequiredPolicy) -> list[str]:
     return options
 
 
-def _policy_file(request: PolicyRequest, policy: RequiredPolicy) -> pathlib.Path | None:
+def _policy_file(request: PolicyRequest, policy: PolicyKey) -> pathlib.Path | None:
     """Returns a policy's file, if it exists."""
     if policy in request.given:
         return request.given[policy].file
@@ -116,7 +116,7 @@ def _policy_file(request: PolicyRequest, policy: RequiredPolicy) -> pathlib.Path
     return background.finished_policy(request.run_dir(policy))
 
 
-def _entrant(request: PolicyRequest, policy: RequiredPolicy) -> Entrant | None:
+def _entrant(request: PolicyRequest, policy: PolicyKey) -> Entrant | None:
     """Reads a policy, if it exists; a method without learning uses the full system's hand and
     geometry.
     """
@@ -124,14 +124,12 @@ def _entrant(request: PolicyRequest, policy: RequiredPolicy) -> Entrant | None:
         return request.given[policy]
     source = policy
     if not get_method(policy.method).learns:
-        source = RequiredPolicy(policy.hand, "ours")
+        source = PolicyKey(policy.hand, "ours")
     file = _policy_file(request, source)
     return None if file is None else read_entrant(file, policy.method)
 
 
-def _trainings(
-    request: PolicyRequest, policies: Sequence[RequiredPolicy]
-) -> dict[RequiredPolicy, Training]:
+def _trainings(request: PolicyRequest, policies: Sequence[PolicyKey]) -> dict[PolicyKey, Training]:
     """Returns the finished trainings of policies."""
     trainings = {}
     for policy in policies:

@@ -4,9 +4,9 @@ import collections
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
+from congrasp.services.evaluate.lineup import PolicyKey
 from congrasp.services.evaluate.paper.evaluation import PartResult
 from congrasp.services.evaluate.paper.figures import PaperLine, paper_lines
-from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.text_table import verdict
 
@@ -58,7 +58,7 @@ class Cell:
 
 
 def compare(
-    results: Sequence[PartResult], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]
+    results: Sequence[PartResult], absent: Mapping[PolicyKey, str], hands: Sequence[str]
 ) -> list[Cell]:
     """Returns a cell for every figure of the paper and every comparable result.
 
@@ -148,13 +148,13 @@ def _with_our_figure(cell: Cell, data_name: str, row: Row) -> Cell:
 def _missing_reason(
     line: PaperLine,
     results: Sequence[PartResult],
-    absent: Mapping[RequiredPolicy, str],
+    absent: Mapping[PolicyKey, str],
     hands: Sequence[str],
 ) -> str:
     """Reason why no result is comparable with a line."""
     if line.hand not in hands:
         return f"the hand '{line.hand}' was not requested"
-    policy_reason = absent.get(RequiredPolicy(line.hand, line.method))
+    policy_reason = absent.get(PolicyKey(line.hand, line.method))
     if policy_reason:
         return f"no policy of the method '{line.method}': {policy_reason}"
     sources = {result.source for result in results}

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.services.evaluate.columns import PLAUSIBILITY, RATE, RATES
+from congrasp.services.evaluate.lineup import PolicyKey
 from congrasp.services.evaluate.pages import Picture, embedded, template
 from congrasp.services.evaluate.paper.comparison import SUCCESS, Cell, summary, unmatched
 from congrasp.services.evaluate.paper.evaluation import PartResult
 from congrasp.services.evaluate.paper.figures import TABLES
-from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.evaluate.scores import UNITS, Row
 from congrasp.services.evaluate.text_table import NONE, Columns, Styled, Table, percent
 
@@ -45,7 +45,7 @@ class Reproduction(NamedTuple):
 
     results: list[PartResult]
     cells: list[Cell]
-    policies: list[tuple[RequiredPolicy, str]]
+    policies: list[tuple[PolicyKey, str]]
     """Policies, each with its file or the reason why there is none."""
     failures: list[str]
     conditions: str

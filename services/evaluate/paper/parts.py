@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from congrasp.common.task.methods import METHODS, STUDENTS
+from congrasp.services.evaluate.lineup import PolicyKey
 
 BASELINES = tuple(name for name in METHODS if name not in ("ours", *STUDENTS))
 """Methods compared with the full system, all for one hand."""
@@ -13,22 +14,10 @@ _METHODS_ON_MANY_OBJECTS = ("ours", "graspxl", "no-dynamic-center")
 _TABLES_WITHOUT_PICTURES = ("objects", "noise")
 
 
-class RequiredPolicy(NamedTuple):
-    """A policy that a reproduction needs."""
-
-    hand: str
-    method: str
-
-    @property
-    def name(self) -> str:
-        """Name of its run, and in texts."""
-        return f"{self.hand}-{self.method}"
-
-
 class Part(NamedTuple):
     """Rows that are evaluated and stored together."""
 
-    policy: RequiredPolicy
+    policy: PolicyKey
     table: str
     """Table of `services.evaluate.tables.evaluate_tables`, or `captured`."""
     data: pathlib.Path | None = None
@@ -52,7 +41,7 @@ class Part(NamedTuple):
         return self.policy.method == "ours" and self.table not in _TABLES_WITHOUT_PICTURES
 
 
-def required_policies(hands: Sequence[str], methods: Sequence[str]) -> list[RequiredPolicy]:
+def required_policies(hands: Sequence[str], methods: Sequence[str]) -> list[PolicyKey]:
     """Returns the policies of a reproduction, including those of methods without learning.
 
     Args:
@@ -62,15 +51,15 @@ def required_policies(hands: Sequence[str], methods: Sequence[str]) -> list[Requ
     Returns:
       The full system of every hand, then the other methods in the order of `BASELINES`.
     """
-    policies = [RequiredPolicy(hand, "ours") for hand in hands]
+    policies = [PolicyKey(hand, "ours") for hand in hands]
     for method in BASELINES:
         if method in methods:
-            policies.append(RequiredPolicy(hands[0], method))
+            policies.append(PolicyKey(hands[0], method))
     return policies
 
 
 def list_parts(
-    policies: Sequence[RequiredPolicy], captured: Sequence[pathlib.Path], *, noise: bool
+    policies: Sequence[PolicyKey], captured: Sequence[pathlib.Path], *, noise: bool
 ) -> list[Part]:
     """Returns all parts of a reproduction.
 

@@ -11,13 +11,12 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.task.methods import get_method
 from congrasp.services.evaluate.experiment import Track
-from congrasp.services.evaluate.lineup import Entrant
+from congrasp.services.evaluate.lineup import Entrant, PolicyKey
 from congrasp.services.evaluate.pages import Picture, curves_of
 from congrasp.services.evaluate.paper.comparison import compare
 from congrasp.services.evaluate.paper.evaluation import PartResult, PartSettings, evaluate_part
 from congrasp.services.evaluate.paper.page import Reproduction, write_reproduction
 from congrasp.services.evaluate.paper.parts import (
-    RequiredPolicy,
     list_parts,
     required_policies,
 )
@@ -35,10 +34,10 @@ class Training(NamedTuple):
 class AvailablePolicies:
     """Policies of a reproduction."""
 
-    entrants: Mapping[RequiredPolicy, Entrant]
-    absent: Mapping[RequiredPolicy, str]
+    entrants: Mapping[PolicyKey, Entrant]
+    absent: Mapping[PolicyKey, str]
     """Reasons for missing policies."""
-    trainings: Mapping[RequiredPolicy, Training] = dataclasses.field(default_factory=dict)
+    trainings: Mapping[PolicyKey, Training] = dataclasses.field(default_factory=dict)
     """Trainings of those that this reproduction trained."""
     failures: Sequence[str] = ()
     """Errors of failed trainings."""
@@ -120,7 +119,7 @@ def reproduce(
     return reproduction
 
 
-def _describe_policies(policies: AvailablePolicies) -> list[tuple[RequiredPolicy, str]]:
+def _describe_policies(policies: AvailablePolicies) -> list[tuple[PolicyKey, str]]:
     """Returns each policy with its file and training, or the reason why it is missing."""
     descriptions = []
     for policy, entrant in policies.entrants.items():
@@ -149,7 +148,7 @@ def _conditions(settings: PartSettings) -> str:
     )
 
 
-def _training_curves(trainings: Mapping[RequiredPolicy, Training]) -> list[Picture]:
+def _training_curves(trainings: Mapping[PolicyKey, Training]) -> list[Picture]:
     """Returns the first figure of each training's recordings."""
     curves = []
     for policy, training in trainings.items():

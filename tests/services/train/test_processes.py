@@ -12,7 +12,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli import main, parse_errors
-from congrasp.services.evaluate.paper.parts import RequiredPolicy
+from congrasp.services.evaluate.lineup import PolicyKey
 from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
 from congrasp.services.train import background, processes
@@ -182,9 +182,7 @@ def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
 # --- trainings of a reproduction ---
 
 
-OURS, GRAPSXL, PHASES = (
-    RequiredPolicy("human", method) for method in ("ours", "graspxl", "two-phase")
-)
+OURS, GRAPSXL, PHASES = (PolicyKey("human", method) for method in ("ours", "graspxl", "two-phase"))
 FINISHES = (
     "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / "
     "'policy.safetensors').touch()"
@@ -263,7 +261,7 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
 
 
 @pytest.mark.parametrize(
-    "policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name
+    "policy", [OURS, GRAPSXL, PolicyKey("allegro", "ours")], ids=lambda policy: policy.name
 )
 def test_its_command_lines_are_those_of_train(policy):
     arguments = [*training_options(policy), "--environments", "4096"]

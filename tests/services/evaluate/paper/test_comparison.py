@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from congrasp.services.evaluate.lineup import PolicyKey
 from congrasp.services.evaluate.paper.comparison import SUCCESS, compare, summary, unmatched
 from congrasp.services.evaluate.paper.evaluation import PartResult
 from congrasp.services.evaluate.paper.figures import TABLES, paper_lines, paper_row
 from congrasp.services.evaluate.paper.page import not_comparable, paper_tables
 from congrasp.services.evaluate.paper.parts import (
     Part,
-    RequiredPolicy,
     list_parts,
     required_policies,
 )
@@ -28,7 +28,7 @@ HANDS = ("human", "allegro", "sharpa")
 
 
 def result(source, *rows, hand="human", method="ours", table="single", data=None):
-    part = Part(RequiredPolicy(hand, method), table, data and pathlib.Path(data))
+    part = Part(PolicyKey(hand, method), table, data and pathlib.Path(data))
     return PartResult(part, source, list(rows), {"pictures": [], "seconds": 1.0}, True)
 
 
@@ -95,7 +95,7 @@ def test_captured_rows_of_several_data_sets_each_have_a_cell():
 
 
 def test_reasons_say_what_is_missing():
-    absent = {RequiredPolicy("human", "graspxl"): "its training failed"}
+    absent = {PolicyKey("human", "graspxl"): "its training failed"}
     cells = compare([result("hands", row("heading", 0.9, 0.8, 0.95))], absent, ("human",))
     (graspxl,) = find(cells, "objects", "heading", method="graspxl", group="small")
     assert graspxl.reason == "no policy of the method 'graspxl': its training failed"

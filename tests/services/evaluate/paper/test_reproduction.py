@@ -13,18 +13,17 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.experiment import silent
-from congrasp.services.evaluate.lineup import read_entrant
+from congrasp.services.evaluate.lineup import PolicyKey, read_entrant
 from congrasp.services.evaluate.paper import evaluation as part_evaluation
 from congrasp.services.evaluate.paper import reproduction
 from congrasp.services.evaluate.paper.evaluation import PartResult, PartSettings
-from congrasp.services.evaluate.paper.parts import RequiredPolicy
 from congrasp.services.evaluate.tables import Evaluation
 from congrasp.services.train import reproduction as training
 from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
 
-OURS = RequiredPolicy("human", "ours")
+OURS = PolicyKey("human", "ours")
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +144,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     )
     account = reproduction.reproduce(request, policies, silent)
     what = {one.name: text for one, text in account.policies}
-    assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
+    assert asked[:2] == [PolicyKey("allegro", "ours"), PolicyKey("human", "graspxl")]
     assert asked[2:6] == [
         "human-ours-single",
         "human-pd-single",
