@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from congrasp.common.objects import shapes
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.decompose import CUT_DEPTH, Decomposition, decompose
 from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
 from congrasp.services.assets.objects.hulls import corners_of, simplify
 from congrasp.services.assets.objects.merging import merge
@@ -103,34 +103,58 @@ def convex_pieces(
 def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collision:
     """A decomposition of each mesh, or the hulls of the meshes if those are closer.
 
-    Each mesh may have pieces according to its share of the volume.
+    Each mesh may have pieces according to its share of the volume. Pieces that are too coarse are
+    cut once more, half as coarse, if more of them are allowed.
     """
     mesh_hulls = [shapes.hull_of(mesh.vertices) for mesh in surfaces.meshes]
     volumes = np.array([hull.volume for hull in mesh_hulls])
     limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
-    hulls: list[np.ndarray] = []
-    owners: list[int] = []
-    for owner, limit in enumerate(limits):
-        pieces = _cut_mesh(surfaces, owner, limit, notes)
-        hulls += pieces
-        owners += [owner] * len(pieces)
-    cut = _simplified(surfaces, hulls, owners)
-    if cut.errors.excess <= 1 or len(hulls) == len(mesh_hulls):
+    cut_notes: list[str] = []
+    cut = _cut_to_depth(surfaces, limits, CUT_DEPTH, cut_notes)
+    count = len(cut.hulls)
+    is_convex = count == len(mesh_hulls)
+    if cut.errors.excess > 1 and not is_convex and count < options.max_pieces:
+        finer_notes: list[str] = []
+        finer = _cut_to_depth(surfaces, limits, CUT_DEPTH / 2, finer_notes)
+        if finer.errors.excess < cut.errors.excess:
+            cut = finer
+            cut_notes = finer_notes
+    notes += cut_notes
+    if cut.errors.excess <= 1 or is_convex:
         return cut
     filled = _filled(surfaces, mesh_hulls)
     if filled.errors.excess < cut.errors.excess:
         notes.append(
-            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): "
+            f"its convex hull is closer to its shape than {len(cut.hulls)} pieces ({cut.errors}): "
             f"hollows are filled"
         )
         return filled
     return cut
 
 
-def _cut_mesh(
-    surfaces: Surfaces, owner: int, max_pieces: int, notes: list[str]
-) -> list[np.ndarray]:
-    """Vertices (V, 3) of the pieces of one of the meshes."""
+def _cut_to_depth(
+    surfaces: Surfaces, limits: Sequence[int], depth: float, notes: list[str]
+) -> Collision:
+    """The pieces of each mesh.
+
+    Args:
+      surfaces: the object's surfaces.
+      limits: largest number of pieces of each mesh.
+      depth: depth of a hollow in a piece from which it is cut, m.
+      notes: what a decomposer reports is appended.
+    """
+    hulls: list[np.ndarray] = []
+    owners: list[int] = []
+    for owner, limit in enumerate(limits):
+        decomposition = _cut_mesh(surfaces, owner, limit, depth)
+        notes += decomposition.notes
+        hulls += decomposition.pieces
+        owners += [owner] * len(decomposition.pieces)
+    return _simplified(surfaces, hulls, owners)
+
+
+def _cut_mesh(surfaces: Surfaces, owner: int, max_pieces: int, depth: float) -> Decomposition:
+    """The pieces of one of the meshes."""
     mesh = surfaces.meshes[owner]
     shown = surfaces.shown[owner]
     small = repair.with_few_faces(mesh)
@@ -138,15 +162,14 @@ def _cut_mesh(
     if surfaces.volume is not None and (small is mesh or repair.encloses(small)):
         is_only_mesh = len(surfaces.meshes) == 1
         volume = surfaces.volume if is_only_mesh else float(shown.volume)
-    decomposition = decompose(
+    return decompose(
         np.asarray(small.vertices),
         np.asarray(small.faces),
         shown=None if shown is mesh else np.asarray(shown.triangles),
         volume=volume,
         max_pieces=max_pieces,
+        depth=depth,
     )
-    notes += decomposition.notes
-    return decomposition.pieces
 
 
 def _filled(surfaces: Surfaces, mesh_hulls: Sequence[ConvexHull]) -> Collision:

@@ -24,8 +24,11 @@ from congrasp.services.assets.confined import OutOfResources, call_confined
 from congrasp.services.assets.objects.bodies import bodies
 from congrasp.services.assets.objects.hulls import corners_of, deepest, solid_hull
 from congrasp.services.assets.objects.interior import enclosed
+from congrasp.services.assets.objects.manifold import manifold
 from congrasp.services.assets.objects.merging import DEPTH, GROWTH, merge
 
+CUT_DEPTH = 2 * DEPTH
+"""Depth of a hollow in a piece from which it is cut, m, at first."""
 PROCESSOR_LIMIT = 300.0
 """Processor time of a decomposer, s, after which the import is an error; most take 1 to 15 s."""
 STARVED = 20.0
@@ -49,6 +52,18 @@ _MESH = "mesh.npz"
 _PIECES = "pieces.npz"
 
 
+class _Cut(NamedTuple):
+    """Options of a cut."""
+
+    method: str
+    """"coacd" or "vhacd"."""
+    volume: float | None
+    """See `decompose`."""
+    max_pieces: int
+    depth: float
+    """See `decompose`."""
+
+
 class Decomposition(NamedTuple):
     """Convex pieces of a mesh."""
 
@@ -67,6 +82,7 @@ def decompose(
     volume: float | None,
     max_pieces: int = MAX_MESH_PIECES,
     shown: np.ndarray | None = None,
+    depth: float = CUT_DEPTH,
 ) -> Decomposition:
     """Decomposes a triangle mesh into as few convex pieces as preserve its shape.
 
@@ -78,6 +94,7 @@ def decompose(
       max_pieces: most pieces.
       shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its
         hollows; by default the mesh's.
+      depth: depth of a hollow in a piece from which it is cut, m.
 
     Raises:
       CongraspError: a decomposer exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for
@@ -91,8 +108,9 @@ def decompose(
     mesh = {"vertices": vertices, "faces": faces, "shown": shown}
     notes: list[str] = []
     for method in ("coacd", "vhacd"):
+        cut = _Cut(method=method, volume=volume, max_pieces=max_pieces, depth=depth)
         try:
-            pieces = _in_child(method, mesh, volume, max_pieces)
+            pieces = _in_child(mesh, cut)
             return Decomposition(pieces, method, notes)
         except ChildProcessError as error:
             notes.append(f"{method} {error}")
@@ -100,26 +118,18 @@ def decompose(
     return Decomposition([corners_of(hull)], "hull", notes)
 
 
-def _in_child(
-    method: str,
-    mesh: dict[str, Any],
-    volume: float | None,
-    max_pieces: int,
-) -> list[np.ndarray]:
+def _in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
     """Vertices (V, 3) of the pieces that a confined process cuts.
 
     Args:
-      method: "coacd" or "vhacd".
       mesh: arrays `vertices`, `faces` and `shown`; see `decompose`.
-      volume: see `decompose`.
-      max_pieces: most pieces.
+      cut: options of the cut.
 
     Raises:
       CongraspError: it exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for it.
       ChildProcessError: it failed, or found no piece; a predicate without a subject.
     """
     patience = STARVED * PROCESSOR_LIMIT + STARVED
-    options = {"method": method, "volume": volume, "max_pieces": max_pieces}
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder = pathlib.Path(name)
         np.savez(folder / _MESH, **mesh)
@@ -127,20 +137,20 @@ def _in_child(
             call_confined(
                 write_pieces,
                 folder,
-                options,
+                cut._asdict(),
                 memory=_ADDRESS_SPACE,
                 seconds=PROCESSOR_LIMIT,
                 patience=patience,
             )
         except TimeoutError:
             raise CongraspError(
-                f"The machine is too busy: {method} got less than {PROCESSOR_LIMIT:g} s of "
+                f"The machine is too busy: {cut.method} got less than {PROCESSOR_LIMIT:g} s of "
                 f"processor time in {patience:.0f} s.",
                 "Stop other programs and try again.",
             ) from None
         except OutOfResources as error:
             raise CongraspError(
-                f"The mesh cannot be cut into convex pieces: {method} {error}.",
+                f"The mesh cannot be cut into convex pieces: {cut.method} {error}.",
                 "Simplify it to fewer triangles, or put convex pieces 'contact*' next to it.",
             ) from None
         with np.load(folder / _PIECES) as arrays:
@@ -150,19 +160,25 @@ def _in_child(
     return pieces
 
 
-def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pieces: int) -> None:
-    """Decomposes the mesh in a folder, in the confined process."""
+def write_pieces(folder: pathlib.Path, **options: Any) -> None:
+    """Decomposes the mesh in a folder, in the confined process.
+
+    Args:
+      folder: has the mesh, and gets the pieces.
+      options: the fields of `_Cut`.
+    """
+    cut = _Cut(**options)
     with np.load(folder / _MESH) as arrays:
         vertices = arrays["vertices"]
         faces = arrays["faces"]
         shown = arrays["shown"]
-    if method == "coacd":
-        pieces = _by_coacd(vertices, faces, closed=bool(volume))
+    if cut.method == "coacd":
+        pieces = _by_coacd(vertices, faces, cut)
     else:
-        pieces = _by_vhacd(vertices, faces, max_pieces)
+        pieces = _by_vhacd(vertices, faces, cut.max_pieces)
     hulls = [solid_hull(np.asarray(piece, np.float64)) for piece in pieces]
     solid = [hull.points for hull in hulls if hull is not None]
-    np.savez(folder / _PIECES, *merge(solid, max_pieces, shown, volume))
+    np.savez(folder / _PIECES, *merge(solid, cut.max_pieces, shown, cut.volume))
 
 
 def _by_vhacd(vertices: np.ndarray, faces: np.ndarray, max_pieces: int) -> list[np.ndarray]:
@@ -175,18 +191,24 @@ def _by_vhacd(vertices: np.ndarray, faces: np.ndarray, max_pieces: int) -> list[
     return [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=max_hulls)]
 
 
-def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:
+def _by_coacd(vertices: np.ndarray, faces: np.ndarray, cut: _Cut) -> list[np.ndarray]:
     """Vertices of the pieces of a mesh, cut by CoACD."""
-    if not closed:
-        return _body_by_coacd(vertices, faces, closed=False)
+    if not cut.volume:
+        # An open surface becomes a thin wall; a finer cut would divide it into hundreds of pieces.
+        return _body_by_coacd(vertices, faces, 1.5 * cut.depth, closed=False)
+    whole = manifold(vertices, faces)
+    if whole is not None:
+        vertices, faces = whole
     # Bodies that intersect would be cut forever.
     pieces: list[np.ndarray] = []
     for body_vertices, body_faces in bodies(vertices, faces):
-        pieces += _body_by_coacd(body_vertices, body_faces, closed=True)
+        pieces += _body_by_coacd(body_vertices, body_faces, cut.depth, closed=True)
     return pieces
 
 
-def _body_by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:
+def _body_by_coacd(
+    vertices: np.ndarray, faces: np.ndarray, depth: float, *, closed: bool
+) -> list[np.ndarray]:
     """Vertices of the pieces of one body."""
     import coacd
 
@@ -196,8 +218,6 @@ def _body_by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> 
         if _is_convex(hull, triangles, enclosed(triangles).volume):
             return [corners_of(hull)]
     size = np.ptp(vertices, axis=0).max()
-    # An open surface becomes a thin wall, which a finer cut would divide into hundreds of pieces.
-    depth = 2 * DEPTH if closed else 3 * DEPTH
     is_manifold = closed and is_watertight(faces_to_edges(faces))[0]
     pieces = coacd.run_coacd(
         coacd.Mesh(vertices, faces),

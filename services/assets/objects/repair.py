@@ -133,7 +133,7 @@ def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     is_single = net_forward != 0
     with_sheets = trimesh.Trimesh(mesh.vertices, faces[np.sort(used)], process=False)
     without_sheets = trimesh.Trimesh(mesh.vertices, faces[np.sort(used[is_single])], process=False)
-    is_closed = is_single.any() and without_sheets.is_watertight
+    is_closed = is_single.any() and encloses(without_sheets)
     best = without_sheets if is_closed else with_sheets
     notes.append(f"{len(faces) - len(best.faces)} of its triangles were repeated and were left out")
     return best
