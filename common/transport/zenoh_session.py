@@ -47,6 +47,10 @@ _OVERHEAD_BYTES = 64 << 10  # of Zenoh for a message
 _ATTEMPT_S = 1.0  # of one attempt to connect; signals are handled between two
 _CLOSE_TIMEOUT_S = 2.0
 """Time for closing; with thousands of tokens on a busy machine it takes more than a second."""
+_EXIT_TIMEOUT_S = 12.0
+"""Longest wait of the interpreter's exit for sessions that still close. A connection without a
+handshake delays a listener's closing by 5 s (`_ACCEPT_TIMEOUT_MS`); after 10 s Zenoh gives up.
+"""
 _REOPEN_TIMEOUT_S = 10.0
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
 """Microseconds that a reply waits for room in its reader's link; then replies are dropped until
@@ -252,7 +256,7 @@ def _check_host(endpoint: str) -> None:
 
 def first_line(error: Exception) -> str:
     """First line of a Zenoh error, without positions in its source."""
-    return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
+    return re.split(r" at /|\n", str(error))[0][:200].rstrip(".! ")
 
 
 class _Declaration:
@@ -341,7 +345,7 @@ class Sessions:
             sessions = list(self._open.values())
             self._open.clear()
             for session in sessions:
-                session.close()
+                close_session(session)
             join(self._threads, time.monotonic() + _REOPEN_TIMEOUT_S)
             for name, opener in self._openers.items():
                 if not self.closed.is_set():
@@ -379,8 +383,8 @@ class Sessions:
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Closes the sessions, and waits briefly for the threads; a fork leaves them to the process
-        that opened them.
+        """Closes the sessions, and waits briefly for the threads; the interpreter's exit waits for
+        late ones. A fork leaves the sessions to the process that opened them.
         """
         if self._opened != forks.generation():
             return
@@ -392,12 +396,27 @@ class Sessions:
         self._open.clear()
         for session in sessions:
             try:
-                self.start(session.close)
+                self.start(close_session, session)
             except RuntimeError:  # the interpreter is shutting down and starts no threads
-                session.close()
+                close_session(session)
+        if not self.wait_for_threads(deadline):
+            _note_closing(self)
+
+    def wait_for_threads(self, deadline: float) -> bool:
+        """Waits until no thread is inside Zenoh once the sessions are closed.
+
+        Args:
+          deadline: longest wait, by `time.monotonic`.
+
+        Returns:
+          False if a thread is still inside.
+        """
         join(self._threads, deadline)
+        if any(thread.is_alive() for thread in self._threads):
+            return False
         with self._changed:
-            self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
+            rest = max(0.0, deadline - time.monotonic())
+            return self._changed.wait_for(lambda: not self._inside, rest)
 
     def watch_revocations(
         self, credentials: Credentials, period: float, revoked: frozenset[str] | None
@@ -448,10 +467,44 @@ class Sessions:
             self.start(work, declaration.entity.handler)
 
 
+def close_session(session: zenoh.Session) -> None:
+    """Closes a session; one whose peers do not react stays open until the process ends."""
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        _log.info("A session is not closed: %s.", first_line(error))
+
+
+_closing: list[Sessions] = []
+"""Sessions whose closing takes longer than their transport waited."""
+
+
+def _note_closing(late: Sessions) -> None:
+    """Adds sessions to those that still close, and removes those that have closed since."""
+    now = time.monotonic()
+    still_closing = [sessions for sessions in _closing if not sessions.wait_for_threads(now)]
+    _closing[:] = [*still_closing, late]
+
+
+def _wait_for_closing() -> None:
+    """Waits for sessions that still close; runs in the interpreter's exit.
+
+    A thread that returns from Zenoh while the interpreter shuts down aborts the process.
+    """
+    deadline = time.monotonic() + _EXIT_TIMEOUT_S
+    for sessions in list(_closing):
+        sessions.wait_for_threads(deadline)
+
+
+# Finalizers run in the reverse order of their creation: this one after those of all transports.
+weakref.finalize(Sessions, _wait_for_closing)
+
+
 def _abandon_all() -> None:
     """Abandons all sessions; runs in forks."""
     for sessions in list(_all_sessions):
         sessions.abandon()
+    _closing.clear()
 
 
 os.register_at_fork(after_in_child=_abandon_all)

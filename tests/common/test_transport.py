@@ -384,11 +384,12 @@ def test_peer_that_comes_back_is_found_again():
 
 
 BUSY_PROCESS = """
-    import contextlib, sys, threading, time
+    import contextlib, socket, sys, threading, time
     from congrasp.common.transport.keys import Keys
     from congrasp.common.transport.zenoh_transport import ZenohTransport
     from congrasp.common.wire.codec import Message
     keys = Keys("test")
+    address = "127.0.0.1", int(sys.argv[1].rpartition(":")[2])
     server = ZenohTransport(listen=[sys.argv[1]])
     client = ZenohTransport(connect=[sys.argv[1]])
     server.serve(keys.act, lambda key, message: message, workers=2)
@@ -408,12 +409,22 @@ BUSY_PROCESS = """
 """
 
 
+SILENT_CONNECTION = (
+    "silent = socket.create_connection(address); "
+    "later = ZenohTransport(connect=[sys.argv[1]]); "
+    "sys.slow = type('Slow', (), {'__del__': lambda slow, sleep=time.sleep: sleep(4)})(); "
+    "sys.exit(3)"
+)
+"""Delays the closing of the listener; it returns while the interpreter shuts down slowly."""
+
+
 @pytest.mark.parametrize(
     ("end", "code"),
     [
         ("pass", 0),
         ("raise RuntimeError('unhandled')", 1),
         ("server.close(); client.close(); server.close()", 0),
+        (SILENT_CONNECTION, 3),
         ("time.sleep(60)", -signal.SIGTERM),
     ],
 )
@@ -428,7 +439,7 @@ def test_process_always_ends(end, code):
         assert process.stdout.readline() == b"ready\n"
         if code < 0:
             process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == code
+        assert process.wait(30) == code
     finally:
         process.kill()
         process.communicate()

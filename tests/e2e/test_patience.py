@@ -77,16 +77,19 @@ def test_twenty_half_open_actors_are_replaced_under_their_name(cluster):
 
 
 @pytest.mark.slow
-def test_an_actor_cut_off_for_over_a_minute_comes_back(cluster):
+@pytest.mark.parametrize("isolated", ["a", "ab"])
+def test_actors_cut_off_for_over_a_minute_come_back(cluster, isolated):
+    """One of two, or the learner from both."""
     learner = cluster.start_learner()
     with cuttable(cluster.endpoint) as link:
-        cluster.start_actor("a", endpoint=link.endpoint)
-        cluster.start_actor("b")
+        for name in "ab":
+            endpoint = link.endpoint if name in isolated else cluster.endpoint
+            cluster.start_actor(name, endpoint=endpoint)
         before = cluster.wait(
             lambda status: len(rollouts(status)) == 2 and all(rollouts(status).values())
         )
         link.cut()
-        cluster.wait(lambda status: len(rollouts(status)) == 1)
+        cluster.wait(lambda status: len(rollouts(status)) == 2 - len(isolated))
         time.sleep(PARTITION_SECONDS)
         link.heal()
         back = cluster.wait(lambda status: len(rollouts(status)) == 2)
