@@ -5,10 +5,10 @@ It holds `config.json`, its checksum `config.sha256`, `launch.json` (`services.t
 `checkpoints/`, `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome
 of every rollout), `accepted/` (rollouts that no checkpoint holds yet), `version` (the newest
 version ever published, so that versions increase across a crash), `endpoint` (address of its
-learner, while it runs), `lock` (held by the process of its learner), `claim` (in its place on a
-file system without locks) and, after an update that was
-not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed
-to `*.aside`.
+learner, while it runs), `lock` (held by the process of its learner), `launch.lock` (held by the
+`congrasp train` that starts its processes), `claim` and `launch.claim` (in their place on a file
+system without locks) and, after an update that was not finite, `failure/`. Files that a resume
+could not read, or does not continue from, are renamed to `*.aside`.
 """
 
 import codecs
@@ -19,7 +19,7 @@ import os
 import pathlib
 import shlex
 from collections.abc import Callable, Iterator
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from congrasp.common import named_inputs
 from congrasp.common.config import NamedInput, RunConfig, run_config_from_json, to_json
@@ -43,8 +43,6 @@ LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _ENDPOINT_FILE = "endpoint"
-_LOCK_FILE = "lock"
-_CLAIM_FILE = "claim"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG_BYTES = 1 << 20
 _MAX_LINE_BYTES = 1 << 10
@@ -59,6 +57,17 @@ CHANGEABLE = (
     "distill",
 )
 """Fields of the configuration that a resumed run may change; running actors do not use them."""
+
+
+class _LockFiles(NamedTuple):
+    """Names of a lock and of the claim that replaces it on a file system without locks."""
+
+    lock: str
+    claim: str
+
+
+_LEARNER_LOCK = _LockFiles("lock", "claim")
+_LAUNCH_LOCK = _LockFiles("launch.lock", "launch.claim")
 
 
 def create_run(
@@ -178,13 +187,16 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
 
 @contextlib.contextmanager
 def exclusive(
-    run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None
+    run_dir: pathlib.Path,
+    notify: Callable[[str], None] = lambda text: None,
+    files: _LockFiles = _LEARNER_LOCK,
 ) -> Iterator[Callable[[], None]]:
-    """Context that locks a run directory; the lock ends with the process.
+    """Context that locks a run directory for its learner; the lock ends with the process.
 
     Args:
       run_dir: directory of the run.
       notify: called if the file system has no locks; a claim (`common.io.claims`) replaces them.
+      files: names of the lock's files.
 
     Yields:
       A function that locks the directory again if the lock's file was removed; it raises a
@@ -193,13 +205,13 @@ def exclusive(
     Raises:
       CongraspError: another process holds the lock.
     """
-    path = run_dir / _LOCK_FILE
+    path = run_dir / files.lock
     with contextlib.ExitStack() as stack:
         try:
-            held = stack.enter_context(_locked(run_dir))
+            held = stack.enter_context(_locked(path))
         except NoLocksError:
-            notify(f"{run_dir} is on a file system without locks: {_CLAIM_FILE} stands in for one.")
-            claim = Claim(run_dir / _CLAIM_FILE)
+            notify(f"{run_dir} is on a file system without locks: {files.claim} stands in for one.")
+            claim = Claim(run_dir / files.claim)
             stack.callback(claim.close)
             yield claim.check
             return
@@ -211,20 +223,30 @@ def exclusive(
             except FileNotFoundError:
                 intact = False
             if not intact:
-                held = stack.enter_context(_locked(run_dir))
+                held = stack.enter_context(_locked(path))
 
         yield check
 
 
-def _locked(run_dir: pathlib.Path) -> BinaryIO:
+@contextlib.contextmanager
+def supervised(
+    run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None
+) -> Iterator[None]:
+    """Context that reserves a run directory for the process that starts and restarts its learner,
+    also while that does not run; raises like `exclusive`, whose arguments it has.
+    """
+    with exclusive(run_dir, notify, _LAUNCH_LOCK):
+        yield
+
+
+def _locked(path: pathlib.Path) -> BinaryIO:
     """The locked file of a run directory, see `exclusive`; closing it unlocks the directory."""
-    path = run_dir / _LOCK_FILE
     with os_errors_as(f"{path} cannot be opened", "Choose another --run-dir."):
         file = open_to_update(path)
     with contextlib.ExitStack() as stack:
         stack.enter_context(file)
         if not try_lock(file):
-            raise _in_use(run_dir, file.read(32).decode(errors="replace"))
+            raise _in_use(path.parent, file.read(32).decode(errors="replace"))
         stack.pop_all()
     # A full disk only removes the number from another process's error.
     with contextlib.suppress(OSError):

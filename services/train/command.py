@@ -33,6 +33,8 @@ from congrasp.learner.run_directory import (
     create_run,
     has_checkpoints,
     initial_notes,
+    open_run,
+    supervised,
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
@@ -79,17 +81,21 @@ def run_training(
       The exit code.
 
     Raises:
-      CongraspError: the arguments contradict each other, the configuration cannot run, or a process
-        failed permanently.
+      CongraspError: the arguments contradict each other, the configuration cannot run, another
+        process trains in the folder, or a process failed permanently.
     """
     imported()
     if run_dir is None:
         raise CongraspError("--resume needs the folder of a run.", _folders_to_resume())
     plan = launch.planned(config)
     before = Folder.of(run_dir)
-    config = _prepare(run_dir, config, initial, resume=resume)
     with contextlib.ExitStack() as stack:
+        if resume:
+            open_run(run_dir)
+            stack.enter_context(supervised(run_dir, _warn))
+        config = _prepare(run_dir, config, initial, resume=resume)
         if not resume:
+            stack.enter_context(supervised(run_dir, _warn))
             stack.enter_context(removed_without_checkpoint(before))
         stop = stack.enter_context(on_signal())
         _announce(config, run_dir, plan)

@@ -2,6 +2,9 @@
 
 import dataclasses
 import io
+import subprocess
+import sys
+import textwrap
 import types
 
 import pytest
@@ -15,7 +18,12 @@ from congrasp.learner.run_directory import create_run
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
 from congrasp.services.train.command import EPISODE, _next_steps, _Progress
-from congrasp.services.train.launch import Launch, LearnerOptions
+from congrasp.services.train.launch import (
+    Launch,
+    LaunchRecord,
+    LearnerOptions,
+    write_launch,
+)
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import ProcessDied
 
@@ -197,6 +205,33 @@ def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):
     create_run(tmp_path / "runs" / "mine", CONFIG)
     with pytest.raises(CongraspError, match=r"--resume needs .*runs/mine"):
         command.run_training(CONFIG, None, LAUNCH, resume=True, evaluation=0)
+
+
+SUPERVISOR = """
+    import pathlib, sys
+    from congrasp.learner.run_directory import supervised
+    with supervised(pathlib.Path(sys.argv[1])):
+        print("locked", flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_a_resume_while_a_learner_restarts_is_refused(said, monkeypatch, tmp_path):
+    """Between the learner's death and its restart nothing but its supervisor holds a lock."""
+    create_run(tmp_path, CONFIG)
+    write_launch(tmp_path, LaunchRecord.of_plan(LAUNCH.planned(CONFIG), CONFIG.name))
+    before = {path.name: path.read_bytes() for path in tmp_path.glob("*.json")}
+    changed = dataclasses.replace(CONFIG, updates=20)
+    program = [sys.executable, "-c", textwrap.dedent(SUPERVISOR), tmp_path]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(program, **pipes) as other:
+        assert other.stdout.readline() == b"locked\n"
+        with pytest.raises(CongraspError, match=f"in use by process {other.pid}"):
+            command.run_training(changed, tmp_path, LAUNCH, resume=True, evaluation=0)
+        other.stdin.close()
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("*.json")} == before
+    with pytest.raises(CongraspError, match="no checkpoint"):
+        command.run_training(changed, tmp_path, LAUNCH, resume=True, evaluation=0)
 
 
 def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):
