@@ -16,6 +16,8 @@ from typing import Generic, NamedTuple, TypeVar
 from congrasp.common.transport.senders import Peer
 
 T = TypeVar("T")
+_MAX_IDLE_NAMES = 256
+"""Limit of the names without an item in a rotation: peers invent names for free."""
 
 
 class _Entry(NamedTuple, Generic[T]):
@@ -31,7 +33,8 @@ class _Turns:
 
     A name is a newcomer until its first turn ends, and then joins the rotation. There it stays
     until its turn comes and it has no item: a name that returns earlier is not a newcomer again, so
-    that a name whose items arrive faster than its turns come never precedes the others.
+    that a name whose items arrive faster than its turns come never precedes the others. A rotation
+    longer than `_MAX_IDLE_NAMES` drops such names earlier.
     """
 
     def __init__(self) -> None:
@@ -68,6 +71,15 @@ class _Turns:
                     del self._rotation[other]
             self._rotation.pop(name, None)
         self._rotation[name] = None
+        self._forget_idle(has_items)
+
+    def _forget_idle(self, has_items: Callable[[str], bool]) -> None:
+        """Removes the first name without an item from a rotation that is too long."""
+        if len(self._rotation) <= _MAX_IDLE_NAMES:
+            return
+        idle = next((name for name in self._rotation if not has_items(name)), None)
+        if idle is not None:
+            del self._rotation[idle]
 
     def leave(self, name: str) -> None:
         """Removes a name that lost its items without a turn; it stays in the rotation."""

@@ -2,10 +2,12 @@
 
 A query does not show the connection that it arrived on. The clients of this project therefore add
 the identifier of their session, which is random and which no other client learns; the listener
-looks up the address of its connection. Clients that do not add it share one account.
+looks up the address of its connection. Clients that do not add it, or invent one, share one
+account; in it, their names share a fixed number of peers, since names are free.
 """
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +17,12 @@ from congrasp.common.transport.keys import account
 from congrasp.common.transport.senders import Peer
 
 _UNKNOWN = "unknown address"
+_UNKNOWN_PEERS = 64
+"""Number of peers to which the names of unknown senders are assigned at random."""
+_LISTINGS_PER_S = 100.0
+"""Limit of the listings of connections, which every invented identifier would cause; as many may
+follow one another at once.
+"""
 
 
 class Sources:
@@ -52,6 +60,8 @@ class Senders:
         self._has_certificates = has_certificates
         self._addresses: dict[str, str] = {}
         self._lock = threading.Lock()
+        self._listings_left = _LISTINGS_PER_S
+        self._listed_at = time.monotonic()
 
     def of_query(self, query: Any, key: str) -> Peer:
         """Returns the sender of a query."""
@@ -59,27 +69,41 @@ class Senders:
             return Peer(account(key), key)
         source = query.source_info
         if source is None:
-            return Peer(_UNKNOWN, key)
+            return _unknown(key)
         connection = str(source.source_id.zid)
         address = self._address_of(connection)
         if address is None:
-            return Peer(_UNKNOWN, key)
+            return _unknown(key)
         return Peer(address, connection)
 
     def _address_of(self, connection: str) -> str | None:
-        """Address of a connection; None if there is no such connection."""
-        with self._lock:
-            address = self._addresses.get(connection)
-            if address is None:
-                self._list()
-                address = self._addresses.get(connection)
+        """Address of a connection; None if there is no such connection, or it is a new one and too
+        many identifiers without a connection came before.
+        """
+        address = self._addresses.get(connection)
+        if address is not None:
             return address
+        with self._lock:
+            self._list()
+            return self._addresses.get(connection)
 
     def _list(self) -> None:
-        """Lists the current connections."""
+        """Lists the current connections, within the limit of `_LISTINGS_PER_S`."""
+        now = time.monotonic()
+        regained = (now - self._listed_at) * _LISTINGS_PER_S
+        self._listings_left = min(_LISTINGS_PER_S, self._listings_left + regained)
+        self._listed_at = now
+        if self._listings_left < 1.0:
+            return
+        self._listings_left -= 1.0
         session = self._session()
         links = session.info.links() if session else []
         self._addresses = {str(link.zid): host(link.dst) for link in links}
+
+
+def _unknown(key: str) -> Peer:
+    """Returns the peer of a query whose connection is unknown, by the random hash of its key."""
+    return Peer(_UNKNOWN, str(hash(key) % _UNKNOWN_PEERS))
 
 
 def host(locator: str) -> str:

@@ -9,6 +9,7 @@ Zenoh closes a connection in the thread that waits for the data of all of them, 
 until the peer has acknowledged it (zenoh #1101). A listener therefore has many such threads.
 """
 
+import collections
 import contextlib
 import functools
 import json
@@ -88,6 +89,8 @@ left.
 """
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""
+_MAX_KEYS = 4096
+"""Keys of a subscription whose last sample is known."""
 _log = logging.getLogger(__name__)
 
 
@@ -567,19 +570,38 @@ def received(channel: Any) -> Iterator[Any]:
             yield channel.recv()
 
 
+class LostSamples:
+    """Numbers of lost samples, by the stamps of the received ones.
+
+    Keys are names that publishers invent for free: those from which nothing came for longest are
+    forgotten.
+    """
+
+    def __init__(self) -> None:
+        self._last: collections.OrderedDict[str, tuple[bytes, int]] = collections.OrderedDict()
+
+    def before(self, key: str, stamp: bytes) -> int:
+        """Returns the number of samples lost between the last one of a key and this one."""
+        if len(stamp) != STAMP.size:
+            return 0
+        sender, count = STAMP.unpack(stamp)
+        last_sender, last_count = self._last.get(key, (sender, count - 1))
+        self._last[key] = sender, count
+        self._last.move_to_end(key)
+        if len(self._last) > _MAX_KEYS:
+            self._last.popitem(last=False)
+        if sender != last_sender:
+            return 0
+        return int(max(0, count - last_count - 1))
+
+
 def listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
     """Moves samples to a subscription, with the number of lost ones before each."""
-    last: dict[str, tuple[bytes, int]] = {}
+    lost_samples = LostSamples()
     for sample in received(samples):
         key = str(sample.key_expr)
-        lost = 0
         stamp = sample.attachment.to_bytes() if sample.attachment else b""
-        if len(stamp) == STAMP.size:
-            sender, count = STAMP.unpack(stamp)
-            last_sender, last_count = last.get(key, (sender, count - 1))
-            if sender == last_sender:
-                lost = max(0, count - last_count - 1)
-            last[key] = (sender, count)
+        lost = lost_samples.before(key, stamp)
         subscription.push(key, functools.partial(_decoded, sample.payload, max_message), lost)
 
 

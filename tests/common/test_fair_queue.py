@@ -1,6 +1,7 @@
 """The order and the limits of a queue that clients share."""
 
 import collections
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -48,6 +49,28 @@ def test_admission(queued, newcomer, admitted, evicted):
     assert queue.has_room(peer(newcomer)) == admitted
     if admitted:
         assert queue.add(newcomer, peer(newcomer)) == evicted
+
+
+def served_names(queue, numbers):
+    """Bytes that a queue holds after it has served names that send one item each; one waits."""
+    for number in numbers:
+        queue.add(number, Peer("a", f"name {number}"))
+        if len(queue) > 1:
+            served = queue.in_turn()[0]
+            queue.end_turn(served)
+            queue.pop(served)
+    return tracemalloc.get_traced_memory()[0]
+
+
+def test_invented_names_fill_no_memory():
+    queue = FairQueue(4, 4)
+    tracemalloc.start()
+    try:
+        before = served_names(queue, range(1000))
+        after = served_names(queue, range(1000, 6000))
+    finally:
+        tracemalloc.stop()
+    assert after - before < 50_000
 
 
 def test_evicted_item_is_the_newest():

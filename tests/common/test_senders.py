@@ -1,14 +1,15 @@
 """The client that a query counts for, over real connections."""
 
 import contextlib
+import types
 
 import pytest
 
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import free_port
-from congrasp.common.transport.senders import sender
+from congrasp.common.transport.senders import Peer, sender
 from congrasp.common.transport.urls import find_credentials, name_on_wire
-from congrasp.common.transport.zenoh_senders import Sources
+from congrasp.common.transport.zenoh_senders import Senders, Sources
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.certificates import create_authority, issue
@@ -76,6 +77,37 @@ def test_foreign_clients_are_one_account(listening):
                 query = encode(Message())
                 list(session.get(KEYS.act_for(name), payload=query, timeout=5.0))
     assert len(senders) == 2 and senders[0].account == senders[1].account
+
+
+class Connections:
+    """Session of a listener with one connection, which counts its listings."""
+
+    def __init__(self):
+        self.info = self
+        self.listings = 0
+
+    def links(self):
+        self.listings += 1
+        return [types.SimpleNamespace(zid="real", dst="tcp/10.0.0.7:50000")]
+
+
+def query_of(source):
+    """A query of a source."""
+    identity = types.SimpleNamespace(zid=source)
+    return types.SimpleNamespace(source_info=types.SimpleNamespace(source_id=identity))
+
+
+def test_invented_sources_are_few_peers_and_listings():
+    connections = Connections()
+    senders = Senders(lambda: connections, has_certificates=False)
+    invented = set()
+    for number in range(5000):
+        key = KEYS.act_for(f"name-{number}")
+        invented.add(senders.of_query(query_of(f"invented {number}"), key))
+        real = senders.of_query(query_of("real"), KEYS.act)
+        assert real == Peer("10.0.0.7", "real")
+    assert len(invented) <= 64 and len({peer.account for peer in invented}) == 1
+    assert connections.listings < 2500
 
 
 def test_names_of_a_certificate_are_one_account(listening, tmp_path):

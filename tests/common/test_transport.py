@@ -21,6 +21,7 @@ from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_session import STAMP, LostSamples
 from congrasp.common.transport.zenoh_transport import MessageLimits, ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from tests.socket_transport import SocketListener, SocketTransport
@@ -239,6 +240,23 @@ def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
     assert {key for key, _ in received} == {KEYS.log("event", "learner", "0")}
     assert subscription.receive(0.05) is None
     assert subscription.dropped - dropped == 6
+
+
+def test_lost_samples_are_those_between_two_counts_of_a_publisher():
+    lost_samples = LostSamples()
+    stamps = [(b"sender-a", 5), (b"sender-a", 6), (b"sender-a", 9), (b"sender-b", 30)]
+    lost = [lost_samples.before("key", STAMP.pack(*stamp)) for stamp in stamps]
+    assert lost == [0, 0, 2, 0]
+    assert lost_samples.before("key", b"") == 0
+
+
+def test_invented_keys_are_forgotten():
+    lost_samples = LostSamples()
+    for number in range(5000):
+        lost_samples.before(f"key {number}", STAMP.pack(b"sender-a", 0))
+    gap = STAMP.pack(b"sender-a", 5)
+    assert lost_samples.before("key 4999", gap) == 4
+    assert lost_samples.before("key 0", gap) == 0
 
 
 def test_closed_subscription_lets_its_reader_go(pair):
