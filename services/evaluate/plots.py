@@ -18,7 +18,15 @@ from congrasp.services.evaluate.scores import ERRORS, Row
 from congrasp.services.evaluate.text_table import Table, percent
 from congrasp.services.evaluate.variations import NOISE
 from congrasp.services.record.palette import INK
-from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, panel_grid, save, style
+from congrasp.services.viz.plots import (
+    COLOURS,
+    QUIET,
+    default_style,
+    new_figure,
+    panel_grid,
+    save,
+    style,
+)
 
 _TITLES = {
     spec.column or spec.name: (f"{constraint.title.capitalize()} error", spec.unit or "share")
@@ -38,6 +46,7 @@ _PLOTTED_UNITS = {"rad": (1.0, "rad"), "m": (10.0, "dm")}
 _MAX_FILE_BYTES = 64 << 20
 
 
+@default_style()
 def plot_evaluation(
     path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]
 ) -> list[pathlib.Path]:
@@ -89,6 +98,7 @@ def compared(rows: Sequence[Row]) -> Table:
     return Table.of("Evaluation and paper", rows, columns)
 
 
+@default_style()
 def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
     """Draws success and errors against the noise, a panel for each kind, as PNG.
 

@@ -1,9 +1,10 @@
 """Figures of a run from its recordings: learning curves, reward terms, episodes, and details."""
 
+import contextlib
 import dataclasses
 import io
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,6 +84,18 @@ LEARNING = (
 """Panels of the first figure; those without data are left out."""
 
 
+@contextlib.contextmanager
+def default_style() -> Iterator[None]:
+    """Context or decorator of drawing: Matplotlib's own defaults replace the user's settings, such
+    as a `matplotlibrc` that requires LaTeX.
+    """
+    import matplotlib.style
+
+    with matplotlib.style.context("default", after_reset=True):
+        yield
+
+
+@default_style()
 def plot_runs(
     paths: Sequence[pathlib.Path], out: pathlib.Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[pathlib.Path]:
@@ -130,6 +143,7 @@ def save(figure: Any, stem: pathlib.Path, formats: Sequence[str]) -> list[pathli
     return files
 
 
+@default_style()
 def encoded(figure: Any, kind: str = "png") -> bytes:
     """A figure as the content of a file."""
     buffer = io.BytesIO()
@@ -228,6 +242,7 @@ def _constants(runs: Runs) -> set[str]:
     return constants
 
 
+@default_style()
 def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
     """Draws one figure of small multiples."""
     figure, grid = panel_grid(len(panels), _PANEL_HEIGHT_IN, title)

@@ -20,6 +20,7 @@ from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.record.writer import JsonChannels, LogWriter, nest
 from congrasp.services.viz.metric_titles import titled
 from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
+from tests.children import python
 from tests.rows import summarised
 
 METRICS = {
@@ -47,6 +48,18 @@ def record(directory: pathlib.Path, updates: int = 30) -> None:
             )
         )
     writer.close()
+
+
+def test_settings_of_matplotlib_change_no_figure(tmp_path: pathlib.Path) -> None:
+    record(tmp_path / "run")
+    expected = plot_runs([tmp_path / "run"], tmp_path / "expected", ["png"])
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfont.size: 40\n")
+    leftovers = {"MPLBACKEND": "module://absent", "MATPLOTLIBRC": str(tmp_path)}
+    words = ("plot", tmp_path / "run", "--out", tmp_path / "drawn", "--formats", "png")
+    done = python("-m", "congrasp", *words, env=leftovers)
+    assert done.returncode == 0, done.stderr
+    for file in expected:
+        assert (tmp_path / "drawn" / file.name).read_bytes() == file.read_bytes()
 
 
 def test_every_metric_is_in_exactly_one_panel() -> None:
