@@ -4,6 +4,7 @@ import contextlib
 import http.client
 import http.server
 import io
+import itertools
 import json
 import pathlib
 import re
@@ -194,6 +195,19 @@ def test_browser_of_another_address_is_served_when_full() -> None:
         assert crowd[-1].recv(1) == b""
         crowd[0].sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert crowd[0].recv(1 << 12).startswith(b"HTTP/1.1 200 ")
+
+
+def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bytes come too often for the limit of silence."""
+    monkeypatch.setattr(server_module, "_TIMEOUT_S", 0.5)
+    with (
+        contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
+        socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as slow,
+        pytest.raises((BrokenPipeError, ConnectionResetError)),
+    ):
+        for byte in itertools.chain(b"GET / HTTP/1.1\r\nHost: ", itertools.repeat(65, 1000)):
+            slow.sendall(bytes([byte]))
+            time.sleep(0.02)
 
 
 def test_other_sites_are_rejected(page: Page) -> None:
