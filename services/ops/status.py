@@ -29,8 +29,9 @@ _SUMS = {
     "accepted": ("consumed", "dropped", "queued"),
 }
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
-_TEXT_COLUMNS = ("role", "name", "incarnation")
-_NUMBER_COLUMNS = ("version", "lag", "rollouts", "rollouts/s", "steps/s")
+_TEXT_COLUMNS = ("role", "name", "incar-\nnation")
+_NUMBER_COLUMNS = ("version", "lag", "rollouts", "rollouts\nper s", "steps\nper s")
+"""Titles of at most eight characters a line: all columns fit into 80."""
 _MAX_ROWS = 100
 """Most processes in a table."""
 _RUN = "quickstart"
@@ -106,7 +107,7 @@ def _roles_table(status: Mapping[str, Any]) -> Table:
         title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}"
     )
     for column in _TEXT_COLUMNS:
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for column in _NUMBER_COLUMNS:
         table.add_column(column, justify="right")
     some_refused = any(role.get("refused") for role in status["roles"])
@@ -130,8 +131,8 @@ def _role_numbers(role: Mapping[str, Any], learner_version: int) -> list[str]:
     """Cells of a process's version, lag, rollouts and rates; empty where it has none."""
     version = learner_version if role["role"] == "learner" else role.get("version", "")
     cells = [str(version), str(role.get("lag", "")), str(role.get("rollouts", ""))]
-    for rate in ("rollouts_per_second", "steps_per_second"):
-        cells.append(f"{role[rate]:.2f}" if rate in role else "")
+    for rate, decimals in (("rollouts_per_second", 2), ("steps_per_second", 0)):
+        cells.append(f"{role[rate]:.{decimals}f}" if rate in role else "")
     return cells
 
 

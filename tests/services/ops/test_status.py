@@ -121,6 +121,20 @@ def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
         Status(connect=endpoint, run="other")()
 
 
+def test_a_terminal_of_80_columns_shows_whole_names(endpoint):
+    """A long name continues in the next line of its cell."""
+    found = ask_with_tokens(endpoint, 70)
+    role = {**found["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
+    rates = {"version": 1234567, "rollouts": 12345678, "steps_per_second": 72900.5}
+    named = {**role, **rates, "rollouts_per_second": 24.355}
+    console = Console(file=io.StringIO(), width=80)
+    console.print(tables({**found, "roles": [named]}))
+    text = console.file.getvalue()
+    assert "…" not in text and "f45e4ae5" in text
+    cells = [line.split("│")[2].strip() for line in text.splitlines() if line.count("│") == 9]
+    assert "".join(cells) == "node-17.cluster-12345"
+
+
 def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):
     """600 liveliness tokens of one certificate, some with names that a terminal or a table would
     take for more.
