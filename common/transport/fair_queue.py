@@ -16,8 +16,8 @@ from typing import Generic, NamedTuple, TypeVar
 from congrasp.common.transport.senders import Peer
 
 T = TypeVar("T")
-_MAX_IDLE_NAMES = 256
-"""Limit of the names without an item in a rotation: peers invent names for free."""
+_LONG_ROTATION = 256
+"""Length above which a rotation drops names without an item: peers invent names for free."""
 
 
 class _Entry(NamedTuple, Generic[T]):
@@ -34,7 +34,7 @@ class _Turns:
     A name is a newcomer until its first turn ends, and then joins the rotation. There it stays
     until its turn comes and it has no item: a name that returns earlier is not a newcomer again, so
     that a name whose items arrive faster than its turns come never precedes the others. A rotation
-    longer than `_MAX_IDLE_NAMES` drops such names earlier.
+    longer than `_LONG_ROTATION` drops such names earlier.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class _Turns:
 
     def _forget_idle(self, has_items: Callable[[str], bool]) -> None:
         """Removes the first name without an item from a rotation that is too long."""
-        if len(self._rotation) <= _MAX_IDLE_NAMES:
+        if len(self._rotation) <= _LONG_ROTATION:
             return
         idle = next((name for name in self._rotation if not has_items(name)), None)
         if idle is not None:
