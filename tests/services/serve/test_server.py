@@ -274,6 +274,29 @@ def test_following_a_run_pulls_only_what_is_newer():
         assert pull(policy.version) is None
 
 
+def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
+    """Its policy stays until the learner answers again with a newer one."""
+    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
+    first = task.policy()
+    newer = dataclasses.replace(first, version=first.version + 1)
+    served_while_lost: list[int] = []
+
+    def pull(version):
+        if version < 0:
+            return first
+        if len(served_while_lost) < 20:
+            served_while_lost.append(version)
+            raise TransportError("No response.")
+        return newer if version == first.version else None
+
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", pull)
+        eventually(lambda: server.health()["version"] == newer.version)
+        assert served_while_lost == 20 * [first.version]
+        server.close()
+
+
 def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
     with MemoryTransport(MemoryHub()) as transport:
         with pytest.raises(CongraspError, match="cannot be read"):
