@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.client.ticker import Ticker
-    from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
+    from congrasp.services.export.motion import GraspMotion
+    from congrasp.services.export.motion_file import load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.interface import grasp
     from congrasp.services.grasp.motion import Grasp
@@ -78,7 +79,7 @@ _MODULES = {
     "Answer": "congrasp.services.client.policy",
     "Command": "congrasp.services.client.guard",
     "Grasp": "congrasp.services.grasp.motion",
-    "GraspMotion": "congrasp.services.export.motion_file",
+    "GraspMotion": "congrasp.services.export.motion",
     "GraspRequest": "congrasp.common.request",
     "Grasper": "congrasp.services.grasp.grasper",
     "Guard": "congrasp.services.client.guard",

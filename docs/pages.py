@@ -28,7 +28,7 @@ from congrasp.common.task.methods import METHODS
 from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.record.episode import ARM_ARRAYS
 from congrasp.services.train.students import CAMERAS, TRACKERS
 from congrasp.services.viz.metric_titles import TITLES

@@ -19,7 +19,7 @@ from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import arm_meshes, object_mesh, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 
 FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
 """World frame with the y axis up to one with the z axis up."""

@@ -17,7 +17,7 @@ from congrasp.services.arm.moved_arm import moved_arm
 from congrasp.services.arm.path_tracking import Path, Track, follow
 from congrasp.services.arm.robot import Pose, Robot, build_robot, default_mount
 from congrasp.services.export.frames import NOT_LINKS
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.record.episode import MovedArm
 
 _REMOVED_TABLE_M = -10.0  # height of a table that was removed

@@ -81,13 +81,9 @@ class ExportMotion:
 
     def __call__(self) -> int:
         """Writes the motions, and prints the number of their frames."""
-        from congrasp.services.export.motion_file import (
-            FORMATS,
-            at_rate,
-            default_name,
-            export_motions,
-            pick_motion,
-        )
+        from congrasp.services.export.episode_motion import pick_motion
+        from congrasp.services.export.formats import FORMATS, default_name, export_motions
+        from congrasp.services.export.motion import at_rate
 
         if not self.paths:
             raise CongraspError(

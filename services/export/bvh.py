@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import TO_Y_UP, bodies, facts, identifiers
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 
 _CM = 100.0
 _ORDER = "ZYX"

@@ -19,7 +19,7 @@ from congrasp.common.hands.flesh import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.common.rotations import continuous
-from congrasp.services.export.motion_file import GraspMotion, hand_arrays
+from congrasp.services.export.motion import GraspMotion, hand_arrays
 from congrasp.services.record import palette
 from congrasp.services.record.episode import Mesh
 from congrasp.services.record.palette import painted

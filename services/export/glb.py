@@ -26,7 +26,7 @@ from congrasp.services.export.frames import (
     skin_of_motion,
     unwrapped,
 )
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.record.episode import Mesh
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners

@@ -23,7 +23,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.skin import Skin
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.export.frames import facts, skin_of_motion
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.motion import GraspMotion, robot_joints
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.hand_shapes import skin_shape

@@ -26,7 +26,8 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from congrasp.services.export.frames import COLOURS, OBJECT, arm_meshes, bodies, facts
-from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
+from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.trajectory import joint_trajectory
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.record.palette import colours_at
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import capsules, link_origins, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.motion import GraspMotion, robot_joints
 from congrasp.services.record.episode import UNLIMITED, MovedArm
 
 _MASS, _INERTIA = "0.01", "1e-6"

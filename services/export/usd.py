@@ -28,7 +28,7 @@ from congrasp.services.export.frames import (
     skin_of_motion,
     unwrapped,
 )
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"

@@ -25,7 +25,7 @@ from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.client.left_policy import mirrored_request
-from congrasp.services.export.motion_file import motion_of_episode
+from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.motion import Grasp

@@ -7,7 +7,7 @@ import numpy as np
 
 from congrasp.actors.stress import ASSESSED
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.grasp.costs import errors_of
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.options import size_in_words
-from congrasp.services.export.motion_file import GraspMotion, load_motion
+from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.csv_paths import HUGE, read_csv
 from congrasp.services.grasp.target import Target, unit_vector
 from congrasp.services.grasp.wrist_paths import read_wrist_path

@@ -29,12 +29,9 @@ from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import (
-    FORMATS,
-    export_motions,
-    motion_of_episode,
-    save_motion,
-)
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.formats import FORMATS, export_motions
+from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.episode import active_blocks, active_constraints, markers
 from congrasp.services.record.palette import painted

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand, Joint, Solid, Vector, vector
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion import GraspMotion
 
 Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.export.motion_file import GraspMotion, load_motion
+from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.files import MOTION
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 

@@ -21,12 +21,9 @@ from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses
 from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import trials
-from congrasp.services.export.motion_file import (
-    GraspMotion,
-    hand_arrays,
-    motion_of_episode,
-    save_motion,
-)
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion import GraspMotion, hand_arrays
+from congrasp.services.export.motion_file import save_motion
 from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
 from tests.benchmarks.dexgraspbench_grasps import (
     STATES,

@@ -22,8 +22,9 @@ from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
+from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.frames import skin_of_motion
-from congrasp.services.export.motion_file import hand_arrays, motion_of_episode
+from congrasp.services.export.motion import hand_arrays
 from congrasp.services.viz.hand_shapes import posed_hand
 from tests.episodes import episode
 

@@ -43,7 +43,8 @@ from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.task_ranges import Ranges
 from congrasp.services.assets.objects.mesh_files import read_mesh
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp.bvh import read_bvh
 from congrasp.services.grasp.wrist_paths import read_wrist_path
 from congrasp.services.record.reader import read_episodes, read_metrics

@@ -20,7 +20,8 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message, decode, encode
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp import bvh, wrist_paths
 from congrasp.services.record.reader import (
     metrics_of,

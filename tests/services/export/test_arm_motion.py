@@ -23,17 +23,11 @@ from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.arm.description import load_arm
 from congrasp.services.arm.moved_arm import moved_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount
-from congrasp.services.export import frames, motion_file, urdf
+from congrasp.services.export import formats, frames, urdf
+from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.lerobot import camera_for, pictures
-from congrasp.services.export.motion_file import (
-    GraspMotion,
-    at_rate,
-    hand_arrays,
-    load_motion,
-    motion_of_episode,
-    robot_joints,
-    save_motion,
-)
+from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays, robot_joints
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.record.scene import check_episode, episode_entries
 from congrasp.services.record.writer import JsonChannels
 from tests.episodes import episode
@@ -127,16 +121,13 @@ WRITTEN = ("glb", "usd", "lerobot")
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN))
-        for kind in motion_file.FORMATS
-    ],
+    [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in formats.FORMATS],
 )
 def test_every_reader_finds_the_arm_where_it_was(
     motion: GraspMotion, kind: str, tmp_path: pathlib.Path
 ) -> None:
-    path = tmp_path / f"motion{motion_file.FORMATS[kind]}"
-    motion_file.export_motions([motion], kind, path)
+    path = tmp_path / f"motion{formats.FORMATS[kind]}"
+    formats.export_motions([motion], kind, path)
     (track,) = READERS[kind](path)
     assert "arm_palm" in track.poses and error_mm(motion, track) < 0.01
 
@@ -192,7 +183,7 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(
         },
     )
     path = tmp_path / "data"
-    motion_file.export_motions([motion, other], "lerobot", path)
+    formats.export_motions([motion, other], "lerobot", path)
     for one, track in zip([motion, other], READERS["lerobot"](path), strict=True):
         assert error_mm(one, track) < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
@@ -219,7 +210,7 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(
     np.testing.assert_allclose(np.array(rows["action"].to_pylist())[:, :4], following, atol=1e-6)
     assert [file.name for file in (path / "meta").glob("*.urdf")] == ["robot.urdf"]
     with pytest.raises(CongraspError, match="one robot"):
-        motion_file.export_motions(
+        formats.export_motions(
             [motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed"
         )
 
@@ -228,7 +219,7 @@ def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pa
     arm = motion.arm
     assert arm is not None
     for kind in ("glb", "usd"):
-        motion_file.export_motions([motion], kind, tmp_path / f"motion{motion_file.FORMATS[kind]}")
+        formats.export_motions([motion], kind, tmp_path / f"motion{formats.FORMATS[kind]}")
     scene = trimesh.load_scene(tmp_path / "motion.glb")
     seen = {name: scene.graph.get(name)[0] for name in ("odd_base", "sledge", "arm_palm")}
     for i, pose in enumerate(seen.values()):

@@ -23,17 +23,12 @@ from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.spec import Colours
 from congrasp.common.rotations import continuous
 from congrasp.services.cli.main import main
-from congrasp.services.export import frames, motion_file
+from congrasp.services.export import formats, frames
+from congrasp.services.export.episode_motion import motion_of_episode, pick_motion
 from congrasp.services.export.frames import COLOURS, unwrapped
 from congrasp.services.export.lerobot import camera_for, pictures
-from congrasp.services.export.motion_file import (
-    GraspMotion,
-    at_rate,
-    hand_arrays,
-    load_motion,
-    motion_of_episode,
-    save_motion,
-)
+from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
@@ -132,12 +127,12 @@ def odd_hand(human: GraspMotion) -> GraspMotion:
 
 
 def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> pathlib.Path:
-    path = folder / f"motion{motion_file.FORMATS[kind]}"
-    motion_file.export_motions(motions, kind, path)
+    path = folder / f"motion{formats.FORMATS[kind]}"
+    formats.export_motions(motions, kind, path)
     return path
 
 
-@pytest.mark.parametrize("kind", motion_file.FORMATS)
+@pytest.mark.parametrize("kind", formats.FORMATS)
 @pytest.mark.parametrize(
     "which",
     ["odd_hand", *(pytest.param(one, marks=pytest.mark.slow) for one in ("human", "robot"))],
@@ -187,7 +182,7 @@ def beginning(motion: GraspMotion, count: int) -> GraspMotion:
     return dataclasses.replace(motion, table=motion.table[:count], **cut)
 
 
-@pytest.mark.parametrize("kind", motion_file.FORMATS)
+@pytest.mark.parametrize("kind", formats.FORMATS)
 def test_a_single_frame_is_a_motion(
     odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
 ) -> None:
@@ -219,7 +214,7 @@ def test_a_usd_has_the_rate_that_is_asked_for(
 ) -> None:
     slower = at_rate(odd_hand, 24.0)
     assert len(slower.time) == int((T - 1) * 24 / 100) + 1
-    motion_file.export_motions([slower], "usd", tmp_path / "m.usda")
+    formats.export_motions([slower], "usd", tmp_path / "m.usda")
     stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
     assert (
         stage.GetTimeCodesPerSecond() == pytest.approx(24)
@@ -502,7 +497,7 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
         beginning(dataclasses.replace(human, object_position=human.wrist_position + 0.1), 2),
     )
     path = tmp_path / "filmed"
-    motion_file.export_motions([near, near], "lerobot", path, camera=True)
+    formats.export_motions([near, near], "lerobot", path, camera=True)
     info = json.loads((path / "meta" / "info.json").read_text())
     feature = info["features"]["observation.images.front"]
     assert feature["dtype"] == "video" and feature["shape"] == [240, 320, 3]
@@ -550,7 +545,7 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
         [changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5
     )
     with pytest.raises(CongraspError, match="A glb file holds no video"):
-        motion_file.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
+        formats.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
 
 
 def test_lerobots_own_reader_gives_the_frame_of_each_row(
@@ -559,7 +554,7 @@ def test_lerobots_own_reader_gives_the_frame_of_each_row(
     reader = pytest.importorskip(
         "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
     )
-    motion_file.export_motions([human, human], "lerobot", tmp_path / "filmed", camera=True)
+    formats.export_motions([human, human], "lerobot", tmp_path / "filmed", camera=True)
     data = reader.LeRobotDataset("congrasp/test", root=tmp_path / "filmed", video_backend="pyav")
     assert len(data) == 2 * T and data.meta.camera_keys == ["observation.images.front"]
     first, second = data[1], data[T + 1]
@@ -622,12 +617,8 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
 def test_a_motions_file_has_no_other_number(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     path = tmp_path / "grasp.npz"
     save_motion(path, human)
-    assert (
-        motion_file.pick_motion(path, 0).object
-        == motion_file.pick_motion(path).object
-        == human.object
-    )
+    assert pick_motion(path, 0).object == pick_motion(path).object == human.object
     with pytest.raises(
         CongraspError, match=r"grasp\.npz is one motion and has no number 99. Remove --index"
     ):
-        motion_file.pick_motion(path, 99)
+        pick_motion(path, 99)

@@ -28,7 +28,8 @@ from congrasp.common.rotations import rotate
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
-from congrasp.services.export.motion_file import load_motion, motion_of_episode
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.files import (
     MOTION,

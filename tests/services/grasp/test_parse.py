@@ -13,7 +13,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.export.motion_file import motion_of_episode, save_motion
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
 from tests.services.conftest import quick_imports

@@ -15,7 +15,7 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.objects import procedural
 from congrasp.common.rotations import rotate
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.export.motion_file import motion_of_episode
+from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.grasp.files import steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose
 from congrasp.services.grasp.reach import (

@@ -10,7 +10,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import load_motion, save_motion
 from tests.episodes import CONTROL_DT, episode
 
 

@@ -28,7 +28,8 @@ from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.record import palette, scene
 from congrasp.services.record.episode import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN, colours_at, finer, painted
