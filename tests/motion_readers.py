@@ -18,8 +18,9 @@ from mcap_ros2.decoder import DecoderFactory
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
-from congrasp.services.export.frames import arm_meshes, object_mesh, pose_matrices
+from congrasp.services.export.frames import pose_matrices
 from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.surfaces import arm_meshes, object_mesh
 
 FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
 """World frame with the y axis up to one with the z axis up."""

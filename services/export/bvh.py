@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.services.export.frames import TO_Y_UP, bodies, facts, identifiers
+from congrasp.services.export.facts import facts
+from congrasp.services.export.frames import TO_Y_UP, bodies, identifiers
 from congrasp.services.export.motion import GraspMotion
 
 _CM = 100.0

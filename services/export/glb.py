@@ -14,63 +14,40 @@ import pygltflib as gltf
 import trimesh
 
 from congrasp.common.hands.skin import Skin
-from congrasp.services.export.frames import (
-    COLOURS,
-    OBJECT,
-    SKIN,
-    TO_Y_UP,
-    arm_meshes,
-    bodies,
-    facts,
-    object_mesh,
-    skin_of_motion,
-    unwrapped,
-)
+from congrasp.services.export.facts import facts
+from congrasp.services.export.frames import OBJECT, SKIN, TO_Y_UP, bodies
 from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.surfaces import COLOURS, arm_meshes, object_mesh, skin_of_motion
+from congrasp.services.export.texture_coordinates import unwrapped
 from congrasp.services.record.episode import Mesh
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners
 
 _KINDS = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
-_NUMBERS = {"<f4": gltf.FLOAT, "<u4": gltf.UNSIGNED_INT, "<u2": gltf.UNSIGNED_SHORT}
+"""Kinds of accessors by the numbers of an item."""
+_FLOAT = "<f4"
+_INDEX = "<u4"
+_JOINT = "<u2"
+_NUMBERS = {_FLOAT: gltf.FLOAT, _INDEX: gltf.UNSIGNED_INT, _JOINT: gltf.UNSIGNED_SHORT}
+"""Types of components by NumPy's dtype."""
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion."""
     (motion,) = motions
     scene = _Scene()
-    file, grasp = scene.file, gltf.Animation(name="grasp")
+    file = scene.file
     about = facts(motion, frame="this node's frame: z up", unit="m", quaternion="x, y, z, w")
     file.asset.generator = "congrasp"
     file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
-    skin, arm = skin_of_motion(motion), arm_meshes(motion)
+    skin = skin_of_motion(motion)
     for name in (*skin.parts(), OBJECT):
         scene.add_material(name, COLOURS[name])
-    time = scene.add_values(motion.time, bounds=True)
-    for body in bodies(motion):
-        number, turns = len(file.nodes), body.quaternions(scalar_first=False)
-        node = gltf.Node(
-            name=body.name, translation=body.translation[0].tolist(), rotation=turns[0].tolist()
-        )
-        file.nodes.append(node)
-        file.nodes[body.parent + 1].children.append(number)
-        if body.name == OBJECT:
-            node.mesh = scene.add_mesh(OBJECT, [_object(scene, motion)])
-        elif body.name in arm:
-            node.mesh = scene.add_mesh(body.name, [_part(scene, mesh) for mesh in arm[body.name]])
-        tracks = {"rotation": turns}
-        if len(body.translation) > 1:
-            tracks["translation"] = body.translation
-        for name, values in tracks.items():
-            target = gltf.AnimationChannelTarget(node=number, path=name)
-            grasp.channels.append(gltf.AnimationChannel(sampler=len(grasp.samplers), target=target))
-            grasp.samplers.append(
-                gltf.AnimationSampler(input=time, output=scene.add_values(values))
-            )
+    file.animations = [_add_bodies(scene, motion)]
     _add_skin(scene, skin)
-    file.animations = [grasp]
     # A skinned mesh follows its joints alone, so that its node is at the root.
-    file.scene, file.scenes = 0, [gltf.Scene(name=motion.object, nodes=[0, len(file.nodes) - 1])]
+    file.scene = 0
+    file.scenes = [gltf.Scene(name=motion.object, nodes=[0, len(file.nodes) - 1])]
     file.buffers = [gltf.Buffer(byteLength=len(scene.data))]
     file.set_binary_blob(bytes(scene.data))
     file.save_binary(str(path))
@@ -80,7 +57,8 @@ class _Scene:
     """A file under construction; every method returns the index of what it adds."""
 
     def __init__(self) -> None:
-        self.file, self.data = gltf.GLTF2(), bytearray()
+        self.file = gltf.GLTF2()
+        self.data = bytearray()
 
     def add_values(
         self, values: np.ndarray, target: int | None = None, *, bounds: bool = False
@@ -88,12 +66,13 @@ class _Scene:
         """Adds values (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4); integers (n,) are indices, (n, 4)
         those of joints.
         """
-        whole = np.issubdtype(values.dtype, np.integer)
-        number = ("<u4" if values.ndim == 1 else "<u2") if whole else "<f4"
+        number = _FLOAT
+        if np.issubdtype(values.dtype, np.integer):
+            number = _INDEX if values.ndim == 1 else _JOINT
         if values.ndim == 3:
             values = values.swapaxes(1, 2).reshape(-1, 16)  # by columns
         values = np.ascontiguousarray(values, number)
-        kind = _KINDS[1 if values.ndim == 1 else values.shape[1]]
+        width = 1 if values.ndim == 1 else values.shape[1]
         view = gltf.BufferView(
             buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target
         )
@@ -101,16 +80,22 @@ class _Scene:
             bufferView=len(self.file.bufferViews),
             componentType=_NUMBERS[number],
             count=len(values),
-            type=kind,
+            type=_KINDS[width],
         )
         if bounds:
-            accessor.min, accessor.max = (
-                np.atleast_1d(end).tolist() for end in (values.min(0), values.max(0))
-            )
+            accessor.min = np.atleast_1d(values.min(0)).tolist()
+            accessor.max = np.atleast_1d(values.max(0)).tolist()
         self.file.bufferViews.append(view)
         self.file.accessors.append(accessor)
         self.data += values.tobytes()
         return len(self.file.accessors) - 1
+
+    def add_node(self, node: gltf.Node, parent: int) -> int:
+        """Adds a node below another."""
+        self.file.nodes.append(node)
+        number = len(self.file.nodes) - 1
+        self.file.nodes[parent].children.append(number)
+        return number
 
     def add_material(
         self, name: str, colour: Sequence[float], roughness: float | None = None
@@ -132,12 +117,11 @@ class _Scene:
 
     def attributes(self, **values: np.ndarray) -> gltf.Attributes:
         """Attributes of vertices by their names in the standard."""
-        return gltf.Attributes(
-            **{
-                name: self.add_values(v, gltf.ARRAY_BUFFER, bounds=name == "POSITION")
-                for name, v in values.items()
-            }
-        )
+        accessors = {}
+        for name, array in values.items():
+            has_bounds = name == "POSITION"
+            accessors[name] = self.add_values(array, gltf.ARRAY_BUFFER, bounds=has_bounds)
+        return gltf.Attributes(**accessors)
 
     def primitive(
         self, attributes: gltf.Attributes, faces: np.ndarray, material: int
@@ -147,26 +131,60 @@ class _Scene:
         return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
 
+def _add_bodies(scene: _Scene, motion: GraspMotion) -> gltf.Animation:
+    """Adds a node for each body, nested as the bodies are; returns their animation."""
+    animation = gltf.Animation(name="grasp")
+    meshes_of_link = arm_meshes(motion)
+    time = scene.add_values(motion.time, bounds=True)
+    for body in bodies(motion):
+        turns = body.quaternions(scalar_first=False)
+        node = gltf.Node(
+            name=body.name, translation=body.translation[0].tolist(), rotation=turns[0].tolist()
+        )
+        number = scene.add_node(node, body.parent + 1)
+        if body.name == OBJECT:
+            node.mesh = scene.add_mesh(OBJECT, [_object(scene, motion)])
+        elif body.name in meshes_of_link:
+            primitives = [_arm_part(scene, mesh) for mesh in meshes_of_link[body.name]]
+            node.mesh = scene.add_mesh(body.name, primitives)
+        tracks = {"rotation": turns}
+        if len(body.translation) > 1:
+            tracks["translation"] = body.translation
+        for name, values in tracks.items():
+            target = gltf.AnimationChannelTarget(node=number, path=name)
+            sampler = len(animation.samplers)
+            animation.channels.append(gltf.AnimationChannel(sampler=sampler, target=target))
+            output = scene.add_values(values)
+            animation.samplers.append(gltf.AnimationSampler(input=time, output=output))
+    return animation
+
+
 def _object(scene: _Scene, motion: GraspMotion) -> gltf.Primitive:
     """The object's mesh with normals and the last material, which becomes white if the points have
     colours.
     """
     vertices, faces, colours = object_mesh(motion)
+    material = len(scene.file.materials) - 1
+    flat = unwrapped(vertices, faces)
+    arrays = {
+        "POSITION": vertices[flat.source],
+        "NORMAL": _normals(vertices, faces)[flat.source],
+        "TEXCOORD_0": _downwards(flat.uv),
+    }
+    if colours is not None:
+        arrays["COLOR_0"] = colours[flat.source] ** GAMMA  # linear
+    attributes = scene.attributes(**arrays)
+    if colours is not None:
+        surface = scene.file.materials[material].pbrMetallicRoughness
+        surface.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
+    return scene.primitive(attributes, flat.faces, material)
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3) of a mesh's points; +z at points between degenerate faces."""
     normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    # Of degenerate faces
-    normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])
-    flat = unwrapped(vertices, faces)
-    paint = {} if colours is None else {"COLOR_0": colours[flat.source] ** GAMMA}  # linear
-    attributes = scene.attributes(
-        POSITION=vertices[flat.source],
-        NORMAL=normals[flat.source],
-        TEXCOORD_0=_downwards(flat.uv),
-        **paint,
-    )
-    if paint:
-        scene.file.materials[-1].pbrMetallicRoughness.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
-    return scene.primitive(attributes, flat.faces, len(scene.file.materials) - 1)
+    return np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])
 
 
 def _downwards(uv: np.ndarray) -> np.ndarray:
@@ -174,9 +192,10 @@ def _downwards(uv: np.ndarray) -> np.ndarray:
     return uv * [1, -1] + [0, 1]
 
 
-def _part(scene: _Scene, mesh: Mesh) -> gltf.Primitive:
+def _arm_part(scene: _Scene, mesh: Mesh) -> gltf.Primitive:
     """A mesh of an arm's link, with sharp edges and a separate material."""
-    corners, (_, normals) = mesh.faces.ravel(), smooth_corners(mesh.vertices, mesh.faces)
+    corners = mesh.faces.ravel()
+    _, normals = smooth_corners(mesh.vertices, mesh.faces)
     normals = normals.reshape(-1, 3)
     keys = np.column_stack([corners, normals.round(3)])
     _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -190,11 +209,13 @@ def _add_skin(scene: _Scene, skin: Skin) -> None:
     joints.
     """
     flat = unwrapped(skin.points, skin.faces)
-    own = {
-        name: getattr(skin, name)[flat.source]
-        for name in ("points", "normals", "weights", "material")
-    }
-    skin = skin._replace(faces=flat.faces, **own)
+    skin = skin._replace(
+        points=skin.points[flat.source],
+        normals=skin.normals[flat.source],
+        weights=skin.weights[flat.source],
+        material=skin.material[flat.source],
+        faces=flat.faces,
+    )
     links, weights = skin.influences()
     attributes = scene.attributes(
         POSITION=skin.points,
@@ -203,10 +224,9 @@ def _add_skin(scene: _Scene, skin: Skin) -> None:
         JOINTS_0=links,
         WEIGHTS_0=weights,
     )
-    primitives = [
-        scene.primitive(attributes, part, number)
-        for number, part in enumerate(skin.parts().values())
-    ]
+    primitives = []
+    for material, faces in enumerate(skin.parts().values()):
+        primitives.append(scene.primitive(attributes, faces, material))
     inverse = np.tile(np.eye(4), (len(skin.origins), 1, 1))
     inverse[:, :3, 3] = -skin.origins
     joints = [1 + link for link in range(len(skin.origins))]

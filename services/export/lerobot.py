@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.skin import Skin
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.export.frames import facts, skin_of_motion
+from congrasp.services.export.facts import facts
 from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.hand_shapes import skin_shape

@@ -25,8 +25,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from congrasp.services.export.frames import COLOURS, OBJECT, arm_meshes, bodies, facts
+from congrasp.services.export.facts import facts
+from congrasp.services.export.frames import OBJECT, bodies
 from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.surfaces import COLOURS, arm_meshes
 from congrasp.services.export.trajectory import joint_trajectory
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.record.palette import colours_at

@@ -14,21 +14,11 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from congrasp.common.hands.skin import MATERIALS, Skin
-from congrasp.services.export.frames import (
-    COLOURS,
-    OBJECT,
-    SKIN,
-    Body,
-    arm_meshes,
-    bodies,
-    capsules,
-    facts,
-    identifiers,
-    object_mesh,
-    skin_of_motion,
-    unwrapped,
-)
+from congrasp.services.export.facts import facts
+from congrasp.services.export.frames import OBJECT, SKIN, Body, bodies, capsules, identifiers
 from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.surfaces import COLOURS, arm_meshes, object_mesh, skin_of_motion
+from congrasp.services.export.texture_coordinates import unwrapped
 from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"

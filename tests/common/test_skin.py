@@ -23,8 +23,8 @@ from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
 from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.frames import skin_of_motion
 from congrasp.services.export.motion import hand_arrays
+from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.viz.hand_shapes import posed_hand
 from tests.episodes import episode
 

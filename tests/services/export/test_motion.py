@@ -25,10 +25,11 @@ from congrasp.common.rotations import continuous
 from congrasp.services.cli.main import main
 from congrasp.services.export import formats, frames
 from congrasp.services.export.episode_motion import motion_of_episode, pick_motion
-from congrasp.services.export.frames import COLOURS, unwrapped
 from congrasp.services.export.lerobot import camera_for, pictures
 from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays
 from congrasp.services.export.motion_file import load_motion, save_motion
+from congrasp.services.export.surfaces import COLOURS, skin_of_motion
+from congrasp.services.export.texture_coordinates import unwrapped
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
@@ -321,7 +322,7 @@ def test_the_skin_of_a_glb_follows_its_joints(which, request, tmp_path):
     inverse = values(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     points = np.pad(values(attributes.POSITION), ((0, 0), (0, 1)), constant_values=1)
     (track,) = read_glb(path)
-    source = unwrapped((surface := frames.skin_of_motion(motion)).points, surface.faces).source
+    source = unwrapped((surface := skin_of_motion(motion)).points, surface.faces).source
     names = [file.nodes[joint].name for joint in skin.joints]
     assert names == motion.link_names.tolist()
     for t in (0, T - 1):
@@ -341,7 +342,7 @@ def test_pixars_library_moves_the_skin_of_a_usd(which, request, tmp_path):
     cache.Populate(root, Usd.PrimDefaultPredicate)
     (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
     skeleton, (target,) = cache.GetSkelQuery(binding.GetSkeleton()), binding.GetSkinningTargets()
-    mesh, surface = UsdGeom.Mesh(target.GetPrim()), frames.skin_of_motion(motion)
+    mesh, surface = UsdGeom.Mesh(target.GetPrim()), skin_of_motion(motion)
     # One a corner, v upwards
     st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
     flat = unwrapped(surface.points, surface.faces)

@@ -6,7 +6,7 @@ import trimesh
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
-from congrasp.services.export.frames import unwrapped
+from congrasp.services.export.texture_coordinates import unwrapped
 
 
 def areas(uv: np.ndarray) -> np.ndarray:
