@@ -5,17 +5,18 @@ skinning.
 """
 
 import functools
-import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 
 from congrasp.common import mirror
-from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of, wrist_circles
+from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of
+from congrasp.common.hands.housings import housings
 from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
+from congrasp.common.hands.nails import nails
+from congrasp.common.hands.sleeve import sleeve
 from congrasp.common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
@@ -28,110 +29,6 @@ _SHORT_NORMAL = 0.5
 """Length below which a mean of unit normals is one of rounding errors."""
 _SMALLEST_LENGTH = 1e-12
 """Length of a normal that has a direction."""
-_SECTIONS = 20
-"""Sides of a housing."""
-_BEVEL = 0.45
-"""Bevel of a housing's ends, in radii."""
-_DRUM_RADIUS = 0.72
-"""Radius of a joint's drum, in radii of its link."""
-_DRUM_LENGTH = 1.04
-"""Half length of a joint's drum, in radii of its link."""
-_AROUND = 28
-"""Points of a ring."""
-_NAIL = (
-    (0.2, 0.0005),
-    (0.55, 0.0005),
-    (0.9, 0.0004),
-    (1.0, 0.0001),
-    (0.9, -0.0012),
-    (0.2, -0.0012),
-)
-"""Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
-_NAIL_WIDTH = 0.90
-"""Half width of a nail, rad about the finger."""
-_NAIL_LENGTH = 0.85
-"""Half length of a nail, in radii of the fingertip."""
-_NAIL_BACK = 0.30
-"""Distance of a nail behind the centre of the fingertip, in radii of the fingertip."""
-_SQUARE = 0.65
-"""Exponent of the nail's outline; 1 is an ellipse."""
-_SLEEVE = (
-    *((0.026, -0.004), (0.0245, 0.0008), (0.0245, 0.0030), (0.0265, 0.0042), (0.034, 0.0044)),
-    *((0.036, 0.0034), (0.060, 0.0042), (0.082, 0.0056), (0.086, 0.0040)),
-)
-"""Rings of the sleeve: distance behind the start of the wrist, and radius in excess of the wrist's,
-m.
-"""
-
-
-def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
-    """A nail on the back of each fingertip that a joint bends; it moves with the skin below it."""
-    surfaces = []
-    skin_points = cKDTree(skin.points)
-    for chain in skeleton.chains():
-        bends = np.flatnonzero(skeleton.joint_link == chain[-1])
-        if not len(bends):
-            continue
-        capsule = np.flatnonzero(skeleton.capsule_link == chain[-1])[0]
-        (start, end), radius = skeleton.capsules[capsule], skeleton.radii[capsule]
-        along = (end - start) / np.linalg.norm(end - start)
-        back = -np.cross(skeleton.axes[bends[-1]], along)
-        back = back / np.linalg.norm(back)
-        angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-        outline = [
-            np.sign(wave) * np.abs(wave) ** _SQUARE for wave in (np.cos(angle), np.sin(angle))
-        ]
-        rings = []
-        for share, height in _NAIL:
-            turn = _NAIL_WIDTH * share * outline[0]
-            place = radius * (_NAIL_LENGTH * share * outline[1] - _NAIL_BACK)
-            radial = np.cos(turn)[:, None] * back + np.sin(turn)[:, None] * np.cross(along, back)
-            # Over the ball at the finger's end
-            down = np.clip(place / radius, 0, np.pi / 2)[:, None]
-            out = np.cos(down) * radial + np.sin(down) * along
-            rings.append(end + np.minimum(place, 0)[:, None] * along + (radius + height) * out)
-        nail = _shell(np.array(rings), chain[-1], len(skeleton.names))
-        nearest = skin_points.query(nail.points)[1]
-        weights = skin.weights[nearest].mean(0)
-        surfaces.append(nail._replace(weights=np.tile(weights, (len(nail.points), 1))))
-    return surfaces
-
-
-def sleeve(skeleton: Skeleton) -> Surface:
-    """A cuff around the wrist, which follows the palm."""
-    centres, radii, back = wrist_circles(skeleton)
-    side = np.cross(back, centres[-1] - centres[0])
-    axes = np.stack([np.cross(side, back), side])
-    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-    out = np.stack([np.cos(angle), np.sin(angle)], -1) @ axes
-    # The circle that the outline touches in each direction
-    farthest = (centres @ out.T + radii[:, None]).argmax(0)
-    rings = [
-        centres[farthest] + (radii[farthest] + wider)[:, None] * out + behind * back
-        for behind, wider in _SLEEVE
-    ]
-    return _shell(np.array(rings), 0, len(skeleton.names))
-
-
-def _shell(rings: np.ndarray, link: int, links: int) -> Surface:
-    """The closed surface through rings (R, S, 3), flat at both ends, which follows one link."""
-    count, around = rings.shape[:2]
-    points = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(1)])
-    here = np.arange(around)
-    after = np.roll(here, -1)
-    faces = [np.stack([after, here, np.full(around, count * around)], -1)]
-    for first in around * np.arange(count - 1):
-        a, b, c, d = first + here, first + after, first + around + here, first + around + after
-        faces += [np.stack([a, b, c], -1), np.stack([b, d, c], -1)]
-    last = (count - 1) * around
-    faces.append(np.stack([last + here, last + after, np.full(around, count * around + 1)], -1))
-    mesh = trimesh.Trimesh(points, np.concatenate(faces), process=False)
-    if mesh.volume < 0:
-        mesh.invert()
-    weights = np.zeros((len(points), links))
-    weights[:, link] = 1.0
-    return Surface(points, np.array(mesh.vertex_normals), np.array(mesh.faces), weights)
 
 
 class Skin(NamedTuple):
@@ -154,12 +51,13 @@ class Skin(NamedTuple):
 
     def parts(self) -> dict[str, np.ndarray]:
         """Faces (n, 3) of each material that there is."""
-        of_face = self.material[self.faces[:, 0]]
-        return {
-            name: self.faces[of_face == i]
-            for i, name in enumerate(MATERIALS)
-            if (of_face == i).any()
-        }
+        material_of_face = self.material[self.faces[:, 0]]
+        faces = {}
+        for i, name in enumerate(MATERIALS):
+            is_of_material = material_of_face == i
+            if is_of_material.any():
+                faces[name] = self.faces[is_of_material]
+        return faces
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
         """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0
@@ -201,32 +99,21 @@ def skin_on(skeleton: Skeleton) -> Skin:
     """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the
     right hand's.
     """
-    right, left = right_name(skeleton.hand)
-    if left:
-        own: dict[str, Any] = _mirrored(skeleton, ("origins", "capsules", "anchors"))
-        skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
-        return skin._replace(
-            faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins"))
+    right, is_left = right_name(skeleton.hand)
+    if is_left:
+        mirrored = skeleton._replace(
+            hand=right,
+            origins=mirror.vector(skeleton.origins),
+            capsules=mirror.vector(skeleton.capsules),
+            anchors=mirror.vector(skeleton.anchors),
+            axes=mirror.axial(skeleton.axes),
         )
-    if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):
-        soft = flesh(skeleton)
-        kinds = (
-            ("flesh", soft),
-            ("sleeve", sleeve(skeleton)),
-            *(("nail", nail) for nail in nails(skeleton, soft)),
-        )
-        material = np.concatenate(
-            [np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds]
-        )
-        firsts = np.cumsum([0, *(len(part.points) for _, part in kinds)])
-        faces = [part.faces + first for (_, part), first in zip(kinds, firsts, strict=False)]
-        points, normals, weights = (
-            np.concatenate([part[k] for _, part in kinds]) for k in (0, 1, 3)
-        )
-        surface = Surface(points, normals, np.concatenate(faces), weights)
+        return _mirrored(skin_on(mirrored))
+    if skeleton.hand in HUMAN_HANDS and _is_anatomical(skeleton):
+        surface, material = _human_surface(skeleton)
     else:
-        surface, joint = _housings(skeleton)
-        material = np.where(joint, MATERIALS.index("joint"), MATERIALS.index("link"))
+        surface, is_joint = housings(skeleton)
+        material = np.where(is_joint, MATERIALS.index("joint"), MATERIALS.index("link"))
     return Skin(
         surface.points.astype(np.float32),
         surface.normals.astype(np.float32),
@@ -237,9 +124,35 @@ def skin_on(skeleton: Skeleton) -> Skin:
     )
 
 
-def _mirrored(shape: Skeleton | Skin, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Mirrored points of a shape, by their names."""
-    return {name: mirror.vector(getattr(shape, name)) for name in names}
+def _mirrored(skin: Skin) -> Skin:
+    """Returns the mirror image of a surface."""
+    return skin._replace(
+        points=mirror.vector(skin.points),
+        normals=mirror.vector(skin.normals),
+        origins=mirror.vector(skin.origins),
+        faces=skin.faces[:, ::-1].copy(),
+    )
+
+
+def _human_surface(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
+    """Returns flesh, sleeve and nails as one surface, and the material (V,) of its points."""
+    soft = flesh(skeleton)
+    surfaces = [soft, sleeve(skeleton)]
+    materials = ["flesh", "sleeve"]
+    for nail in nails(skeleton, soft):
+        surfaces.append(nail)
+        materials.append("nail")
+    counts = [len(surface.points) for surface in surfaces]
+    firsts = np.cumsum([0, *counts[:-1]])
+    faces = [surface.faces + first for surface, first in zip(surfaces, firsts, strict=True)]
+    surface = Surface(
+        points=np.concatenate([surface.points for surface in surfaces]),
+        normals=np.concatenate([surface.normals for surface in surfaces]),
+        faces=np.concatenate(faces),
+        weights=np.concatenate([surface.weights for surface in surfaces]),
+    )
+    material_numbers = [MATERIALS.index(material) for material in materials]
+    return surface, np.repeat(material_numbers, counts)
 
 
 def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
@@ -292,12 +205,12 @@ def _rounded(link: Link) -> trimesh.Trimesh:
         if way.any():
             part.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], way))
         parts.append(part.apply_translation(np.add(capsule.start, capsule.end) / 2))
-    whole = trimesh.util.concatenate(parts)
-    assert isinstance(whole, trimesh.Trimesh)
-    return whole
+    mesh = trimesh.util.concatenate(parts)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
 
 
-def _anatomical(skeleton: Skeleton) -> bool:
+def _is_anatomical(skeleton: Skeleton) -> bool:
     """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's
     size.
     """
@@ -310,77 +223,3 @@ def _anatomical(skeleton: Skeleton) -> bool:
         return False
     extent = np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max()
     return float(extent + skeleton.radii.max()) < _MAX_SIZE
-
-
-def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
-    """Returns a bevelled housing around every capsule, a drum at every joint, and a mask (V,) of
-    the joints' points.
-    """
-    parts, links, joints = [], [], []
-    for (start, end), radius, link in zip(
-        skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True
-    ):
-        parts.append(_bevelled(start, end, radius, radius))
-        links.append(link)
-        joints.append(False)
-    for anchor, axis, link in zip(
-        skeleton.anchors, skeleton.axes, skeleton.joint_link, strict=True
-    ):
-        mine = skeleton.radii[skeleton.capsule_link == link]
-        if len(mine):
-            half = _DRUM_LENGTH * mine[0] * axis - 0.2 * mine[0] * axis
-            parts.append(
-                _bevelled(anchor - half, anchor + half, _DRUM_RADIUS * mine[0], 0.2 * mine[0])
-            )
-            links.append(skeleton.parents[link])
-            joints.append(True)
-    counts = [len(points) for points, _, _ in parts]
-    firsts = np.cumsum([0, *counts[:-1]])
-    weights = np.eye(len(skeleton.names))[np.repeat(links, counts)]
-    faces = np.concatenate([part[2] + first for part, first in zip(parts, firsts, strict=True)])
-    points, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    return Surface(points, normals, faces, weights), np.repeat(joints, counts)
-
-
-def _bevelled(
-    start: np.ndarray, end: np.ndarray, radius: float, reach: float
-) -> tuple[np.ndarray, ...]:
-    """Points, normals and faces of a cylinder with bevelled ends that extends beyond both points
-    (3,).
-    """
-    length, bevel = float(np.linalg.norm(end - start)), _BEVEL * min(radius, reach)
-    outline = [
-        (0.0, -reach),
-        (radius - bevel, -reach),
-        (radius, bevel - reach),
-        (radius, length + reach - bevel),
-        (radius - bevel, length + reach),
-        (0.0, length + reach),
-    ]
-    points: list[np.ndarray] = []
-    normals: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    turn = np.eye(3)
-    if length > 1e-9:
-        turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)[:3, :3]
-    angles = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
-    around = np.stack([np.cos(angles), np.sin(angles)], -1)
-    for (r0, z0), (r1, z1) in itertools.pairwise(
-        outline
-    ):  # separate points for each strip give sharp edges
-        out = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r0 - r1)
-        first = _SECTIONS * len(points)
-        for r, z in ((r0, z0), (r1, z1)):
-            points.append(np.column_stack([r * around, np.full(_SECTIONS, z)]))
-            normals.append(np.column_stack([out[0] * around, np.full(_SECTIONS, out[1])]))
-        here = first + np.arange(_SECTIONS)
-        after = first + (np.arange(_SECTIONS) + 1) % _SECTIONS
-        if r0 > 0:
-            faces.append(np.column_stack([here, after, after + _SECTIONS]))
-        if r1 > 0:
-            faces.append(np.column_stack([here, after + _SECTIONS, here + _SECTIONS]))
-    return (
-        start + np.concatenate(points) @ turn.T,
-        np.concatenate(normals) @ turn.T,
-        np.concatenate(faces),
-    )

@@ -176,12 +176,13 @@ class Hand:
     @functools.cached_property
     def joints(self) -> tuple[Joint, ...]:
         """Finger joints in the order of `q`."""
-        return tuple(joint for link in self.links for joint in link.joints)
+        return tuple(itertools.chain.from_iterable(link.joints for link in self.links))
 
     @functools.cached_property
     def joint_links(self) -> np.ndarray:
         """(F,) index of the link that each joint moves."""
-        return np.array([i for i, link in enumerate(self.links) for _ in link.joints])
+        counts = [len(link.joints) for link in self.links]
+        return np.repeat(np.arange(len(self.links)), counts)
 
     @functools.cached_property
     def motors(self) -> tuple[Motor, ...]:
@@ -323,12 +324,13 @@ class Hand:
     @functools.cached_property
     def capsule_links(self) -> np.ndarray:
         """(C,) index of the link of each capsule."""
-        return np.array([i for i, link in enumerate(self.links) for _ in link.capsules])
+        counts = [len(link.capsules) for link in self.links]
+        return np.repeat(np.arange(len(self.links)), counts)
 
     @functools.cached_property
     def _link_capsules(self) -> tuple[Capsule, ...]:
         """The C capsules in the order of the links."""
-        return tuple(capsule for link in self.links for capsule in link.capsules)
+        return tuple(itertools.chain.from_iterable(link.capsules for link in self.links))
 
     @functools.cached_property
     def wrist_inertia(self) -> np.ndarray:
