@@ -24,8 +24,8 @@ _ROOT = "world"
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion, and the description of its numbers next to it."""
     (motion,) = motions
-    found = bodies(motion)
-    names = identifiers([_ROOT, *(body.name for body in found)])[1:]
+    motion_bodies = bodies(motion)
+    names = identifiers([_ROOT, *(body.name for body in motion_bodies)])[1:]
     count = len(motion.time)
     # A root turns the world y-up; everything below keeps z-up coordinates.
     lines = [
@@ -39,7 +39,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
     def add(index: int, indent: str) -> None:
         """Adds a joint and those below it."""
-        body = found[index]
+        body = motion_bodies[index]
         moves = len(body.translation) > 1
         channels = (*_POSITION, *_ROTATION) if moves else _ROTATION
         # Programs differ in whether a joint's positions replace its offset or add to it: with no
@@ -51,7 +51,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         if moves:
             columns.append(_CM * body.translation)
         columns.append(_angles(body.rotation))
-        children = [child for child, other in enumerate(found) if other.parent == index]
+        children = [child for child, other in enumerate(motion_bodies) if other.parent == index]
         for child in children:
             add(child, indent + "  ")
         if not children:
@@ -59,7 +59,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             lines.extend([f"{indent}    OFFSET {_row(_CM * _end(motion, index))}", f"{indent}  }}"])
         lines.append(f"{indent}}}")
 
-    for index, body in enumerate(found):
+    for index, body in enumerate(motion_bodies):
         if body.parent < 0:
             add(index, "  ")
     lines += ["}", "MOTION", f"Frames: {count}", f"Frame Time: {motion.control_dt:.9g}"]
@@ -71,7 +71,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         unit="cm and degrees",
         quaternion=f"none: angles, intrinsic {_ORDER}",
     )
-    about["frames"] = {name: body.name for name, body in zip(names, found, strict=True)}
+    about["frames"] = {name: body.name for name, body in zip(names, motion_bodies, strict=True)}
     path.with_name(f"{path.name}.json").write_text(json.dumps(about, indent=1))
 
 

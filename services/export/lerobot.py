@@ -9,36 +9,23 @@ for all episodes, a frame for every row.
 
 import json
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.skin import Skin
-from congrasp.common.runtime.parallel import cores
 from congrasp.services.export.facts import facts
+from congrasp.services.export.film import SIZE, Film, film
 from congrasp.services.export.motion import GraspMotion, robot_joints
-from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.export.urdf import robot_urdf
-from congrasp.services.viz.camera import Camera, fit
-from congrasp.services.viz.hand_shapes import skin_shape
-from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.shapes import (
-    Shape,
-    arm_shapes,
-    object_shape,
-    table_shape,
-)
-from congrasp.services.viz.sheets import save_video
+from congrasp.services.record.episode import MovedArm
 
 VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _PLACE = {"chunk_index": 0, "file_index": 0}
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _COUNTERS = {
@@ -48,15 +35,29 @@ _COUNTERS = {
     "task_index": "int64",
 }
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
+_STATE = "observation.state"
+_OBJECT = "observation.environment_state"
+_ACTION = "action"
 _CAMERA = "observation.images.front"
-_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-SIZE = (320, 240)
-"""Width and height of the video, pixels."""
-_DIRECTION = np.array([0.8, -1.0, 0.7])  # from the table's middle to the camera
-_STEP = 10  # frames between those that the camera must contain
-_KEYFRAMES = ("-g", "2")  # for random access in training
-_COUNTED = 64  # pixels between those that the statistics count
+_PANDAS_COLUMNS = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+"""Columns of the table of tasks: name, and types in pandas and in NumPy."""
+
+
+class _Dataset(NamedTuple):
+    """Motions as episodes of a dataset."""
+
+    motions: Sequence[GraspMotion]
+    fps: int
+    """Frames a second."""
+    tasks: list[str]
+    """Different tasks, as sentences."""
+    starts: list[int]
+    """Number of rows before each episode, and of all rows."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of all episodes."""
+        return self.starts[-1]
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
@@ -67,40 +68,77 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
       CongraspError: the motions differ in robot or control step, or the control step is no whole
         number of frames a second.
     """
-    first, fps = motions[0], _frame_rate(motions)
-    tasks = list(dict.fromkeys(map(_task, motions)))
-    starts = np.cumsum([0, *(len(motion.time) for motion in motions)])
-    episodes = [_columns(motion, i, int(starts[i]), tasks) for i, motion in enumerate(motions)]
-    every = {name: np.concatenate([columns[name] for columns in episodes]) for name in episodes[0]}
-    stats = {name: _statistics(values) for name, values in every.items()}
-    info = _info(first, len(motions), int(starts[-1]), len(tasks), fps)
+    dataset = _dataset(motions)
+    episodes = [_columns(dataset, episode) for episode in range(len(motions))]
+    columns = {}
+    for name in episodes[0]:
+        columns[name] = np.concatenate([episode[name] for episode in episodes])
+    stats = {name: _statistics(values) for name, values in columns.items()}
+    info = _info(dataset)
     described = {"congrasp": _about(motions), "stats": stats, "info": info}
-    pixels: list[np.ndarray] = []
+    video = None
     if camera:
-        video = path / _VIDEO.format(video_key=_CAMERA, **_PLACE)
-        described["camera"], pixels = film(video, motions, fps)
-        stats[_CAMERA] = _statistics(np.concatenate(pixels), int(starts[-1]))
-        info["video_path"], info["features"][_CAMERA] = _VIDEO, _video_feature(fps)
+        file = path / _VIDEO.format(video_key=_CAMERA, **_PLACE)
+        video = film(file, motions, dataset.fps)
+        described["camera"] = video.calibration
+        stats[_CAMERA] = _statistics_of_pixels(np.concatenate(video.pixels), dataset.rows)
+        info["video_path"] = _VIDEO
+        info["features"][_CAMERA] = _video_feature(dataset.fps)
     rows = []
-    for i, columns in enumerate(episodes):
-        start, end = starts[i : i + 2].tolist()
-        row = {"episode_index": i, "tasks": [_task(motions[i])], "length": end - start}
-        row |= _prefixed("data", _PLACE) | {"dataset_from_index": start, "dataset_to_index": end}
-        for name, values in columns.items():
-            row |= _prefixed(f"stats/{name}", _statistics(values))
-        if camera:
-            span = {**_PLACE, "from_timestamp": start / fps, "to_timestamp": end / fps}
-            row |= _prefixed(f"videos/{_CAMERA}", span)
-            row |= _prefixed(f"stats/{_CAMERA}", _statistics(pixels[i], end - start))
-        rows.append(row | _prefixed("meta/episodes", _PLACE))
-    _write_parquet(
-        path / "data" / _FILE.format(**_PLACE), pa.table({n: _column(v) for n, v in every.items()})
-    )
+    for episode, episode_columns in enumerate(episodes):
+        rows.append(_episode_row(dataset, episode, episode_columns, video))
+    data = pa.table({name: _column(values) for name, values in columns.items()})
+    _write_parquet(path / "data" / _FILE.format(**_PLACE), data)
     _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
-    _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(tasks))
-    (path / "meta" / ("robot.urdf" if first.arm else "hand.urdf")).write_text(robot_urdf(first))
+    _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(dataset.tasks))
+    urdf = "robot.urdf" if motions[0].arm else "hand.urdf"
+    (path / "meta" / urdf).write_text(robot_urdf(motions[0]))
     for name, content in described.items():
         (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1))
+
+
+def _dataset(motions: Sequence[GraspMotion]) -> _Dataset:
+    """Returns the dataset of motions of one robot.
+
+    Raises:
+      CongraspError: see `write`.
+    """
+    tasks = [_task(motion) for motion in motions]
+    starts = [0]
+    for motion in motions:
+        starts.append(starts[-1] + len(motion.time))
+    return _Dataset(motions, _frame_rate(motions), list(dict.fromkeys(tasks)), starts)
+
+
+def _episode_row(
+    dataset: _Dataset, episode: int, columns: Mapping[str, np.ndarray], video: Film | None
+) -> dict[str, Any]:
+    """Row of an episode in the table of episodes.
+
+    Args:
+      dataset: the dataset.
+      episode: index of the episode.
+      columns: the episode's columns.
+      video: the dataset's video, if it has one.
+    """
+    start, end = dataset.starts[episode : episode + 2]
+    tasks = [_task(dataset.motions[episode])]
+    row: dict[str, Any] = {"episode_index": episode, "tasks": tasks, "length": end - start}
+    row |= _prefixed("data", _PLACE)
+    row |= {"dataset_from_index": start, "dataset_to_index": end}
+    for name, values in columns.items():
+        row |= _prefixed(f"stats/{name}", _statistics(values))
+    if video is not None:
+        span = {
+            **_PLACE,
+            "from_timestamp": start / dataset.fps,
+            "to_timestamp": end / dataset.fps,
+        }
+        row |= _prefixed(f"videos/{_CAMERA}", span)
+        stats = _statistics_of_pixels(video.pixels[episode], end - start)
+        row |= _prefixed(f"stats/{_CAMERA}", stats)
+    row |= _prefixed("meta/episodes", _PLACE)
+    return row
 
 
 def _frame_rate(motions: Sequence[GraspMotion]) -> int:
@@ -109,7 +147,8 @@ def _frame_rate(motions: Sequence[GraspMotion]) -> int:
     fps = round(1 / dt)
     if abs(fps * dt - 1) > 1e-6:
         raise CongraspError(f"A control step of {dt} s makes no whole number of frames a second.")
-    if any(_robot(motion) != _robot(motions[0]) for motion in motions):
+    robot = _robot(motions[0])
+    if any(_robot(motion) != robot for motion in motions):
         raise CongraspError(
             "A dataset has one robot and one control step, but the motions differ.",
             "Export each set.",
@@ -130,17 +169,13 @@ def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
         unit="m, rad, s",
         quaternion="qw, qx, qy, qz",
     )
-    del about["object"], about["constraints"]
-    about |= {
-        "objects": [motion.object for motion in motions],
-        "success": [motion.success for motion in motions],
-    }
-    if motions[0].arm:
-        about["arm_base"] = [
-            [*m.arm.link_position[0, 0].tolist(), *m.arm.link_quaternion[0, 0].tolist()]
-            for m in motions
-            if m.arm
-        ]
+    del about["object"]
+    del about["constraints"]
+    about["objects"] = [motion.object for motion in motions]
+    about["success"] = [motion.success for motion in motions]
+    arms = [motion.arm for motion in motions if motion.arm]
+    if arms:
+        about["arm_base"] = [_base_pose(arm) for arm in arms]
     about["action"] = (
         "finger targets of the joints' position servos; arm's joints and wrist's pose one step "
         "later"
@@ -148,19 +183,24 @@ def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
     return about
 
 
+def _base_pose(arm: MovedArm) -> list[float]:
+    """Position and quaternion of an arm's base."""
+    return [*arm.link_position[0, 0].tolist(), *arm.link_quaternion[0, 0].tolist()]
+
+
 def _video_feature(fps: int) -> dict[str, Any]:
     """Description of the camera as a feature."""
     width, height = SIZE
-    about = {
-        "height": height,
-        "width": width,
-        "channels": 3,
-        "codec": "h264",
-        "pix_fmt": "yuv420p",
-        "fps": fps,
+    info = {
+        "video.height": height,
+        "video.width": width,
+        "video.channels": 3,
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.is_depth_map": False,
+        "has_audio": False,
     }
-    about |= {"is_depth_map": False}
-    info = {**{f"video.{name}": value for name, value in about.items()}, "has_audio": False}
     return {
         "dtype": "video",
         "shape": [height, width, 3],
@@ -175,36 +215,33 @@ def _task(motion: GraspMotion) -> str:
 
 
 def _robot(motion: GraspMotion) -> tuple[Any, ...]:
-    """Identity of the hand, the arm, and the control step."""
+    """Identity of the hand, the control step, and the arm."""
+    identity = (motion.hand, motion.control_dt)
     arm = motion.arm
-    return (
-        motion.hand,
-        motion.control_dt,
-        arm and (arm.name, *arm.joint_names, *arm.hand_position, *arm.hand_quaternion),
-    )
+    if arm is None:
+        return identity
+    return (*identity, arm.name, *arm.joint_names, *arm.hand_position, *arm.hand_quaternion)
 
 
-def _columns(
-    motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]
-) -> dict[str, np.ndarray]:
-    """A motion's columns (T, ...) by name; `start` is the number of rows before them."""
+def _columns(dataset: _Dataset, episode: int) -> dict[str, np.ndarray]:
+    """Columns (T, ...) of an episode, by name."""
+    motion = dataset.motions[episode]
     count = len(motion.time)
     arm = motion.arm.joint_position if motion.arm else np.zeros((count, 0))
     wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
-    later = np.minimum(np.arange(count) + 1, count - 1)
+    next_row = np.minimum(np.arange(count) + 1, count - 1)
+    state = np.concatenate([arm, motion.joint_position, wrist], 1)
+    object_pose = np.concatenate([motion.object_position, motion.object_quaternion], 1)
+    action = np.concatenate([arm[next_row], motion.joint_target, wrist[next_row]], 1)
     return {
-        _STATE: np.concatenate([arm, motion.joint_position, wrist], 1).astype(np.float32),
-        _OBJECT: np.concatenate([motion.object_position, motion.object_quaternion], 1).astype(
-            np.float32
-        ),
-        _ACTION: np.concatenate([arm[later], motion.joint_target, wrist[later]], 1).astype(
-            np.float32
-        ),
+        _STATE: state.astype(np.float32),
+        _OBJECT: object_pose.astype(np.float32),
+        _ACTION: action.astype(np.float32),
         "timestamp": motion.time.astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, episode),
-        "index": start + np.arange(count),
-        "task_index": np.full(count, tasks.index(_task(motion))),
+        "index": dataset.starts[episode] + np.arange(count),
+        "task_index": np.full(count, dataset.tasks.index(_task(motion))),
     }
 
 
@@ -219,48 +256,49 @@ def _tasks_table(tasks: Sequence[str]) -> pa.Table:
     """Tasks in pandas' format of a frame with one column and the tasks as its index, as LeRobot
     expects them.
     """
-    columns = [
-        {
+    columns = []
+    for name, pandas_type, numpy_type in _PANDAS_COLUMNS:
+        column = {
             "name": name,
             "field_name": name,
-            "pandas_type": kind,
-            "numpy_type": numpy,
+            "pandas_type": pandas_type,
+            "numpy_type": numpy_type,
             "metadata": None,
         }
-        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
-    ]
+        columns.append(column)
     pandas = {
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": columns,
         "pandas_version": "2.0.0",
     }
-    table = pa.table(
-        {
-            "task_index": pa.array(range(len(tasks)), pa.int64()),
-            "task": pa.array(tasks, pa.string()),
-        }
-    )
+    numbers = pa.array(range(len(tasks)), pa.int64())
+    table = pa.table({"task_index": numbers, "task": pa.array(tasks, pa.string())})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _statistics(values: np.ndarray, frames: int = 0) -> dict[str, list[Any]]:
-    """Statistics of a column (T, ...), in the names of the format, or of some pixels (n, 3) of a
-    number of frames.
-    """
+def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
+    """Statistics of a column (T, ...), in the names of the format."""
     columns = values.reshape(len(values), -1).astype(float)
-    shape = (-1, 1, 1) if frames else (-1,)
-    found = {
-        "min": columns.min(0),
-        "max": columns.max(0),
-        "mean": columns.mean(0),
-        "std": columns.std(0),
+    statistics: dict[str, list[Any]] = {
+        "min": columns.min(0).tolist(),
+        "max": columns.max(0).tolist(),
+        "mean": columns.mean(0).tolist(),
+        "std": columns.std(0).tolist(),
+        "count": [len(columns)],
     }
-    quantiles = {name: np.quantile(columns, q, axis=0) for name, q in _QUANTILES.items()}
-    first, rest = (
-        {name: x.reshape(shape).tolist() for name, x in part.items()} for part in (found, quantiles)
-    )
-    return {**first, "count": [frames or len(columns)], **rest}
+    for name, share in _QUANTILES.items():
+        statistics[name] = np.quantile(columns, share, axis=0).tolist()
+    return statistics
+
+
+def _statistics_of_pixels(pixels: np.ndarray, frames: int) -> dict[str, list[Any]]:
+    """Statistics of some pixels (n, 3) of a number of frames: those of each channel as (1, 1)."""
+    statistics = _statistics(pixels)
+    for name, values in statistics.items():
+        statistics[name] = [[[value]] for value in values]
+    statistics["count"] = [frames]
+    return statistics
 
 
 def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
@@ -269,137 +307,47 @@ def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
     pq.write_table(table, path, compression="snappy")
 
 
-def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
+def _info(dataset: _Dataset) -> dict[str, Any]:
     """Description of the data set: features with their shapes and names, counts, paths of files."""
-    joints, count = robot_joints(motion), len(motion.joint_names)
-    arm, fingers = joints[:-count], joints[-count:]
+    motion = dataset.motions[0]
+    episodes = len(dataset.motions)
+    robot = ["congrasp", motion.hand]
+    if motion.arm:
+        robot.insert(1, motion.arm.name)
+    return {
+        "codebase_version": VERSION,
+        "robot_type": "_".join(robot),
+        "total_episodes": episodes,
+        "total_frames": dataset.rows,
+        "total_tasks": len(dataset.tasks),
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": dataset.fps,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": f"data/{_FILE}",
+        "video_path": None,
+        "features": _features(motion),
+    }
+
+
+def _features(motion: GraspMotion) -> dict[str, Any]:
+    """Types, shapes and names of the columns of a motion."""
+    joints = robot_joints(motion)
+    count = len(motion.joint_names)
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {
         _STATE: [*joints, *wrist],
         _OBJECT: [f"object_{name}" for name in _POSE],
         _ACTION: [
-            *(f"{name}_next" for name in arm),
-            *(f"{name}_target" for name in fingers),
+            *(f"{name}_next" for name in joints[:-count]),
+            *(f"{name}_target" for name in joints[-count:]),
             *(f"{name}_next" for name in wrist),
         ],
     }
-    features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [len(parts)], "names": parts}
-        for name, parts in names.items()
-    }
-    for name, dtype in {"timestamp": "float32", **_COUNTERS}.items():
-        features[name] = {"dtype": dtype, "shape": [1], "names": None}
-    return {
-        "codebase_version": VERSION,
-        "robot_type": "_".join(
-            ["congrasp", *([motion.arm.name] if motion.arm else []), motion.hand]
-        ),
-        "total_episodes": episodes,
-        "total_frames": frames,
-        "total_tasks": tasks,
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": fps,
-        "splits": {"train": f"0:{episodes}"},
-        "data_path": f"data/{_FILE}",
-        "video_path": None,
-        "features": features,
-    }
-
-
-class Film(NamedTuple):
-    """Video of motions."""
-
-    calibration: dict[str, Any]
-    """See `calibration`."""
-    pixels: list[np.ndarray]
-    """(n, 3) from 0 to 1 for each motion: some pixels of every frame."""
-
-
-def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) -> Film:
-    """Writes the video of all motions in sequence, from a camera that shows all of them."""
-    camera, pixels = camera_for(motions), list[np.ndarray]()
-
-    def frames() -> Iterator[np.ndarray]:
-        """Yields every frame, and keeps some of its pixels."""
-        for motion in motions:
-            kept = []
-            for picture in pictures(motion, camera):
-                kept.append(picture.reshape(-1, 3)[::_COUNTED] / 255)
-                yield picture
-            pixels.append(np.concatenate(kept))
-
-    save_video(path, frames(), SIZE, frame_rate, _KEYFRAMES)
-    return Film(calibration(camera), pixels)
-
-
-def camera_for(motions: Sequence[GraspMotion]) -> Camera:
-    """Returns a camera that shows hands and objects of all motions."""
-    points = np.concatenate([_extent(motion) for motion in motions])
-    return fit(points[ConvexHull(points).vertices], _DIRECTION, SIZE[0] / SIZE[1])
-
-
-def _extent(motion: GraspMotion) -> np.ndarray:
-    """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
-    found = []
-    skin = skin_of_motion(motion)
-    for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
-        hand, thing = _shapes(motion, skin, frame)[:2]
-        found += [
-            hand.vertices,
-            Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices),
-        ]
-        found[-1] = found[-1] + thing.position
-    return np.concatenate(found)
-
-
-def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
-    """(height, width, 3) uint8 of every frame of a motion."""
-    skin = skin_of_motion(motion)
-    with ThreadPoolExecutor(cores()) as pool:
-        frames = range(len(motion.time))
-        yield from pool.map(
-            lambda frame: render_scene(_shapes(motion, skin, frame), camera, SIZE), frames
-        )
-
-
-def calibration(camera: Camera) -> dict[str, Any]:
-    """Parameters of the pinhole camera in the convention of computer vision: x right, y down, z
-    forward.
-    """
-    right, up, forward = camera.axes()
-    focal = SIZE[1] / 2 / np.tan(np.radians(camera.field_of_view) / 2)
-    return {
-        "model": (
-            "pinhole, no distortion; x right, y down, z forward; pixel (0, 0) is the upper left "
-            "one's centre"
-        ),
-        "width": SIZE[0],
-        "height": SIZE[1],
-        "intrinsics": [
-            [focal, 0.0, SIZE[0] / 2 - 0.5],
-            [0.0, focal, SIZE[1] / 2 - 0.5],
-            [0.0, 0.0, 1.0],
-        ],
-        "camera_to_world": [
-            *np.column_stack([right, -up, forward, camera.position]).tolist(),
-            [0.0, 0.0, 0.0, 1.0],
-        ],
-    }
-
-
-def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
-    """Shapes of the hand, the object, the arm, and the table while it is present."""
-    hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
-    mesh = motion.object_vertices, motion.object_faces
-    thing = object_shape(
-        mesh, motion.object_position[frame], motion.object_quaternion[frame], motion.colours
-    )
-    arm = arm_shapes(motion.arm, frame) if motion.arm else []
-    return [
-        hand,
-        thing,
-        *arm,
-        *([table_shape(motion.object_position[0])] if motion.table[frame] else []),
-    ]
+    features: dict[str, Any] = {}
+    for column, numbers in names.items():
+        features[column] = {"dtype": "float32", "shape": [len(numbers)], "names": numbers}
+    for column, dtype in {"timestamp": "float32", **_COUNTERS}.items():
+        features[column] = {"dtype": dtype, "shape": [1], "names": None}
+    return features

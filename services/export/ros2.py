@@ -9,7 +9,7 @@ one).
 import json
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import (
@@ -29,7 +29,7 @@ from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import OBJECT, bodies
 from congrasp.services.export.motion import GraspMotion, robot_joints
 from congrasp.services.export.surfaces import COLOURS, arm_meshes
-from congrasp.services.export.trajectory import joint_trajectory
+from congrasp.services.export.trajectory import JointTrajectory, joint_trajectory
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.record.palette import colours_at
 
@@ -55,13 +55,21 @@ or empty.
 """
 
 
+class _Topic(NamedTuple):
+    """A topic of the bag."""
+
+    kind: str
+    """Type of its messages."""
+    messages: Sequence[_Content]
+
+
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero
     means any time.
     """
     (motion,) = motions
     store = get_typestore(Stores.ROS2_HUMBLE)
-    position, velocity, stamps = joint_trajectory(motion, motion.joint_position.astype(float))
+    trajectory = joint_trajectory(motion, motion.joint_position.astype(float))
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         about = facts(
             motion,
@@ -70,102 +78,124 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             quaternion="by name",
         )
         bag.set_custom_data("congrasp", json.dumps(about))
-        for topic, (kind, messages) in _topics(motion, position, velocity, stamps).items():
-            qos = [] if topic in _OFTEN else [_LATCHED]
-            channel = bag.add_connection(topic, kind, typestore=store, offered_qos_profiles=qos)
-            for stamp, content in zip(stamps, messages, strict=False):
-                bag.write(channel, stamp, store.serialize_cdr(_message(store, kind, content), kind))
+        for name, topic in _topics(motion, trajectory).items():
+            qos = [] if name in _OFTEN else [_LATCHED]
+            channel = bag.add_connection(
+                name, topic.kind, typestore=store, offered_qos_profiles=qos
+            )
+            for stamp, content in zip(trajectory.stamps, topic.messages, strict=False):
+                message = _message(store, topic.kind, content)
+                bag.write(channel, stamp, store.serialize_cdr(message, topic.kind))
 
 
-def _topics(
-    motion: GraspMotion, position: np.ndarray, velocity: np.ndarray, stamps: Sequence[int]
-) -> dict[str, tuple[str, Sequence[_Content]]]:
-    """Types and messages of all topics, from the joints' positions and velocities (T, N) at T times
-    in ns.
-    """
-    frames = _transforms(motion, stamps)
-    palm = next(
-        i for i, transform in enumerate(frames[0]) if transform["header"]["frame_id"] == _WORLD
-    )
-    wrist, joints = frames[0][palm]["child_frame_id"], robot_joints(motion)
-    rows = list(zip(position, velocity, stamps, strict=True))
-    points = [
-        {"positions": q, "velocities": v, "time_from_start": _time(stamp)} for q, v, stamp in rows
-    ]
-    poses = [
-        {"transforms": [frame[palm]["transform"]], "time_from_start": _time(stamp)}
-        for frame, stamp in zip(frames, stamps, strict=True)
-    ]
-    trajectory = {"header": _header(0, wrist), "joint_names": joints, "points": points}
-    path = {"header": _header(0, _WORLD), "joint_names": [wrist], "points": poses}
-    states = [
-        {"header": _header(stamp, wrist), "name": joints, "position": q, "velocity": v}
-        for q, v, stamp in rows
-    ]
-    corners = motion.object_vertices[motion.object_faces.ravel()]
-    thing = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
-    if motion.colours:
-        thing["colors"] = [
-            _colour(each) for each in (colours_at(corners, motion.colours) / 255).tolist()
-        ]
-    topics: dict[str, tuple[str, Sequence[_Content]]] = {
-        "/robot_description": ("std_msgs/msg/String", [{"data": robot_urdf(motion)}]),
-        "/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", [trajectory]),
-        "/wrist_trajectory": ("trajectory_msgs/msg/MultiDOFJointTrajectory", [path]),
-        "/object": ("visualization_msgs/msg/Marker", [thing]),
+def _topics(motion: GraspMotion, trajectory: JointTrajectory) -> dict[str, _Topic]:
+    """All topics by name, from the trajectory of arm and fingers."""
+    transforms = _transforms(motion, trajectory.stamps)
+    palm = next(i for i, link in enumerate(transforms[0]) if link["header"]["frame_id"] == _WORLD)
+    wrist = transforms[0][palm]["child_frame_id"]
+    joints = robot_joints(motion)
+    points = []
+    wrist_points = []
+    states = []
+    for t, stamp in enumerate(trajectory.stamps):
+        time = _time(stamp)
+        position = trajectory.positions[t]
+        velocity = trajectory.velocities[t]
+        pose = transforms[t][palm]["transform"]
+        points.append({"positions": position, "velocities": velocity, "time_from_start": time})
+        wrist_points.append({"transforms": [pose], "time_from_start": time})
+        state = {
+            "header": _header(stamp, wrist),
+            "name": joints,
+            "position": position,
+            "velocity": velocity,
+        }
+        states.append(state)
+    path = {"header": _header(0, wrist), "joint_names": joints, "points": points}
+    wrist_path = {"header": _header(0, _WORLD), "joint_names": [wrist], "points": wrist_points}
+    topics = {
+        "/robot_description": _Topic("std_msgs/msg/String", [{"data": robot_urdf(motion)}]),
+        "/joint_trajectory": _Topic("trajectory_msgs/msg/JointTrajectory", [path]),
+        "/wrist_trajectory": _Topic("trajectory_msgs/msg/MultiDOFJointTrajectory", [wrist_path]),
+        "/object": _Topic("visualization_msgs/msg/Marker", [_object_marker(motion)]),
     }
-    if arm := motion.arm:
-        parts = [
-            _marker(name, arm.name, number, mesh.vertices[mesh.faces.ravel()], mesh.colour)
-            for name, meshes in arm_meshes(motion).items()
-            for number, mesh in enumerate(meshes)
-        ]
-        topics["/arm"] = ("visualization_msgs/msg/MarkerArray", [{"markers": parts}])
-    topics["/joint_states"] = ("sensor_msgs/msg/JointState", states)
-    topics["/tf"] = ("tf2_msgs/msg/TFMessage", [{"transforms": frame} for frame in frames])
+    if motion.arm:
+        markers = _arm_markers(motion, motion.arm.name)
+        topics["/arm"] = _Topic("visualization_msgs/msg/MarkerArray", [{"markers": markers}])
+    topics["/joint_states"] = _Topic("sensor_msgs/msg/JointState", states)
+    frames = [{"transforms": links} for links in transforms]
+    topics["/tf"] = _Topic("tf2_msgs/msg/TFMessage", frames)
     return topics
 
 
 def _message(store: Typestore, kind: str, content: _Content) -> Any:
     """A message of a type."""
+    fields = {}
+    for name, (node, field_type) in store.fielddefs[kind][1]:
+        fields[name] = _field(store, node, field_type, content.get(name))
+    return store.types[kind](**fields)
 
-    def value(node: Nodetype, of: Any, given: Any) -> Any:
-        """A field's value; `of` is the type of a field or, in a sequence, of its items."""
-        if node == Nodetype.NAME:
-            return _message(store, of, given or {})
-        if node == Nodetype.BASE:
-            return given if given is not None else "" if of[0] == "string" else 0
-        (item, type_of_item), _ = of
-        if item == Nodetype.BASE and type_of_item[0] != "string":
-            return np.array([] if given is None else given, type_of_item[0])
-        return [value(item, type_of_item, each) for each in given or ()]
 
-    fields = store.fielddefs[kind][1]
-    return store.types[kind](
-        **{name: value(node, of, content.get(name)) for name, (node, of) in fields}
-    )
+def _field(store: Typestore, node: Nodetype, field_type: Any, content: Any) -> Any:
+    """The value of a field, or of an item of a sequence.
+
+    Args:
+      store: types of messages.
+      node: kind of field.
+      field_type: its type; for a sequence, that of its items and its length.
+      content: content of the field; None for zero, false or empty.
+    """
+    if node == Nodetype.NAME:
+        return _message(store, field_type, content or {})
+    if node == Nodetype.BASE:
+        if content is not None:
+            return content
+        return "" if field_type[0] == "string" else 0
+    (item, item_type), _ = field_type
+    if item == Nodetype.BASE and item_type[0] != "string":
+        return np.array([] if content is None else content, item_type[0])
+    return [_field(store, item, item_type, element) for element in content or ()]
 
 
 def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
     """TF of all bodies at each of T times in ns."""
-    found = bodies(motion)
-    parents = [found[body.parent].name if body.parent >= 0 else _WORLD for body in found]
-    turns = [body.rotation.as_quat() for body in found]
-    places = [np.broadcast_to(body.translation, (len(stamps), 3)) for body in found]
-    return [
-        [
-            {
-                "header": _header(stamp, parents[i]),
-                "child_frame_id": body.name,
-                "transform": {
-                    "translation": _named("xyz", places[i][t]),
-                    "rotation": _named("xyzw", turns[i][t]),
-                },
+    motion_bodies = bodies(motion)
+    names = [body.name for body in motion_bodies]
+    parents = [names[body.parent] if body.parent >= 0 else _WORLD for body in motion_bodies]
+    turns = [body.rotation.as_quat() for body in motion_bodies]
+    places = [np.broadcast_to(body.translation, (len(stamps), 3)) for body in motion_bodies]
+    frames = []
+    for t, stamp in enumerate(stamps):
+        transforms = []
+        for i, name in enumerate(names):
+            pose = {
+                "translation": _named("xyz", places[i][t]),
+                "rotation": _named("xyzw", turns[i][t]),
             }
-            for i, body in enumerate(found)
-        ]
-        for t, stamp in enumerate(stamps)
-    ]
+            header = _header(stamp, parents[i])
+            transforms.append({"header": header, "child_frame_id": name, "transform": pose})
+        frames.append(transforms)
+    return frames
+
+
+def _object_marker(motion: GraspMotion) -> dict[str, Any]:
+    """The object, with the colours of its corners if they are known, as a marker."""
+    corners = motion.object_vertices[motion.object_faces.ravel()]
+    marker = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
+    if motion.colours:
+        colours = colours_at(corners, motion.colours) / 255
+        marker["colors"] = [_colour(colour) for colour in colours.tolist()]
+    return marker
+
+
+def _arm_markers(motion: GraspMotion, arm: str) -> list[dict[str, Any]]:
+    """The meshes of the links of an arm as markers; `arm` is its name."""
+    markers = []
+    for link, meshes in arm_meshes(motion).items():
+        for number, mesh in enumerate(meshes):
+            corners = mesh.vertices[mesh.faces.ravel()]
+            markers.append(_marker(link, arm, number, corners, mesh.colour))
+    return markers
 
 
 def _marker(

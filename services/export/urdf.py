@@ -12,8 +12,12 @@ from congrasp.services.export.frames import capsules, link_origins, pose_matrice
 from congrasp.services.export.motion import GraspMotion, robot_joints
 from congrasp.services.record.episode import UNLIMITED, MovedArm
 
-_MASS, _INERTIA = "0.01", "1e-6"
-"""Placeholders for every link: only the kinematics is exported, but some readers need them."""
+_MASS = "0.01"
+"""Placeholder for every link: only the kinematics is exported, but some readers need a mass."""
+_INERTIA = "1e-6"
+"""Placeholder for every link, like the mass."""
+_EFFORT = "10"
+"""Placeholder for every joint, like the mass."""
 _SPEED = 20.0
 """Speed limit of the hand's joints, rad/s."""
 
@@ -43,12 +47,13 @@ def robot_urdf(motion: GraspMotion) -> str:
     of the robot.
     """
     arm = motion.arm
-    robot = ET.Element("robot", name=f"{arm.name}_{motion.hand}" if arm else motion.hand)
+    name = f"{arm.name}_{motion.hand}" if arm else motion.hand
+    robot = ET.Element("robot", name=name)
     if arm:
         _add_arm(robot, arm)
         turn = Rotation.from_quat(arm.hand_quaternion, scalar_first=True)
-        carrier, palm = str(arm.link_names[arm.hand_link]), str(motion.link_names[0])
-        _joint(robot, "mount", "fixed", carrier, palm, arm.hand_position, turn)
+        ends = _Ends(str(arm.link_names[arm.hand_link]), str(motion.link_names[0]))
+        _add_joint(robot, "mount", "fixed", ends, arm.hand_position, turn)
     _add_hand(robot, motion)
     ET.indent(robot)
     return ET.tostring(robot, "unicode")
@@ -56,102 +61,126 @@ def robot_urdf(motion: GraspMotion) -> str:
 
 def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
-    names = robot_joints(motion)[-len(motion.joint_names) :]
+    joint_names = robot_joints(motion)[-len(motion.joint_names) :]
+    link_names = [str(name) for name in motion.link_names]
     origins = link_origins(motion)
-    for i, (name, parent) in enumerate(
-        zip(map(str, motion.link_names), motion.link_parent, strict=True)
-    ):
-        moved = np.flatnonzero(motion.joint_link == i)
-        joints = [
-            _Joint(
-                names[j],
-                "revolute",
-                motion.joint_axis[j],
-                motion.joint_anchor[j] - origins[i],
-                limits,
-                _SPEED,
+    for i, parent in enumerate(motion.link_parent):
+        joints = []
+        for j in np.flatnonzero(motion.joint_link == i):
+            joint = _Joint(
+                joint_names[j],
+                kind="revolute",
+                axis=motion.joint_axis[j],
+                anchor=motion.joint_anchor[j] - origins[i],
+                limits=motion.joint_limits[j],
+                speed=_SPEED,
             )
-            for j, limits in zip(moved, motion.joint_limits[moved], strict=True)
-        ]
+            joints.append(joint)
         if parent >= 0:
+            ends = _Ends(link_names[parent], link_names[i])
             place = origins[i] - origins[parent]
-            _add_link(
-                robot, name, str(motion.link_names[parent]), place, Rotation.identity(), joints
-            )
-        _add_capsules(_link(robot, name), motion, i)
+            _add_joints(robot, joints, ends, place, Rotation.identity())
+        _add_capsules(_add_link(robot, link_names[i]), motion, i)
 
 
 def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
     """Adds the arm's links, without meshes."""
-    names, places = arm.link_names.tolist(), arm.link_position[0]
+    names = arm.link_names.tolist()
+    places = arm.link_position[0]
     turns = Rotation.from_quat(arm.link_quaternion[0], scalar_first=True)
-    _link(robot, names[0])
+    _add_link(robot, names[0])
     for i, parent in enumerate(arm.link_parent.tolist()[1:], 1):
-        joints: list[_Joint] = []
-        back = np.eye(4)  # from the link's frame at the first frame's angles to its frame at zero
-        for j in np.flatnonzero(arm.joint_link == i)[::-1]:
-            slides, axis, anchor = bool(arm.joint_slides[j]), arm.joint_axis[j], arm.joint_anchor[j]
-            limited = np.abs(arm.joint_limits[j]).max() < UNLIMITED
-            kind = "prismatic" if slides else "revolute" if limited else "continuous"
-            joints.insert(
-                0,
-                _Joint(
-                    str(arm.joint_names[j]),
-                    kind,
-                    axis,
-                    anchor,
-                    arm.joint_limits[j],
-                    arm.joint_speed[j],
-                ),
-            )
-            way = -arm.joint_position[0, j] * axis
-            turn = Rotation.identity() if slides else Rotation.from_rotvec(way)
-            shift = way if slides else anchor - turn.apply(anchor)
-            back = back @ pose_matrices(shift[None], turn)[0]
         inverse = turns[parent].inv()
-        local = (
-            pose_matrices(inverse.apply(places[i] - places[parent])[None], inverse * turns[i])[0]
-            @ back
-        )
-        _add_link(
-            robot,
-            names[i],
-            names[parent],
-            local[:3, 3],
-            Rotation.from_matrix(local[:3, :3]),
-            joints,
-        )
-        _link(robot, names[i])
+        offset = inverse.apply(places[i] - places[parent])
+        pose = pose_matrices(offset[None], inverse * turns[i])[0]
+        joints = []
+        for j in np.flatnonzero(arm.joint_link == i):
+            joints.append(_joint_of_arm(arm, j))
+        pose_at_zero = pose @ _frame_at_zero(arm, i)
+        turn = Rotation.from_matrix(pose_at_zero[:3, :3])
+        _add_joints(robot, joints, _Ends(names[parent], names[i]), pose_at_zero[:3, 3], turn)
+        _add_link(robot, names[i])
 
 
-def _add_link(
-    robot: ET.Element,
-    name: str,
-    carrier: str,
-    place: np.ndarray,
-    turn: Rotation,
-    joints: Sequence[_Joint],
+def _joint_of_arm(arm: MovedArm, j: int) -> _Joint:
+    """The arm's joint of an index."""
+    kind = "revolute"
+    if arm.joint_slides[j]:
+        kind = "prismatic"
+    elif np.abs(arm.joint_limits[j]).max() >= UNLIMITED:
+        kind = "continuous"
+    return _Joint(
+        str(arm.joint_names[j]),
+        kind=kind,
+        axis=arm.joint_axis[j],
+        anchor=arm.joint_anchor[j],
+        limits=arm.joint_limits[j],
+        speed=arm.joint_speed[j],
+    )
+
+
+def _frame_at_zero(arm: MovedArm, link: int) -> np.ndarray:
+    """(4, 4) pose of a link with its joints at zero, in its frame with the first frame's angles."""
+    pose = np.eye(4)
+    for j in np.flatnonzero(arm.joint_link == link)[::-1]:
+        way = -arm.joint_position[0, j] * arm.joint_axis[j]
+        if arm.joint_slides[j]:
+            turn = Rotation.identity()
+            shift = way
+        else:
+            anchor = arm.joint_anchor[j]
+            turn = Rotation.from_rotvec(way)
+            shift = anchor - turn.apply(anchor)
+        pose = pose @ pose_matrices(shift[None], turn)[0]
+    return pose
+
+
+class _Ends(NamedTuple):
+    """Links that a joint connects."""
+
+    parent: str
+    child: str
+
+
+def _add_joints(
+    robot: ET.Element, joints: Sequence[_Joint], ends: _Ends, place: np.ndarray, turn: Rotation
 ) -> None:
-    """Adds the joints between a link and its carrier; `place` and `turn` are its pose there with
-    all joints at zero.
+    """Adds the joints between a link and its carrier, with the links between them.
+
+    Args:
+      robot: the file.
+      joints: from the carrier to the link; a fixed joint follows if the last one's anchor is not
+        the link's origin.
+      ends: carrier and link.
+      place: (3,) position of the link in its carrier with all joints at zero, m.
+      turn: rotation from the link's frame to its carrier's with all joints at zero.
     """
-    for number, (joint, kind, axis, anchor, limits, speed) in enumerate(joints):
-        ends = number == len(joints) - 1 and np.allclose(anchor, 0, atol=1e-9)
-        child = name if ends else f"{name}_{number}"
-        element = _joint(robot, joint, kind, carrier, child, place + turn.apply(anchor), turn)
-        ET.SubElement(element, "axis", xyz=_numbers(axis))
-        lower, upper = map(_number, limits)
+    carrier, link = ends
+    for number, joint in enumerate(joints):
+        is_last = number == len(joints) - 1 and np.allclose(joint.anchor, 0, atol=1e-9)
+        child = link if is_last else f"{link}_{number}"
+        origin = place + turn.apply(joint.anchor)
+        element = _add_joint(robot, joint.name, joint.kind, _Ends(carrier, child), origin, turn)
+        ET.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        lower, upper = joint.limits
         ET.SubElement(
-            element, "limit", lower=lower, upper=upper, effort="10", velocity=_number(speed)
+            element,
+            "limit",
+            lower=_number(lower),
+            upper=_number(upper),
+            effort=_EFFORT,
+            velocity=_number(joint.speed),
         )
-        if not ends:
-            _link(robot, child)
-        carrier, place, turn = child, -anchor, Rotation.identity()
-    if carrier != name:
-        _joint(robot, f"{name}_fixed", "fixed", carrier, name, place, turn)
+        if not is_last:
+            _add_link(robot, child)
+        carrier = child
+        place = -joint.anchor
+        turn = Rotation.identity()
+    if carrier != link:
+        _add_joint(robot, f"{link}_fixed", "fixed", _Ends(carrier, link), place, turn)
 
 
-def _link(robot: ET.Element, name: str) -> ET.Element:
+def _add_link(robot: ET.Element, name: str) -> ET.Element:
     """Adds a link with a mass."""
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
@@ -162,22 +191,14 @@ def _link(robot: ET.Element, name: str) -> ET.Element:
     return link
 
 
-def _joint(
-    robot: ET.Element,
-    name: str,
-    kind: str,
-    parent: str,
-    child: str,
-    offset: np.ndarray,
-    turn: Rotation,
+def _add_joint(
+    robot: ET.Element, name: str, kind: str, ends: _Ends, offset: np.ndarray, turn: Rotation
 ) -> ET.Element:
     """Adds a joint at an offset (3,) and a rotation in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    with warnings.catch_warnings(
-        action="ignore"
-    ):  # of a pitch of 90 degrees, where any roll will do
+    ET.SubElement(joint, "parent", link=ends.parent)
+    ET.SubElement(joint, "child", link=ends.child)
+    with warnings.catch_warnings(action="ignore"):  # any roll will do at a pitch of 90 degrees
         angles = turn.as_euler("xyz")
     ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(angles))
     return joint
@@ -185,15 +206,17 @@ def _joint(
 
 def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
     """Adds each capsule as a cylinder and two spheres, because URDF has no capsules."""
-    for number, length, radius, middle, turn in capsules(motion, index):
-        for end in motion.capsule_ends[number]:
-            ET.SubElement(_visual(link, end, np.zeros(3)), "sphere", radius=_number(radius))
-        if length:
-            visual = _visual(link, middle, turn.as_euler("xyz"))
-            ET.SubElement(visual, "cylinder", radius=_number(radius), length=_number(length))
+    for capsule in capsules(motion, index):
+        radius = _number(capsule.radius)
+        for end in motion.capsule_ends[capsule.number]:
+            sphere = _add_visual(link, end, np.zeros(3))
+            ET.SubElement(sphere, "sphere", radius=radius)
+        if capsule.length:
+            cylinder = _add_visual(link, capsule.middle, capsule.turn.as_euler("xyz"))
+            ET.SubElement(cylinder, "cylinder", radius=radius, length=_number(capsule.length))
 
 
-def _visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:
+def _add_visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:
     """Adds a shape at a position (3,) with angles (3,); returns its geometry."""
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_numbers(position), rpy=_numbers(angles))

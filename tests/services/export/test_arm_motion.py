@@ -25,7 +25,7 @@ from congrasp.services.arm.moved_arm import moved_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount
 from congrasp.services.export import formats, frames, urdf
 from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.lerobot import camera_for, pictures
+from congrasp.services.export.film import camera_for, pictures
 from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays, robot_joints
 from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.record.scene import check_episode, episode_entries
