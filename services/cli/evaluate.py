@@ -17,7 +17,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import engine_title
 from congrasp.services.assets.objects import named
 from congrasp.services.cli.console import in_range, say, tracked
-from congrasp.services.evaluate import pools, tables
+from congrasp.services.evaluate import exams, pools, tables
 from congrasp.services.evaluate.captured import captured_objects
 from congrasp.services.evaluate.columns import object_table, tables_of
 from congrasp.services.evaluate.experiment import Experiment, Track, Variation
@@ -71,7 +71,7 @@ class Evaluate:
     objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of
     RobustDexGrasp and of Isaac Lab's dexsuite; all: every table of one policy. Several may be
     named."""
-    exam: pools.Exam = "figures"
+    exam: exams.Exam = "figures"
     """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for
     published figures; development has seeds from 1,000,000. Training uses neither."""
     objects: pathlib.Path | None = None
@@ -116,8 +116,8 @@ class Evaluate:
     def __call__(self) -> int:
         """Evaluates, and prints and writes the results."""
         self._check()
-        given = read_entrants(self.policy, self.method)
-        lineup = line_up(self.table, given, self.hand, self.method)
+        entrants = read_entrants(self.policy, self.method)
+        lineup = line_up(self.table, entrants, self.hand, self.method)
         engine = resolve_physics(self.physics)
         many_objects = self._many_objects(engine)
         with tracked() as track:
@@ -164,7 +164,7 @@ class Evaluate:
             return None
         if self.objects:
             return pools.folder_pools(self.objects, engine)
-        count = self.pool or min(self.episodes, pools.MANY)
+        count = self.pool or min(self.episodes, exams.MANY)
         return pools.procedural_pools(count, engine, self.exam)
 
     def _experiment(
@@ -201,7 +201,7 @@ class Evaluate:
         """Returns the objects of all tables but `objects`."""
         if self.objects:
             return named.objects_of(self.objects, track=track)
-        return pools.exam_pool(self.exam, self.pool)
+        return exams.exam_pool(self.exam, self.pool)
 
     def _folder_of_rows(self, entrant: Entrant) -> pathlib.Path | None:
         """Folder for a policy's rows, from which a stopped evaluation resumes."""
@@ -292,7 +292,10 @@ def _partial_results(file: pathlib.Path) -> pathlib.Path:
 
 def _rows(evaluations: Sequence[tables.Evaluation]) -> list[Row]:
     """The rows of all policies."""
-    return [row for evaluation in evaluations for row in evaluation.rows]
+    rows: list[Row] = []
+    for evaluation in evaluations:
+        rows += evaluation.rows
+    return rows
 
 
 def _draw_evaluation(evaluation: tables.Evaluation, folder: pathlib.Path) -> None:

@@ -59,8 +59,8 @@ class Report:
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.services.assets.objects.named import objects_of
+        from congrasp.services.evaluate.exams import exam_pool
         from congrasp.services.evaluate.experiment import Experiment
-        from congrasp.services.evaluate.pools import exam_pool
         from congrasp.services.evaluate.report import report_on
         from congrasp.services.evaluate.scores import write_json
 

@@ -3,6 +3,7 @@ effect of noise.
 """
 
 import functools
+import itertools
 import math
 import pathlib
 from collections.abc import Callable, Sequence
@@ -28,12 +29,6 @@ from congrasp.services.viz.plots import (
     style,
 )
 
-_TITLES = {
-    spec.column or spec.name: (f"{constraint.title.capitalize()} error", spec.unit or "share")
-    for constraint in CONSTRAINTS
-    for spec in constraint.errors
-}
-"""Title and unit of each error, by its name in the rows."""
 _NOISES = {
     "joints": "Pose: normal error of every finger joint",
     "depth": "Pose: depth that it sinks into the object",
@@ -44,6 +39,19 @@ _RULE = "#e3e6ea"
 _PLOTTED_UNITS = {"rad": (1.0, "rad"), "m": (10.0, "dm")}
 """Factors and units with which angles and lengths fit one axis, by the units of errors."""
 _MAX_FILE_BYTES = 64 << 20
+
+
+def _titles_of_errors() -> dict[str, tuple[str, str]]:
+    """Title and unit of each error, by its name in the rows."""
+    titles = {}
+    for constraint in CONSTRAINTS:
+        title = f"{constraint.title.capitalize()} error"
+        for spec in constraint.errors:
+            titles[spec.column or spec.name] = (title, spec.unit or "share")
+    return titles
+
+
+_TITLES = _titles_of_errors()
 
 
 @default_style()
@@ -233,7 +241,8 @@ def _draw_success(rows: Sequence[Row]) -> Any:
 
 def _draw_errors(rows: Sequence[Row]) -> Any:
     """Draws cumulative distributions of the errors, one panel each."""
-    names = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
+    with_quantiles = set(itertools.chain.from_iterable(row.quantiles for row in rows))
+    names = [name for name in _TITLES if name in with_quantiles]
     figure, grid = panel_grid(
         len(names), 2.8, "Errors of successful episodes: share of episodes below"
     )

@@ -8,6 +8,7 @@ the objects of an exam.
 """
 
 import hashlib
+import itertools
 import json
 import pathlib
 from collections.abc import Callable, Sequence
@@ -50,6 +51,28 @@ _ATTEMPTS_PER_REFERENCE = 1.25
 _SEED = 0
 _MAX_FILES = 256
 """Most sets of references in the cache; a set for 64 objects takes about 3 MB."""
+
+
+def _constraint_of(region: int) -> str:
+    """Name of the constraint under which a region is grasped without a reference."""
+    for constraint in CONSTRAINTS:
+        if constraint.region == region and not constraint.from_reference:
+            return constraint.name
+    raise LookupError(f"no constraint grasps the region {region}")
+
+
+def _reference_columns() -> tuple[str, ...]:
+    """Columns of references in a constraint bank."""
+    constraints = {constraint.name for constraint in CONSTRAINTS if constraint.from_reference}
+    return tuple(
+        column for column in ConstraintBank._fields if column.partition("_")[0] in constraints
+    )
+
+
+_REGIONS = (_constraint_of(0), _constraint_of(1))
+"""Constraints of the grasps on the whole surface, and on the graspable region."""
+_ARRAYS = _reference_columns()
+"""Columns of references: fields of `Poses`, then results of `make_references`."""
 
 
 class References(NamedTuple):
@@ -105,17 +128,6 @@ def make(
     return references
 
 
-_REGIONS = tuple(
-    next(c.name for c in CONSTRAINTS if c.region == v and not c.from_reference) for v in range(2)
-)
-"""Constraints of the grasps on the whole surface, and on the graspable region."""
-_FROM_REFERENCES = {constraint.name for constraint in CONSTRAINTS if constraint.from_reference}
-_ARRAYS = tuple(
-    name for name in ConstraintBank._fields if name.partition("_")[0] in _FROM_REFERENCES
-)
-"""Columns of references: fields of `Poses`, then results of `make_references`."""
-
-
 class _GraspsOfRegion(NamedTuple):
     """Grasps of one region (whole surface, or graspable region) of each object."""
 
@@ -127,6 +139,10 @@ class _GraspsOfRegion(NamedTuple):
     """(N,) int: episodes of each object so far."""
     grasps: list[list[Poses]]
     """At most `POSES` grasps of each object."""
+
+    def count_graspable(self) -> int:
+        """Returns the number of objects whose region can be grasped in some resting pose."""
+        return sum(len(rests) > 0 for rests in self.rests)
 
     def next_attempts(self) -> np.ndarray:
         """Returns the number (N,) of further episodes of each object."""
@@ -187,7 +203,8 @@ def _grasp_all(
                 [[] for _ in objects],
             )
         )
-    most = sum(POSES for region in regions for rests in region.rests if len(rests))
+    graspable = sum(region.count_graspable() for region in regions)
+    most = POSES * graspable
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
     with Episodes(
         policy, task, objects, hold=task.hold_steps, batch=size, physics=physics
@@ -203,12 +220,14 @@ def _grasp_all(
                     region.add(jax.tree.map(np.asarray, episodes.take_grasps()), count)
                     progress(_count_grasps(regions), most)
                 region.attempts[:] += attempts
-    return [[region.grasps[n] for region in regions] for n in range(len(objects))]
+    grasps_by_object = zip(*(region.grasps for region in regions), strict=True)
+    return [list(of_regions) for of_regions in grasps_by_object]
 
 
 def _count_grasps(regions: Sequence[_GraspsOfRegion]) -> int:
     """Number of grasps of all objects and regions."""
-    return sum(len(grasps) for region in regions for grasps in region.grasps)
+    grasps = itertools.chain.from_iterable(region.grasps for region in regions)
+    return sum(map(len, grasps))
 
 
 def with_references(

@@ -3,6 +3,7 @@ comparison.
 """
 
 import dataclasses
+import itertools
 import json
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,6 +15,7 @@ from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.io.files import write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.intervals import (
@@ -31,11 +33,25 @@ TABLES = {
     "cross": ("heading", "pose", "trajectory", "pose+trajectory"),
 }
 """Rows of the paper's tables, by active constraints; the aligned pairs are not in the paper."""
-ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
+
+
+def _columns_of_errors(constraint: Constraint) -> dict[str, str]:
+    """Names of the errors of a constraint in rows, by their names in the metrics of episodes."""
+    return {spec.name: spec.column or spec.name for spec in constraint.errors}
+
+
+def _units_of_errors() -> dict[str, str]:
+    """Units of the errors of all constraints, by their names in rows."""
+    units = {}
+    for constraint in CONSTRAINTS:
+        for spec in constraint.errors:
+            units[spec.column or spec.name] = spec.unit
+    return units
+
+
+ERRORS = {constraint.name: _columns_of_errors(constraint) for constraint in CONSTRAINTS}
 """Names of the errors of each constraint, in the metrics of episodes and in rows."""
-UNITS = {
-    spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors
-}
+UNITS = _units_of_errors()
 """Units of the errors, by their names in rows."""
 _FORCE_COLUMNS = (
     "link_force_mean",
@@ -131,8 +147,8 @@ class Row:
         # Older files lack constraints that were added later.
         errors = {name: row.get(name) for name in UNITS}
         forces = {name: row[name] for name in _FORCE_COLUMNS}
-        known = {*fields, *errors, *forces, "return"}
-        plausibility = {name: value for name, value in row.items() if name not in known}
+        other_columns = {*fields, *errors, *forces, "return"}
+        plausibility = {name: value for name, value in row.items() if name not in other_columns}
         paper = PaperRow(**row["paper"]) if row["paper"] else None
         fields |= {"paper": paper, "plausibility": plausibility}
         return cls(**fields, errors=errors, forces=forces, episode_return=row["return"])
@@ -141,7 +157,8 @@ class Row:
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
     """Names of the rows of some of `TABLES` whose constraints the task's policy supports."""
     supported = []
-    for row in dict.fromkeys(row for table in tables for row in TABLES[table]):
+    rows = itertools.chain.from_iterable(TABLES[table] for table in tables)
+    for row in dict.fromkeys(rows):
         constraints = row.removesuffix(ALIGNED).split("+")
         if set(constraints) <= set(task.constraints):
             supported.append(row)

@@ -14,8 +14,9 @@ from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.task.methods import takes
 from congrasp.services.evaluate.experiment import Experiment, Result, Variation
 from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.many_objects import evaluate_pools
 from congrasp.services.evaluate.plan import from_references
-from congrasp.services.evaluate.pools import Pools, evaluate_pools
+from congrasp.services.evaluate.pools import Pools
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 from congrasp.services.evaluate.variations import NOISE, PEERS, SENSING, Center, payload
@@ -76,11 +77,9 @@ def evaluate_tables(
         requested = {*TABLES, *_OTHER_TABLES}
     if not takes(task.method, Variation().constraint):
         requested -= _TABLES_OF_HEADINGS
-    constraints = [
-        name
-        for name in known_rows([table for table in TABLES if table in requested], task)
-        if takes(task.method, name)
-    ]
+    tables_of_constraints = [table for table in TABLES if table in requested]
+    known = known_rows(tables_of_constraints, task)
+    constraints = [name for name in known if takes(task.method, name)]
     if not constraints and not requested & _OTHER_TABLES:
         raise CongraspError(
             f"The method '{task.method}' has no row in these tables.", "Pass another --table."

@@ -17,13 +17,14 @@ from congrasp.common.policy.bundle import content_hash
 from congrasp.common.wire.codec import encode
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.captured import CapturedObjects, captured_objects
+from congrasp.services.evaluate.exams import MANY, exam_pool
 from congrasp.services.evaluate.experiment import Experiment, Track, Variation
 from congrasp.services.evaluate.lineup import Entrant, facts
 from congrasp.services.evaluate.pages import count_causes
 from congrasp.services.evaluate.paper.parts import Part
 from congrasp.services.evaluate.pictures import failure_sheets
 from congrasp.services.evaluate.plan import NOMINAL_FRICTION
-from congrasp.services.evaluate.pools import MANY, Pools, exam_pool, procedural_pools
+from congrasp.services.evaluate.pools import Pools, procedural_pools
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.evaluate.tables import Evaluation, evaluate_tables
 from congrasp.services.viz.sheets import save_png

@@ -118,7 +118,7 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
         )
 
     monkeypatch.setattr(tables, "evaluate_tables", evaluate_tables)
-    monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
+    monkeypatch.setattr("congrasp.services.evaluate.exams.exam_pool", lambda exam, count: [])
     files = [str(saved("ours")), f"no-feedforward={saved('no-feedforward')}"]
     command = [
         "--table",

@@ -8,7 +8,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
 from congrasp.common.task.constraints import blocks
-from congrasp.services.evaluate import pools
+from congrasp.services.evaluate import exams
 from congrasp.services.evaluate.episodes import identity, reference
 from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row, protocol
 from congrasp.services.evaluate.scores import TABLES
@@ -27,8 +27,8 @@ def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
         "parallel_map",
         lambda make, seeds, families: asked.append((list(seeds), families)),
     )
-    pools.exam_pool("figures")
-    pools.exam_pool("development", 5)
+    exams.exam_pool("figures")
+    exams.exam_pool("development", 5)
     (figures, families), (development, _) = asked
     assert sorted(families) == sorted(procedural.FAMILIES), "one object of each family"
     assert figures == list(range(FIGURES_SEED, FIGURES_SEED + len(procedural.FAMILIES)))
@@ -36,9 +36,9 @@ def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
 
 
 def test_the_development_exam_never_reaches_objects_for_figures():
-    assert pools.first_seed("development", 1_000_000) == HELD_OUT_SEED
+    assert exams.first_seed("development", 1_000_000) == HELD_OUT_SEED
     with pytest.raises(CongraspError, match="smaller --pool"):
-        pools.first_seed("development", 1_000_001)
+        exams.first_seed("development", 1_000_001)
 
 
 def test_episodes_that_begin_alike_are_one(conditions):

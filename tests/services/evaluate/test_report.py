@@ -109,7 +109,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         return Evaluation(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
     monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
-    monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
+    monkeypatch.setattr("congrasp.services.evaluate.exams.exam_pool", lambda exam, count: [])
     command = [
         "report",
         str(tmp_path),

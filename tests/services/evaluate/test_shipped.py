@@ -6,9 +6,9 @@ import pytest
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
+from congrasp.services.evaluate.exams import exam_pool
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.intervals import NORMAL_95
-from congrasp.services.evaluate.pools import exam_pool
 from congrasp.services.evaluate.results import recorded
 
 _SIGMAS = 3

@@ -16,15 +16,10 @@ from congrasp.common.task.metrics import metric_names
 from congrasp.services.evaluate import experiment
 from congrasp.services.evaluate import pools as of_objects
 from congrasp.services.evaluate.episodes import Sample
+from congrasp.services.evaluate.exams import FAMILIES
 from congrasp.services.evaluate.experiment import Experiment
-from congrasp.services.evaluate.pools import (
-    FAMILIES,
-    Loaded,
-    Pools,
-    evaluate_pools,
-    folder_pools,
-    procedural_pools,
-)
+from congrasp.services.evaluate.many_objects import evaluate_pools
+from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, procedural_pools
 from tests.task import TASK, policy
 
 OBJECTS = procedural.generate_many(5, 1_000_000)

@@ -1,0 +1,175 @@
+"""Rows of the heading constraint on many objects, evaluated pool by pool.
+
+The result of a pool is a few numbers per episode, which can be stored on disk, so that a stopped
+evaluation resumes at its current pool.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import math
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import keep, read_kept
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.episodes import Episodes, Sample, joined
+from congrasp.services.evaluate.experiment import (
+    MEASURED,
+    STRESSED,
+    Experiment,
+    Variation,
+    advance_from,
+)
+from congrasp.services.evaluate.object_groups import object_groups
+from congrasp.services.evaluate.pools import Pool, Pools, prepared
+from congrasp.services.evaluate.scores import Row, RowDescription, summarise
+
+
+class _ObjectFacts(NamedTuple):
+    """Facts by which objects are grouped."""
+
+    name: str
+    largest_side: float
+    """m."""
+    mass: float
+    """kg."""
+    family: str
+
+
+class _Result(NamedTuple):
+    """Result of a pool."""
+
+    sample: Sample
+    """Its episodes."""
+    objects: list[_ObjectFacts]
+    left_out: list[str]
+    """Names of objects that could not be used."""
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.sample.values.get("success", ()))
+
+    def message(self) -> Message:
+        """Returns the result for a file."""
+        return Message(self.sample.arrays(), {"objects": self.objects, "left_out": self.left_out})
+
+
+def evaluate_pools(
+    experiment: Experiment, pools: Pools, stored: pathlib.Path | None = None
+) -> list[Row]:
+    """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass
+    and family.
+
+    Args:
+      experiment: policy and settings; `episodes` is the least total number, and every object has
+        the same number.
+      pools: pools of objects.
+      stored: folder for results of pools, from which an evaluation with the same arguments resumes;
+        None stores none.
+
+    Raises:
+      CongraspError: the hand can approach none of the objects.
+    """
+    number = len(pools.make)
+    episodes_of_object = math.ceil(experiment.episodes / (pools.size * number))
+    total = episodes_of_object * pools.size * number
+    advance = experiment.track("Episodes on many objects", total)
+    experiment = dataclasses.replace(
+        experiment,
+        constraints=None,
+        episodes=episodes_of_object * pools.size,
+        measured=pools.size * number <= MEASURED,
+    )
+    files: list[pathlib.Path | None] = [None] * number
+    if stored is not None:
+        name = experiment.digest(pools.source, pools.size)
+        files = [stored / f"{name}-{n:05d}.safetensors" for n in range(number)]
+    results = {}
+    for n, file in enumerate(files):
+        message = None if file is None else read_kept(file)
+        if message is not None:
+            results[n] = _stored(message)
+    missing = [n for n in range(number) if n not in results]
+    with contextlib.ExitStack() as stack, prepared(experiment, pools, missing) as ready:
+        running: Episodes | None = None
+        for pool in ready:
+            if pool.real and not running:
+                running = stack.enter_context(pool.experiment.simulator())
+            finished = sum(result.episodes for result in results.values())
+            progress = functools.partial(advance_from, advance, finished)
+            result = _simulated(running, pool, progress, max(0, STRESSED - finished))
+            if finished:  # forces are read from the first pool
+                result = result._replace(sample=result.sample.without_forces())
+            n = pool.experiment.pool
+            results[n] = result
+            file = files[n]
+            if file is not None:
+                keep(file, result.message(), number)
+    return _rows([results[n] for n in sorted(results)], experiment)
+
+
+def _simulated(
+    running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int
+) -> _Result:
+    """Simulates the episodes of a pool, if it has objects."""
+    if not running or not pool.real:
+        return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
+    experiment = pool.experiment
+    row = Variation()
+    plan = experiment.plan(row)
+    sample = experiment.sample(running, row, plan, progress, stressed=stressed)
+    facts = []
+    for obj in experiment.scaled[: pool.real]:
+        largest_side = float(np.ptp(obj.visual_vertices, axis=0).max())
+        facts.append(_ObjectFacts(obj.name, largest_side, float(obj.mass), obj.family))
+    not_padding = sample.values["object_index"] < pool.real
+    return _Result(sample.where(not_padding), facts, pool.left_out)
+
+
+def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
+    """Returns the rows of all objects, then of groups."""
+    left_out = list(itertools.chain.from_iterable(result.left_out for result in results))
+    results = [result for result in results if result.episodes]
+    if not results:
+        raise CongraspError(
+            "None of the objects can be approached.", "Scale them for the hand, or pass others."
+        )
+    first = 0
+    facts: list[_ObjectFacts] = []
+    for result in results:
+        result.sample.values["object_index"] = result.sample.values["object_index"] + first
+        first += len(result.objects)
+        facts += result.objects
+    sample = joined([result.sample for result in results])
+    index = sample.values["object_index"].astype(int)
+    sizes = np.array([obj.largest_side for obj in facts])
+    masses = np.array([obj.mass for obj in facts])
+    families = np.array([obj.family for obj in facts])
+    all_objects = RowDescription(
+        Variation().constraint,
+        experiment.hand.name,
+        [*(obj.name for obj in facts), *left_out],
+        held_2s=True,
+        method=experiment.task.method,
+        paper="objects",
+    )
+    rows = [summarise(all_objects, sample)]
+    for label, members in object_groups(sizes, masses, families):
+        chosen = members[index]
+        if chosen.any():
+            group = dataclasses.replace(all_objects, pool=int(members.sum()), group=label)
+            rows.append(summarise(group, sample.where(chosen)))
+    return rows
+
+
+def _stored(message: Message) -> _Result:
+    """Returns the result of its `message`."""
+    facts = [_ObjectFacts(*fields) for fields in message.meta["objects"]]
+    return _Result(Sample.of(message.arrays), facts, message.meta["left_out"])
