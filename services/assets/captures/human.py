@@ -49,9 +49,9 @@ def joint_positions(q: np.ndarray) -> np.ndarray:
     wrist frame, m.
     """
     data = posed(HUMAN, HUMAN.q_open)
-    return np.reshape(
-        [_joints(data, row) for row in q.reshape(-1, q.shape[-1])], (*q.shape[:-1], 5, 4, 3)
-    )
+    rows = q.reshape(-1, q.shape[-1])
+    joints = [_joints(data, row) for row in rows]
+    return np.reshape(joints, (*q.shape[:-1], 5, 4, 3))
 
 
 def fit(joints: np.ndarray) -> Fit:
@@ -63,17 +63,20 @@ def fit(joints: np.ndarray) -> Fit:
     Args:
       joints: (5, 4, 3) joints and tips of the captured hand, in the wrist frame, m.
     """
-    data, bones = posed(HUMAN, HUMAN.q_open), _directions(joints)
-    found = least_squares(
-        lambda q: (_directions(_joints(data, q)) - bones).ravel(),
-        np.zeros(len(HUMAN.joints)),
-        method="lm",
-    )
-    q = (found.x + np.pi) % (2 * np.pi) - np.pi
+    data = posed(HUMAN, HUMAN.q_open)
+    bones = _directions(joints)
+
+    def residuals(q: np.ndarray) -> np.ndarray:
+        """Differences (45,) of the bones' directions from those of the capture at angles (20,)."""
+        return (_directions(_joints(data, q)) - bones).ravel()
+
+    solution = least_squares(residuals, np.zeros(len(HUMAN.joints)), method="lm")
+    q = (solution.x + np.pi) % (2 * np.pi) - np.pi
     reached = _joints(data, q)
-    cosine = (_directions(reached) * bones).sum(-1).clip(-1, 1)
-    tips = np.linalg.norm(reached[:, 3] - joints[:, 3], axis=-1)
-    return Fit(q, float(np.sqrt((np.arccos(cosine) ** 2).mean())), float(tips.mean()))
+    cosines = (_directions(reached) * bones).sum(-1).clip(-1, 1)
+    angles = np.arccos(cosines)
+    tip_distances = np.linalg.norm(reached[:, 3] - joints[:, 3], axis=-1)
+    return Fit(q, float(np.sqrt((angles**2).mean())), float(tip_distances.mean()))
 
 
 def _joints(data: mujoco.MjData, q: np.ndarray) -> np.ndarray:
@@ -92,11 +95,15 @@ def _fingers() -> tuple[np.ndarray, np.ndarray]:
     body's frame, m.
     """
     model = posed(HUMAN, HUMAN.q_open).model
-    chains = [[link for link in HUMAN.links if link.name.startswith(finger)] for finger in FINGERS]
-    bodies = [[model.body(link.name).id for link in chain] for chain in chains]
-    return np.array(bodies), np.array(
-        [np.subtract(chain[-1].tip, link_origin(chain[-1])) for chain in chains]  # type: ignore[arg-type]
-    )
+    bodies = []
+    tips = []
+    for finger in FINGERS:
+        chain = [link for link in HUMAN.links if link.name.startswith(finger)]
+        last = chain[-1]
+        assert last.tip is not None
+        bodies.append([model.body(link.name).id for link in chain])
+        tips.append(np.subtract(last.tip, link_origin(last)))
+    return np.array(bodies), np.array(tips)
 
 
 def _directions(points: np.ndarray) -> np.ndarray:
@@ -150,10 +157,8 @@ def skeleton(
     joints, tips = model.skeleton(betas)
     if template is not None:
         vertices = read_vertices(template)
-        joints, tips = (
-            model.regressor @ vertices,
-            vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]],
-        )
+        joints = model.regressor @ vertices
+        tips = vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]]
     fingers = np.concatenate([joints[1:].reshape(5, 3, 3), tips[:, None]], 1)
     return Skeleton(joints[0], fingers)
 
@@ -164,9 +169,9 @@ def read_vertices(path: pathlib.Path) -> np.ndarray:
     Raises:
       CongraspError: it cannot be read, or holds several.
     """
-    found = load_geometry(path, "Download the file again.", maintain_order=True)
-    if not hasattr(found, "vertices"):
+    geometry = load_geometry(path, "Download the file again.", maintain_order=True)
+    if not hasattr(geometry, "vertices"):
         raise CongraspError(
             f"{path} does not hold a single mesh or point cloud.", "Download the file again."
         )
-    return np.asarray(found.vertices, float)
+    return np.asarray(geometry.vertices, float)
