@@ -194,23 +194,27 @@ def _frame_of(body: int) -> _Flange:
 
 
 def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> _Flange:
-    """Returns the flange of a name; if that is empty, of a usual site, or the end of the chain."""
+    """Returns the flange of a name; if that is empty, of a usual site, or the end of the chain.
+
+    Raises:
+      CongraspError: there is neither a site nor a body of that name.
+    """
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(model.nbody)]
-    usual_sites = [site for site in _SITES if site in sites]
-    if not name and usual_sites:
+    if not name:
+        usual_sites = [site for site in _SITES if site in sites]
+        if not usual_sites:
+            return _last_body(model)
         name = usual_sites[0]
     if name in sites:
         site = sites.index(name)
         return _Flange(int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site])
     if name in bodies:
         return _frame_of(bodies.index(name))
-    if name:
-        raise CongraspError(
-            f"{path} has no site or body '{name}'.",
-            f"It ends with {', '.join(bodies[-_MAX_LISTED_BODIES:])}.",
-        )
-    return _last_body(model)
+    raise CongraspError(
+        f"{path} has no site or body '{name}'.",
+        f"It ends with {', '.join(bodies[-_MAX_LISTED_BODIES:])}.",
+    )
 
 
 def _last_body(model: mujoco.MjModel) -> _Flange:

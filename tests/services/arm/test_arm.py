@@ -200,6 +200,16 @@ def test_a_gripper_makes_room_for_the_hand_and_angles_keep_their_units(folder, b
     )
 
 
+def test_unnamed_sites_are_not_the_flange(tmp_path):
+    tool = '<site pos="0 0 0.05"/><body name="tool" pos="0 0 0.1"><geom size=".01"/></body>'
+    marked = mjcf(tool).replace("<worldbody>", '<worldbody><site pos="0 0 0.5"/>')
+    (tmp_path / "marked.xml").write_text(marked)
+    arm = load_arm(tmp_path / "marked.xml")
+    assert arm.flange == "tool" and arm.joints == tuple(f"j{i}" for i in range(1, 8))
+    with pytest.raises(CongraspError, match=r"no chain of hinges and slides .* --flange"):
+        load_arm(tmp_path / "marked.xml", flange="world")
+
+
 def test_the_fingers_point_away_from_the_flange(robot):
     hand = get_hand("allegro")
     data = mujoco.MjData(robot.model)
