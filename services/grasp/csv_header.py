@@ -8,7 +8,7 @@ import itertools
 import re
 from typing import NamedTuple
 
-from congrasp.services.assets.objects.options import METRES
+from congrasp.services.assets.objects.units import METRES
 
 _UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
 _LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")

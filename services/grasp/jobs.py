@@ -19,9 +19,10 @@ from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
-from congrasp.services.assets.objects.materials import with_mass
+from congrasp.services.assets.objects.masses import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
-from congrasp.services.assets.objects.options import ImportOptions, check_options, size_in_words
+from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, save_grasp
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.keys import identity_of_constraints, identity_of_options, key_of

@@ -17,7 +17,7 @@ from congrasp.services.assets.captures.approach import approach
 from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
-from congrasp.services.assets.objects.options import size_in_words
+from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.csv_paths import HUGE, read_csv

@@ -14,13 +14,8 @@ from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import objects_at, one_object
-from congrasp.services.assets.objects.options import (
-    UNIT_NAMES,
-    ImportOptions,
-    Unit,
-    guessed_unit,
-    sizes_by_unit,
-)
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.units import UNIT_NAMES, Unit, guessed_unit, sizes_by_unit
 from congrasp.services.studio.server import BadRequest, Picture
 from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of

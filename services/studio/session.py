@@ -17,8 +17,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.objects.materials import MATERIALS, with_mass
-from congrasp.services.assets.objects.options import METRES
+from congrasp.services.assets.objects.masses import with_mass
+from congrasp.services.assets.objects.materials import MATERIALS
+from congrasp.services.assets.objects.units import METRES
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
 from congrasp.services.studio.grasping import Loaders, PolicyGrasping, Progress
 from congrasp.services.studio.jobs import Jobs

@@ -6,7 +6,8 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Joint, Link
-from congrasp.services.assets.objects.options import METRES, length
+from congrasp.services.assets.objects.sizes import length
+from congrasp.services.assets.objects.units import METRES
 
 MIN_LINK = 5e-4
 """Length of the smallest link, m."""

@@ -21,11 +21,12 @@ from congrasp.services.assets.objects.collision import Collision, Surfaces, conv
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.hollows import without_hollows
 from congrasp.services.assets.objects.interior import Enclosed, enclosed
-from congrasp.services.assets.objects.materials import Weight, weigh_evenly, weigh_parts
+from congrasp.services.assets.objects.masses import Weight, weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
-from congrasp.services.assets.objects.options import METRES, ImportOptions, metres_per_unit
+from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.sources import Source
+from congrasp.services.assets.objects.units import METRES, metres_per_unit
 from congrasp.services.assets.objects.winding import open_volume
 
 UNLABELLED = ("near half", "far half")

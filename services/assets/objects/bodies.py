@@ -7,7 +7,7 @@ import trimesh
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
-from congrasp.services.assets.objects.options import LONGEST
+from congrasp.services.assets.objects.units import LONGEST
 
 _MAX_FLATNESS = 0.08
 """Greatest thickness of a table, as a share of its width."""

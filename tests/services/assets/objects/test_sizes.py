@@ -12,11 +12,12 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import options
-from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.masses import guessed_mass, weigh
+from congrasp.services.assets.objects.materials import materials_of
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
-from congrasp.services.assets.objects.options import (
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.units import (
     METRES,
-    ImportOptions,
     guessed_unit,
     metres_per_unit,
     sizes_by_unit,
