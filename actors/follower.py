@@ -56,8 +56,8 @@ class Follower:
         ends = np.flatnonzero(self._followed.trace.terminal)
         if not len(ends):
             return None
-        whole = Trace(*(field[: ends[0] + 1] for field in self._followed.trace))
-        episode = self._followed._replace(trace=whole)
+        finished = Trace(*(field[: ends[0] + 1] for field in self._followed.trace))
+        episode = self._followed._replace(trace=finished)
         self._followed = None
         if len(ends) > 1:
             return None

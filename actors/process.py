@@ -229,19 +229,19 @@ class _Actor:
         """Produces rollouts until `stop` is set or the run ends."""
         try:
             self._warm_up(stop)
-            asked = time.monotonic()
+            requested_at = time.monotonic()
             while not stop.is_set():
                 ticket = self._link.acquire_ticket(_TICKET_TIMEOUT_S)
                 if ticket is None:
                     continue
-                granted = time.monotonic()
+                granted_at = time.monotonic()
                 if not self._refresh():
                     self._link.give_back(ticket)
                     stop.wait(_TICKET_TIMEOUT_S)
                     continue
                 assert self._bundle is not None
-                self._rollout(self._bundle, ticket, _Since(asked, granted))
-                asked = time.monotonic()
+                self._rollout(self._bundle, ticket, _Since(requested_at, granted_at))
+                requested_at = time.monotonic()
         finally:
             if self._references:
                 save_references(self._references, self._worker.bank)

@@ -376,8 +376,8 @@ def _traced(
     """Recorded values of a step for one environment, or for several."""
     state = scene.state
     features = scene.features
-    found = state.contact_found[where][..., None]
-    force = jnp.sum(jnp.where(found, state.contact_force[where], 0.0), -2)
+    is_contact = state.contact_found[where][..., None]
+    force = jnp.sum(jnp.where(is_contact, state.contact_force[where], 0.0), -2)
     errors = []
     for spec in metrics.specs(scene.task):
         numerator, denominator = transition.errors[spec.name]

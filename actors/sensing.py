@@ -40,15 +40,15 @@ def begin_sensing(hand: Hand, task: TaskConfig, initial: InitialConditions) -> S
         hand=hand, task=task, pose=pose, surface=initial.surface, goal=initial.goal
     )
     state = sensor.begin(initial.sensors, start)
-    shown = sensor.pose(state, jnp.zeros((len(pose), 3)))
+    sensed_pose = sensor.pose(state, jnp.zeros((len(pose), 3)))
     wrist = jnp.zeros((len(pose), 6))
     first = Readings(
         q=reset_state.q,
         u=wrist,
         q_target=reset_state.q,
         u_target=wrist,
-        object_position=shown[:, :3],
-        object_quaternion=shown[:, 3:],
+        object_position=sensed_pose[:, :3],
+        object_quaternion=sensed_pose[:, 3:],
     )
     return Sensing(initial.sensors, state, still(first, task.history))
 
@@ -57,14 +57,14 @@ def sense(sensing: Sensing, moment: Moment, newest: Action) -> Sensing:
     """Returns the sensors after a control step whose policy set the `newest` targets."""
     sensor = get_sensor(moment.task)
     state = sensor.step(sensing.parameters, sensing.sensor, moment)
-    shown = sensor.pose(state, moment.lift)
+    sensed_pose = sensor.pose(state, moment.lift)
     reading = Readings(
         q=moment.state.q,
         u=moment.state.u,
         q_target=newest.q_target,
         u_target=newest.u_target,
-        object_position=shown[:, :3],
-        object_quaternion=shown[:, 3:],
+        object_position=sensed_pose[:, :3],
+        object_quaternion=sensed_pose[:, 3:],
     )
     return sensing._replace(sensor=state, readings=push(sensing.readings, reading))
 

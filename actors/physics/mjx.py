@@ -260,6 +260,6 @@ def _strongest_contacts(
     values = jnp.concatenate([found, local, contact.pos, axes[:, 0] * sign, axes[:, 1] * sign], -1)
     strength = jnp.where(found[:, 0] > 0, jnp.linalg.norm(force, axis=-1), -1.0)
     touches_object = jnp.any(body == object_body, -1)
-    mine = touches_object & jnp.any(body == links[:, None, None], -1)
-    best_strength, best = jax.lax.top_k(jnp.where(mine, strength, -1.0), CONTACTS_PER_LINK)
+    is_of_link = touches_object & jnp.any(body == links[:, None, None], -1)
+    best_strength, best = jax.lax.top_k(jnp.where(is_of_link, strength, -1.0), CONTACTS_PER_LINK)
     return jnp.where(best_strength[..., None] >= 0, values[best], 0.0).reshape(-1)

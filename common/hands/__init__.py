@@ -96,9 +96,9 @@ def get_hand(reference: str) -> Hand:
         return HANDS[reference]()
     if reference.lstrip().startswith("{"):
         return hand_from_text(reference)
-    own = own_hands()
-    if reference in own:
-        return read_hand(own[reference])
+    user_hands = own_hands()
+    if reference in user_hands:
+        return read_hand(user_hands[reference])
     if reference.endswith(SUFFIX):
         return read_hand(pathlib.Path(reference))
     if reference.lower().endswith((".urdf", ".xml")):
@@ -106,5 +106,5 @@ def get_hand(reference: str) -> Hand:
         raise CongraspError(what, f"Pass the file that 'congrasp hands import {reference}' writes.")
     raise CongraspError(
         f"There is no hand '{reference}'.",
-        f"Choose one of: {', '.join(sorted({*HANDS, *own}))}; or name a hand file.",
+        f"Choose one of: {', '.join(sorted({*HANDS, *user_hands}))}; or name a hand file.",
     )

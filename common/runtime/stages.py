@@ -12,6 +12,8 @@ from typing import NamedTuple
 import jax
 import psutil
 
+_PROGRAM_SECONDS = 0.5
+"""Least duration of the work on a compiled program that is a stage."""
 _log = logging.getLogger(__name__)
 
 
@@ -24,8 +26,6 @@ class Stage(NamedTuple):
 
 
 _BEGAN = psutil.Process().create_time()
-_PROGRAM_SECONDS = 0.5
-"""Least duration of the work on a compiled program that is a stage."""
 _PROGRAM_WORK = {
     "/jax/core/compile/jaxpr_trace_duration": "trace",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",

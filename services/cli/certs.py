@@ -13,6 +13,8 @@ from congrasp.common.transport.security import CERTIFICATE_FILE, LISTENERS, ROLE
 
 Folder = Annotated[pathlib.Path, tyro.conf.Positional]
 Role = Literal["learner", "actor", "server", "client", "observer"]
+_SOON_DAYS = 30
+"""Days before its expiry from which on a certificate is marked."""
 
 
 def init(
@@ -123,17 +125,23 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
 
     revoked = Credentials(folder, "").revoked()
     table = Table("certificate", "expires (UTC)", "days left", "listens as")
-    found = certificates(folder)
-    for one in found:
-        style = "red" if one.days <= 0 else "yellow" if one.days < 30 else ""
-        left = (
-            "revoked" if one.name in revoked else f"{one.days:.0f}" if one.days > 0 else "expired"
-        )
-        table.add_row(
-            one.name, f"{one.expires:%Y-%m-%d %H:%M}", left, ", ".join(one.hosts), style=style
-        )
+    has_expired = False
+    for certificate in certificates(folder):
+        is_expired = certificate.days <= 0
+        has_expired |= is_expired
+        days_left = "expired" if is_expired else f"{certificate.days:.0f}"
+        if certificate.name in revoked:
+            days_left = "revoked"
+        style = ""
+        if is_expired:
+            style = "red"
+        elif certificate.days < _SOON_DAYS:
+            style = "yellow"
+        expires = f"{certificate.expires:%Y-%m-%d %H:%M}"
+        hosts = ", ".join(certificate.hosts)
+        table.add_row(certificate.name, expires, days_left, hosts, style=style)
     Console(markup=False).print(table)
-    return int(any(one.days <= 0 for one in found))
+    return int(has_expired)
 
 
 COMMANDS = {"init": init, "issue": issue, "revoke": revoke, "show": show}

@@ -8,7 +8,8 @@ import tyro
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.store import Catalogue
-from congrasp.services.assets.objects.options import ImportOptions, size_in_words
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.cli.console import bars, report_error, say
 
 if TYPE_CHECKING:

@@ -184,8 +184,8 @@ def _value(kind: Any) -> str:
 
 def _hint(default: str) -> str:
     """Suffix of an option's help."""
-    shown = default.strip("[']")  # a choice is shown as a list
-    return "" if shown in _QUIET else f"(default: {shown})"
+    text = default.strip("[']")  # a choice is shown as a list
+    return "" if text in _QUIET else f"(default: {text})"
 
 
 _REGISTRY = tyro.constructors.ConstructorRegistry()

@@ -152,15 +152,15 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
 
 def _given(texts: tuple[str, ...], needed: list[PolicyKey]) -> dict[PolicyKey, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-    given = {entrant.key: entrant for entrant in read_entrants(texts)}
-    for policy, entrant in given.items():
+    entrants = {entrant.key: entrant for entrant in read_entrants(texts)}
+    for policy, entrant in entrants.items():
         if policy not in needed:
             raise CongraspError(
                 f"The policy {entrant.file.name} is of the hand '{policy.hand}' and the method "
                 f"'{policy.method}'.",
                 "Name that hand with --hands, the first one for methods, or leave the policy out.",
             )
-    return given
+    return entrants
 
 
 def _check_device(names: list[str]) -> None:

@@ -59,8 +59,8 @@ def variable_error(error: Exception) -> CongraspError | None:
         named.append(_PLATFORMS)
     if not named:
         return None
-    said = text.splitlines()[0] if text else ""
-    return CongraspError(*_unusable(named[0], said))
+    first_line = text.splitlines()[0] if text else ""
+    return CongraspError(*_unusable(named[0], first_line))
 
 
 def _quoted(text: str, variables: Mapping[str, str]) -> list[str]:

@@ -78,8 +78,8 @@ class EpisodePolicy(Policy):
         packer = self._packing()
         rest, rested = self._resting(state, packer.settle)
         (answer,) = self._ask(began, [{**rest, **state}])
-        known = {**self._fields, **state}
-        reading = {name: numbers(name, known[name]) for name in HISTORY_FIELDS if name in known}
+        fields = {**self._fields, **state}
+        reading = {name: numbers(name, fields[name]) for name in HISTORY_FIELDS if name in fields}
         self._past = [reading, *self._past[: _MAX_HISTORY - 1]]
         # Copies, since the caller may change the answer
         targets = {"q_target": answer.q_target.copy(), "u_target": answer.u_target.copy()}

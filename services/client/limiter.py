@@ -94,14 +94,14 @@ class Limiter:
         requested = as_numbers(target, len(last))
         q = as_numbers(position, len(last))
         v = as_numbers(velocity, len(last))
-        known = np.isfinite(requested)
+        is_requested = np.isfinite(requested)
         measured = np.isfinite(q) & np.isfinite(v)
-        wanted = np.where(known, requested, last)
+        goal = np.where(is_requested, requested, last)
         with np.errstate(all="ignore"):
             self._position = np.where(measured, q, self._position)
             v = np.where(measured, v, 0.0)
             steady = self._position + v * (limits.kv / limits.kp)
-            within = steady + bounded(wanted - steady, limits.torque / limits.kp)
+            within = steady + bounded(goal - steady, limits.torque / limits.kp)
             within = np.where(measured & np.isfinite(within), within, last)
             way, soft = self._allowed(within - last, elapsed)
             inside = np.clip(last + soft, limits.lower, limits.upper)
@@ -110,8 +110,8 @@ class Limiter:
             servo_torque = limits.kp * (self.target - self._position) - limits.kv * v
             torque = bounded(servo_torque, limits.torque)
         changed = {
-            "not_finite": not (known & measured).all(),
-            "torque": not np.allclose(within, wanted, rtol=0.0, atol=_EQUAL),
+            "not_finite": not (is_requested & measured).all(),
+            "torque": not np.allclose(within, goal, rtol=0.0, atol=_EQUAL),
             "acceleration": not np.allclose(soft, way, rtol=0.0, atol=_EQUAL),
             "speed": not np.allclose(last + way, within, rtol=0.0, atol=_EQUAL),
             "position": not np.allclose(inside, last + soft, rtol=0.0, atol=_EQUAL),

@@ -53,13 +53,13 @@ class Packer:
             if f"past_{name}" in self._fields
         }
         needs = layout["constraints"]
-        known = [name for name in constraints if name in needs]
+        supported = [name for name in constraints if name in needs]
         goals: dict[str, Any] = {}
-        for name in known:
+        for name in supported:
             for array, value in constraints[name].items():
                 goals[f"{name}_{array}"] = value
         fields = {**episode, **checked(goals)}
-        for name in known:
+        for name in supported:
             require(needs[name], fields)
         self._meta = {"constraints": list(constraints), "layout": layout["digest"]}
         self._vector = np.zeros(layout["size"], np.float32)

@@ -82,17 +82,18 @@ class PolicyClient(EpisodePolicy):
     def _metadata(self) -> dict[str, Any]:
         """The metadata of a server that responds."""
         query = Message({}, {"metadata": True})
-        found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
-        if "query" not in found:
+        reply = self._transport.query(self._keys.health, query, timeout=self._timeout)
+        metadata = dict(reply.meta)
+        if "query" not in metadata:
             raise RefusedError(
                 "The server does not describe its queries.", "Update congrasp where it runs."
             )
-        if found["hand"] != self._hand:
+        if metadata["hand"] != self._hand:
             raise RefusedError(
-                f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'."
+                f"The policy is for the hand {ascii(metadata['hand'])[:60]}, not '{self._hand}'."
             )
         self._is_known = True
-        return found
+        return metadata
 
     def close(self) -> None:
         """Disconnects."""

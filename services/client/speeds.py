@@ -37,9 +37,9 @@ class Speeds:
         elapsed = now - self._changed_at
         way = position - self._position
         way[-3:] = np.remainder(way[-3:] + np.pi, 2 * np.pi) - np.pi
-        known = np.isfinite(way) & (elapsed > 0.0)
+        is_measurable = np.isfinite(way) & (elapsed > 0.0)
         changed = position != self._position  # also where it is not finite
-        measured = np.where(known, way / np.maximum(elapsed, _SHORTEST_S), 0.0)
+        measured = np.where(is_measurable, way / np.maximum(elapsed, _SHORTEST_S), 0.0)
         lasting = np.where(elapsed <= self._lasting, self._speed, 0.0)
         self._speed = bounded(np.where(changed, measured, lasting), self._most)
         self._position = position

@@ -9,6 +9,7 @@ from congrasp.actors.stress import SURVIVAL
 from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
 from congrasp.services.evaluate.text_table import NONE, Columns, Styled, Table, percent
 
+FORCES_TITLE = "Forces after the removal: mean, 95th percentile"
 _SMALL_UNITS = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
 """Units of errors in columns of one error each, with the factor from those of rows."""
 
@@ -179,7 +180,6 @@ FORCES: Columns[Row] = (
     ("diverged", lambda row: percent(row.diverged)),
 )
 """Forces after the removal of the table: mean, 95th percentile."""
-FORCES_TITLE = "Forces after the removal: mean, 95th percentile"
 
 
 def tables_of(

@@ -69,9 +69,9 @@ class Sample:
 
     def where(self, chosen: np.ndarray) -> "Sample":
         """Selects episodes by `chosen` (E,)."""
-        kept = chosen[: len(self.link_force)]
+        with_forces = chosen[: len(self.link_force)]
         values = {name: column[chosen] for name, column in self.values.items()}
-        return Sample(values, self.link_force[kept], self.torque[kept])
+        return Sample(values, self.link_force[with_forces], self.torque[with_forces])
 
     def without_forces(self) -> "Sample":
         """Drops the forces of all episodes."""
@@ -352,8 +352,8 @@ def _active(goal: Goal, name: str) -> list[np.ndarray]:
 def _hashes(arrays: Sequence[Array]) -> np.ndarray:
     """Hashes (B,) uint32 of the rows of arrays (B, ...), rounded to 1e-4."""
     rows = [np.asarray(array, np.float64).reshape(len(arrays[0]), -1) for array in arrays]
-    whole = np.round(np.concatenate(rows, 1) * 1e4).astype(np.int64)
-    return np.array([zlib.crc32(row.tobytes()) for row in whole], np.uint32)
+    rounded = np.round(np.concatenate(rows, 1) * 1e4).astype(np.int64)
+    return np.array([zlib.crc32(row.tobytes()) for row in rounded], np.uint32)
 
 
 class _Effort(NamedTuple):

@@ -200,20 +200,20 @@ def line_up(
       CongraspError: there is no policy for the hand.
     """
     policies = list(given) or [read_entrant(policy_file(None, hand), method)]
-    known = {entrant.key: entrant for entrant in policies}
+    entrants_by_key = {entrant.key: entrant for entrant in policies}
     tables_of: dict[PolicyKey, list[Table]] = {}
     missing: list[Missing] = []
     for table in dict.fromkeys(tables):
-        _add_pretrained(known, table, policies, pretrained_hands_requested=not given)
-        for key in _policies_of_table(table, policies, known):
-            if key in known:
+        _add_pretrained(entrants_by_key, table, policies, pretrained_hands_requested=not given)
+        for key in _policies_of_table(table, policies, entrants_by_key):
+            if key in entrants_by_key:
                 same_rows = "single" if table in ("hands", "ablation") else table
                 tables_of.setdefault(key, []).append(same_rows)
             else:
                 missing.append(Missing(*key, "not trained"))
     entrants = []
     for key, tables_of_policy in tables_of.items():
-        entrants.append((known[key], tuple(dict.fromkeys(tables_of_policy))))
+        entrants.append((entrants_by_key[key], tuple(dict.fromkeys(tables_of_policy))))
     return Lineup(entrants, missing)
 
 

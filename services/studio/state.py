@@ -313,8 +313,8 @@ class Studio:
     @property
     def resolution(self) -> Resolution:
         """The request after the priority rules, without batch axes."""
-        asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
-        batch = _resolve(self.hand, self._surface, self._goal_batch(), asked)
+        requested = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
+        batch = _resolve(self.hand, self._surface, self._goal_batch(), requested)
         return Resolution(
             goal=batch.goal.row(0),
             redirected=np.asarray(batch.redirected)[0],

@@ -11,8 +11,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import Colours, GraspObject
 from congrasp.services.assets.objects.mesh_files import read_mesh
-from congrasp.services.assets.objects.options import length, size_in_words
 from congrasp.services.assets.objects.repair import with_few_faces
+from congrasp.services.assets.objects.sizes import length, size_in_words
 from congrasp.services.assets.objects.sources import Source
 from congrasp.services.record.palette import OBJECT, PIECES, Colour, region_colours
 from congrasp.services.viz.hand_shapes import posed_hand, upright
@@ -85,12 +85,12 @@ def import_sheet(
         label, body = _of_file(before, obj)
         panels[label] = [body]
     sides = tuple(np.ptp(obj.visual_vertices, axis=0).tolist())
-    whole = Body(obj.visual_vertices, obj.visual_faces, paint=obj.colours)
-    panels[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [whole]
+    imported = Body(obj.visual_vertices, obj.visual_faces, paint=obj.colours)
+    panels[f"the object: {size_in_words(sides)}, {1000 * obj.mass:.0f} g"] = [imported]
     if avoid is not None:
         regions = region_colours(obj.points, avoid)
         label = "the affordance: green may be grasped, red must not be touched"
-        panels[label] = [whole._replace(paint=regions)]
+        panels[label] = [imported._replace(paint=regions)]
     panels[_pieces_label(obj)] = _pieces(obj)
 
     rest = Rotation.from_quat(obj.rest_poses[0][3:], scalar_first=True)

@@ -7,6 +7,14 @@ import numpy as np
 from congrasp.services.viz.kernels import add_light, cover
 from congrasp.services.viz.triangles import Triangles
 
+_KEY_RADIUS = 0.12
+"""Radius of the key light at a distance of one."""
+_LIFT_SAMPLES = 1.5
+"""Height above the surface at which its light is looked up, in samples of the shadow map."""
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+_LOWEST_SKY = 0.08
+"""Height of the lowest lamps of the sky, as the sine of their elevation."""
+
 
 class Lamps(NamedTuple):
     """Resolution of a soft light."""
@@ -25,13 +33,6 @@ FEW = Lamps(12, 24, 160)
 """For bodies in small pictures."""
 ON_TABLE = Lamps(48, 160, 64)
 """For a table top: the shadow of a high body is so wide that few lamps would show as bands."""
-_KEY_RADIUS = 0.12
-"""Radius of the key light at a distance of one."""
-_LIFT_SAMPLES = 1.5
-"""Height above the surface at which its light is looked up, in samples of the shadow map."""
-_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-_LOWEST_SKY = 0.08
-"""Height of the lowest lamps of the sky, as the sine of their elevation."""
 
 
 def light_on(

@@ -128,12 +128,12 @@ def _fitted(text: str, size: int, width: int) -> tuple[str, Font]:
         size -= 1
         font = ImageFont.load_default(size)
     half = len(text) // 2
-    shown = text
+    shortened = text
     for cut in range(1, half):
-        if font.getlength(shown) <= width:
+        if font.getlength(shortened) <= width:
             break
-        shown = f"{text[: half - cut]}…{text[half + cut :]}"
-    return shown, font
+        shortened = f"{text[: half - cut]}…{text[half + cut :]}"
+    return shortened, font
 
 
 def png_of(image: np.ndarray) -> bytes:

@@ -166,12 +166,12 @@ class _PicturedStep:
             contact = float(seen[self._is_touching].mean())
         along = float(self._forearm @ view.direction)
         weight_along = _BEHIND if along > 0 else _BEFORE
-        whole = counts[-1] / max(unhidden, 1)
+        object_share = counts[-1] / max(unhidden, 1)
         broad = np.abs(self._object_turn.inv().apply(view.direction)) @ self._box_faces
         return float(
             _CONTACT * contact
             + _FINGER * seen[self._is_finger].mean()
-            + _OBJECT * whole
+            + _OBJECT * object_share
             + _BROAD * broad
             - weight_along * along**2
         )

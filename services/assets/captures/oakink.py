@@ -124,10 +124,10 @@ def _sequence(
     mesh = meshes.find(name, object_id, object_name)
     files = [folder / f"{file_name(stem, 'a frame')}.pkl" for _, stem in frames]
     annotations = _annotations(name, files)
-    known = next((frame for frame in annotations if frame is not None), None)
-    if known is None:
+    reference = next((frame for frame in annotations if frame is not None), None)
+    if reference is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
-    filled = [frame or known for frame in annotations]
+    filled = [frame or reference for frame in annotations]
     pose = np.stack([frame.hand_pose for frame in filled])
     object_pose = np.stack([frame.object_pose for frame in filled])
     _check_unit(name, pose)

@@ -119,7 +119,7 @@ def _leaves_range(model: mujoco.MjModel, coupling: Follow) -> bool:
 
 def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[Follow]:
     """Couplings by equalities between joints, or between the joints of a fixed tendon."""
-    found = []
+    couplings = []
     for e in range(model.neq):
         if not model.eq_active0[e]:
             continue
@@ -142,12 +142,12 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[Follow]:
         else:
             continue
         if coupling is not None:
-            found.append(coupling)
+            couplings.append(coupling)
         elif kind != mujoco.mjtEq.mjEQ_CONNECT:
             notes.append(
                 f"an equality of '{name}' that does not couple two joints is dropped ('couplings')"
             )
-    return found
+    return couplings
 
 
 def _joint_equality(model: mujoco.MjModel, equality: int, notes: list[str]) -> Follow:
@@ -181,7 +181,7 @@ def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[Follow]:
 
     One of the joints has no motor.
     """
-    found = []
+    couplings = []
     for tendon in range(model.ntendon):
         coefficients = fixed_tendon(model, tendon)
         leaders = [j for j in coefficients if j in driven]
@@ -198,5 +198,6 @@ def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[Follow]:
         )
         middle = 0.5 * (lower + upper) - length_at_zero
         ratio = -coefficients[leader] / coefficients[follower]
-        found.append(Follow(follower, leader, ratio, float(middle / coefficients[follower])))
-    return found
+        offset = float(middle / coefficients[follower])
+        couplings.append(Follow(follower, leader, ratio, offset))
+    return couplings

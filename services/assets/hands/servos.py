@@ -27,7 +27,7 @@ def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
       notes: replacements and simplifications are appended.
     """
     slopes = tendon_slopes(model)
-    found = []
+    servos = []
     muscles = 0
     through_space = 0
     for a in range(model.nu):
@@ -44,12 +44,12 @@ def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
                 joints = spatial_tendon(slopes[target])
         else:
             continue
-        found.append(_servo(model, a, joints))
+        servos.append(_servo(model, a, joints))
     if muscles:
         notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
     if through_space:
         notes.append(f"{through_space} motors pull spatial tendons, which are linearised")
-    return found
+    return servos
 
 
 def _pulls_joint(model: mujoco.MjModel, actuator: int) -> bool:

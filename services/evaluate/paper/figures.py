@@ -8,6 +8,11 @@ import json
 import pathlib
 from typing import NamedTuple
 
+CENTER_GROUP = "hand's centre alone above the table"
+"""Group of the row whose headings only keep the hand's centre above the table; the paper has no
+rule for the hand.
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class PaperRow:
@@ -17,10 +22,6 @@ class PaperRow:
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
-CENTER_GROUP = "hand's centre alone above the table"
-"""Group of the row whose headings only keep the hand's centre above the table; the paper has no
-rule for the hand.
-"""
 SOURCES = {
     "hands": "procedural references for each hand (hand morphology)",
     "captured": (
