@@ -206,14 +206,14 @@ def _draw_table(table: Table) -> Any:
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(8.5)
     for (line, column), cell in drawn.get_celld().items():
-        heading = line == 0
-        first_column = column == 0
-        cell.set_edgecolor(INK if heading else _RULE)
-        cell.set_text_props(
-            color=QUIET if table.columns[column] == "paper" else INK,
-            weight="bold" if heading or first_column else "normal",
-            ha="left" if first_column else "right",
-        )
+        is_head = line == 0
+        is_label = column == 0
+        edge_colour = INK if is_head else _RULE
+        text_colour = QUIET if table.columns[column] == "paper" else INK
+        weight = "bold" if is_head or is_label else "normal"
+        alignment = "left" if is_label else "right"
+        cell.set_edgecolor(edge_colour)
+        cell.set_text_props(color=text_colour, weight=weight, ha=alignment)
     return figure
 
 

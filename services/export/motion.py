@@ -136,7 +136,9 @@ def robot_joints(motion: GraspMotion) -> list[str]:
     names: list[str] = motion.arm.joint_names.tolist() if motion.arm else []
     arm_joints = set(names)
     for name in motion.joint_names.tolist():
-        names.append(f"hand_{name}" if name in arm_joints else name)
+        if name in arm_joints:
+            name = f"hand_{name}"
+        names.append(name)
     return names
 
 

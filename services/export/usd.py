@@ -164,7 +164,10 @@ def _joint_paths(links: Sequence[Body]) -> list[str]:
     names = identifiers([link.name for link in links])
     paths: list[str] = []
     for link, name in zip(links, names, strict=True):
-        paths.append(f"{paths[link.parent]}/{name}" if link.parent >= 0 else name)
+        path = name
+        if link.parent >= 0:
+            path = f"{paths[link.parent]}/{name}"
+        paths.append(path)
     return paths
 
 
