@@ -81,9 +81,8 @@ class ExportMotion:
 
     def __call__(self) -> int:
         """Writes the motions, and prints the number of their frames."""
-        from congrasp.services.export.episode_motion import pick_motion
         from congrasp.services.export.formats import FORMATS, default_name, export_motions
-        from congrasp.services.export.motion import at_rate
+        from congrasp.services.export.motions import at_rate, pick_motion
 
         if not self.paths:
             raise CongraspError(

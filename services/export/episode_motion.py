@@ -1,17 +1,15 @@
 """Motions of episodes, recorded or in memory."""
 
-import pathlib
 from typing import Any
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion import GraspMotion, hand_arrays
-from congrasp.services.export.motion_file import GOAL_ARRAYS, load_motion
+from congrasp.services.export.motion_file import GOAL_ARRAYS
 from congrasp.services.record.episode import active_constraints, arm_of_episode
 
 _GOAL_PREFIX = "goal/"
@@ -83,29 +81,3 @@ def _normalised(quaternions: np.ndarray) -> np.ndarray:
     """
     lengths = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     return quaternions / np.where(np.abs(lengths - 1) <= _ROUNDING, lengths, 1)
-
-
-def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
-    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`).
-
-    Raises:
-      CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor
-        0.
-    """
-    if not path.exists():
-        raise CongraspError(
-            f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder."
-        )
-    if path.suffix == ".npz":
-        if index not in (-1, 0):
-            raise CongraspError(
-                f"{path} is one motion and has no number {index}.", "Remove --index."
-            )
-        return load_motion(path)
-    if path.is_file() and path.suffix != ".mcap":
-        raise CongraspError(
-            f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder."
-        )
-    from congrasp.services.record.reader import pick_episode  # with MCAP's packages
-
-    return motion_of_episode(pick_episode(path, index, success=success))

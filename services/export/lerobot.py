@@ -19,7 +19,8 @@ import pyarrow.parquet as pq
 from congrasp.common.errors import CongraspError
 from congrasp.services.export.facts import facts
 from congrasp.services.export.film import SIZE, Film, film
-from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.joint_trajectory import robot_joints
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.record.episode import MovedArm
 

@@ -10,13 +10,9 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.objects.spec import Colours
 from congrasp.services.record.episode import MovedArm
-
-_TIMED_SHAPES = ("(T,", "(T)")
-"""Beginnings of the meanings of arrays with a row for each frame."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -102,44 +98,6 @@ ARRAYS = {
     name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")
 }
 """Meaning of the arrays that every motion has; each begins with the shape."""
-
-
-def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
-    """Returns the motion at another frame rate: for each of its times the nearest frame, at most
-    half a step off.
-
-    Raises:
-      CongraspError: the rate is above the motion's own, or not above zero.
-    """
-    motion_fps = 1 / motion.control_dt
-    if not 0 < fps <= motion_fps + 1e-6:
-        raise CongraspError(
-            f"--fps is {fps:g}.",
-            f"The motion has {motion_fps:g} frames a second: set at most as many.",
-        )
-    last_frame = len(motion.time) - 1
-    time = np.arange(int(last_frame * fps / motion_fps + 1e-6) + 1) / fps
-    nearest = np.minimum(np.round(time * motion_fps).astype(int), last_frame)
-    arrays = {}
-    for name, meaning in ARRAYS.items():
-        if meaning.startswith(_TIMED_SHAPES):
-            arrays[name] = getattr(motion, name)[nearest]
-    arrays["time"] = time.astype(motion.time.dtype)
-    arm = motion.arm.at(nearest) if motion.arm else None
-    return dataclasses.replace(motion, **arrays, control_dt=1 / fps, arm=arm)
-
-
-def robot_joints(motion: GraspMotion) -> list[str]:
-    """Returns the names of the arm's joints, if there is an arm, and of the hand's, all
-    different.
-    """
-    names: list[str] = motion.arm.joint_names.tolist() if motion.arm else []
-    arm_joints = set(names)
-    for name in motion.joint_names.tolist():
-        if name in arm_joints:
-            name = f"hand_{name}"
-        names.append(name)
-    return names
 
 
 def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:

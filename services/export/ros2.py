@@ -27,9 +27,13 @@ from rosbags.typesys.store import Typestore
 
 from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import OBJECT, bodies
-from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.joint_trajectory import (
+    JointTrajectory,
+    joint_trajectory,
+    robot_joints,
+)
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import COLOURS, arm_meshes
-from congrasp.services.export.trajectory import JointTrajectory, joint_trajectory
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.record.palette import colours_at
 

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import capsules, link_origins, pose_matrices
-from congrasp.services.export.motion import GraspMotion, robot_joints
+from congrasp.services.export.joint_trajectory import robot_joints
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.record.episode import UNLIMITED, MovedArm
 
 _MASS = "0.01"

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion import GraspMotion, robot_joints
-from congrasp.services.export.trajectory import joint_trajectory
+from congrasp.services.export.joint_trajectory import joint_trajectory, robot_joints
+from congrasp.services.export.motion import GraspMotion
 from congrasp.services.record.episode import MovedArm
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.episode_scene import episode_shapes

@@ -22,8 +22,8 @@ from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.objects.decompose import decompose
 from congrasp.services.assets.objects.hulls import simplify
-from congrasp.services.export.episode_motion import pick_motion
 from congrasp.services.export.motion import GraspMotion
+from congrasp.services.export.motions import pick_motion
 from congrasp.services.record.episode import grasp_span
 from tests.benchmarks.dexgraspbench_hands import Match, benchmarked, match_hand
 

@@ -25,9 +25,9 @@ from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
-from congrasp.services.export.episode_motion import pick_motion
-from congrasp.services.export.motion import robot_joints
+from congrasp.services.export.joint_trajectory import robot_joints
 from congrasp.services.export.motion_file import load_motion
+from congrasp.services.export.motions import pick_motion
 from congrasp.services.grasp.arm_files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
 from tests.services.conftest import quick_imports
 

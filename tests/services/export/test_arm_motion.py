@@ -26,8 +26,10 @@ from congrasp.services.arm.robot import Pose, build_robot, default_mount
 from congrasp.services.export import formats, frames, urdf
 from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.film import camera_for, pictures
-from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays, robot_joints
+from congrasp.services.export.joint_trajectory import robot_joints
+from congrasp.services.export.motion import GraspMotion, hand_arrays
 from congrasp.services.export.motion_file import load_motion, save_motion
+from congrasp.services.export.motions import at_rate
 from congrasp.services.record.scene import check_episode, episode_entries
 from congrasp.services.record.writer import JsonChannels
 from tests.episodes import episode

@@ -24,10 +24,11 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.rotations import continuous
 from congrasp.services.cli.main import main
 from congrasp.services.export import formats, frames
-from congrasp.services.export.episode_motion import motion_of_episode, pick_motion
+from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.film import camera_for, pictures
-from congrasp.services.export.motion import GraspMotion, at_rate, hand_arrays
+from congrasp.services.export.motion import GraspMotion, hand_arrays
 from congrasp.services.export.motion_file import load_motion, save_motion
+from congrasp.services.export.motions import at_rate, pick_motion
 from congrasp.services.export.surfaces import COLOURS, skin_of_motion
 from congrasp.services.export.texture_coordinates import unwrapped
 from congrasp.services.record.recorder import Converter

@@ -1,4 +1,4 @@
-"""A motion as the trajectory of a robot's controller."""
+"""Joints of a robot, and a motion as the trajectory of its controller."""
 
 from typing import NamedTuple
 
@@ -6,12 +6,25 @@ import numpy as np
 
 from congrasp.services.export.motion import GraspMotion
 
-TRAJECTORY_START = 10**9
-"""Time of the first point of a trajectory, ns."""
+TRAJECTORY_START_NS = 10**9
+"""Time of the first point of a trajectory."""
+
+
+def robot_joints(motion: GraspMotion) -> list[str]:
+    """Returns the names of the arm's joints, if there is an arm, and of the hand's, all
+    different.
+    """
+    names: list[str] = motion.arm.joint_names.tolist() if motion.arm else []
+    arm_joints = set(names)
+    for name in motion.joint_names.tolist():
+        if name in arm_joints:
+            name = f"hand_{name}"
+        names.append(name)
+    return names
 
 
 class JointTrajectory(NamedTuple):
-    """T points of N joints, in the order of `motion.robot_joints`."""
+    """T points of N joints, in the order of `robot_joints`."""
 
     positions: np.ndarray
     """(T, N) rad, or m of slides."""
@@ -36,5 +49,5 @@ def joint_trajectory(motion: GraspMotion, fingers: np.ndarray) -> JointTrajector
         positions = np.concatenate([motion.arm.joint_position, fingers], 1)
     velocities = np.zeros(positions.shape)
     velocities[1:-1] = (positions[2:] - positions[:-2]) / (2 * motion.control_dt)
-    stamps = [TRAJECTORY_START + round(1e9 * time) for time in motion.time.tolist()]
+    stamps = [TRAJECTORY_START_NS + round(1e9 * time) for time in motion.time.tolist()]
     return JointTrajectory(positions, velocities, stamps)
