@@ -67,10 +67,11 @@ def camera_for(motions: Sequence[GraspMotion]) -> Camera:
 
 def _extent(motion: GraspMotion) -> np.ndarray:
     """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
-    points = []
+    points: list[np.ndarray] = []
     skin = skin_of_motion(motion)
     for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
         hand = _hand(motion, skin, frame)
+        assert hand.vertices is not None
         points.append(hand.vertices)
         thing = _object(motion, frame)
         turn = Rotation.from_quat(thing.quaternion, scalar_first=True)

@@ -153,7 +153,7 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
     target.
     """
     control = bundle.task.control
-    actions = []
+    actions: list[dict[str, Any]] = []
     for motor in get_hand(bundle.spec.hand).motors:
         finger = {
             "joint": motor.name,

@@ -94,9 +94,7 @@ def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
         inverse = turns[parent].inv()
         offset = inverse.apply(places[i] - places[parent])
         pose = pose_matrices(offset[None], inverse * turns[i])[0]
-        joints = []
-        for j in np.flatnonzero(arm.joint_link == i):
-            joints.append(_joint_of_arm(arm, j))
+        joints = [_joint_of_arm(arm, int(j)) for j in np.flatnonzero(arm.joint_link == i)]
         pose_at_zero = pose @ _frame_at_zero(arm, i)
         turn = Rotation.from_matrix(pose_at_zero[:3, :3])
         _add_joints(robot, joints, _Ends(names[parent], names[i]), pose_at_zero[:3, 3], turn)
