@@ -9,8 +9,9 @@ import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax
 import psutil
+
+from congrasp.common.runtime.lazy_jax import jax
 
 _log = logging.getLogger(__name__)
 

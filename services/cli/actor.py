@@ -1,6 +1,7 @@
 """`congrasp actor`: one actor."""
 
 import dataclasses
+import importlib
 import math
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any
@@ -73,6 +74,7 @@ class Actor:
             raise CongraspError(
                 f"--audit {self.audit} contradicts --no-audit.", "Leave out one of them."
             )
+        importlib.import_module("congrasp.actors.process")  # takes seconds, so before it connects
         name = urls.name_on_wire(self.id or process_name("actor"), self.certs)
         metrics = ActorMetrics()
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:

@@ -17,7 +17,7 @@ import math
 import pathlib
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from congrasp.common.task.sampling.object_headings import headings_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.evaluate.choices import Exam
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
 from congrasp.services.evaluate.experiment import (
     MEASURED,
@@ -48,8 +49,6 @@ from congrasp.services.evaluate.experiment import (
 from congrasp.services.evaluate.object_groups import object_groups
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
-Exam = Literal["figures", "development"]
-"""Sets of procedural objects: one for published figures, one for development."""
 FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))
 """All families, cycled among the objects in an order that mixes basic and household ones."""
 MANY = 50_000

@@ -20,10 +20,11 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.runtime.engines import ENGINES, engine_title
 from congrasp.services.cli.console import in_range, tracked
+from congrasp.services.evaluate.choices import Exam
 from congrasp.services.evaluate.experiment import Experiment, Track, Variation
 from congrasp.services.evaluate.lineup import Entrant, facts, read_entrant
 from congrasp.services.evaluate.plan import batches
-from congrasp.services.evaluate.pools import Exam, exam_pool
+from congrasp.services.evaluate.pools import exam_pool
 from congrasp.services.evaluate.results import provenance
 from tests.benchmarks import ceiling_search
 from tests.benchmarks.ceiling_counts import Counts, Lost, by_object, by_row, counts_of, table
