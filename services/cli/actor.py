@@ -59,7 +59,7 @@ class Actor:
     """Write no journal."""
     references: pathlib.Path | None = None
     """File that preserves the reference poses from the policy's grasps for the next start."""
-    watch: Watch = Watch()  # noqa: RUF009
+    watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
     """Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on
