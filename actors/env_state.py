@@ -7,7 +7,7 @@ from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.sensing import Sensing
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.actors.success import Success
-from congrasp.common.task.config import ControlConfig, RewardWeights
+from congrasp.common.task.traced_settings import ControlConfig, RewardWeights
 from congrasp.common.task.types import Array, Features, Goal, SceneState, Surface
 
 

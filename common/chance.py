@@ -8,10 +8,9 @@ draws.
 import zlib
 from collections.abc import Mapping
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.types import Array
 
 _LEAST = 2.0**-24

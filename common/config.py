@@ -10,9 +10,10 @@ import dataclasses
 import hashlib
 import json
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import dacite
+import tyro
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
@@ -295,7 +296,7 @@ class RunConfig:
     """The algorithm's hyperparameters."""
     distill: DistillConfig = DistillConfig()
     """Hyperparameters of distillation."""
-    inputs: tuple[NamedInput, ...] = dataclasses.field(default=(), metadata={"option": False})
+    inputs: Annotated[tuple[NamedInput, ...], tyro.conf.Fixed, tyro.conf.Suppress] = ()
     """Content of the files and folders that the run names; written by the learner."""
 
 

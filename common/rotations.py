@@ -5,9 +5,9 @@ Products are written over whole vectors instead of components: each component wo
 programs that contain hundreds of rotations, and compiling takes longer than running them.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array
 
 _FACTORS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common import rotations
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.task import traced_settings  # noqa: F401 - weights may be traced
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.affordance import AffordanceGoal

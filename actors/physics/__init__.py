@@ -6,24 +6,25 @@ import concurrent.futures
 import functools
 import importlib.util
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
-
-from congrasp.actors.physics.engine import Physics
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, Engine, PhysicsName
+from congrasp.common.runtime.lazy_jax import jax
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
+
+if TYPE_CHECKING:
+    from congrasp.actors.physics.engine import Physics
 
 _NVIDIA = ("gpu", "cuda")
 
 
 def _make_warp(
     hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int
-) -> Physics:
+) -> "Physics":
     """Builds MuJoCo Warp, which ignores `threads`."""
     from congrasp.actors.physics.warp import WarpPhysics
 
@@ -40,14 +41,14 @@ def _prepare_warp(hand: Hand, task: TaskConfig) -> None:
 
 def _make_jax(
     hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int
-) -> Physics:
+) -> "Physics":
     """Builds MJX-JAX, which ignores `threads`."""
     from congrasp.actors.physics.mjx import MjxPhysics
 
     return MjxPhysics(hand, task, objects)
 
 
-def _make_native(*arguments: Any) -> Physics:
+def _make_native(*arguments: Any) -> "Physics":
     """Builds MuJoCo C on threads."""
     from congrasp.actors.physics.native import NativePhysics
 
@@ -124,7 +125,7 @@ def prepare_physics(name: PhysicsName, hand: Hand, task: TaskConfig) -> None:
 
 def make_physics(
     name: PhysicsName, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], *, threads: int
-) -> Physics:
+) -> "Physics":
     """Builds an engine with a pool of objects; `threads` applies to those that step on the CPU.
 
     Raises:

@@ -10,14 +10,13 @@ few of these poses.
 import functools
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.types import Array
 
 CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
@@ -76,7 +75,8 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    least_gaps = kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32))
+    compiled_gaps = jax.jit(_least_gaps, static_argnums=0)
+    least_gaps = kinematics.untraced(compiled_gaps, hand, CLOSURES.astype(np.float32))
     gaps = np.asarray(least_gaps, np.float64)
     return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
 
@@ -142,9 +142,8 @@ def _cost(hand: Hand, motors: Array) -> Array:
     )
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _least_gaps(hand: Hand, closures: Array) -> Array:
-    """Gaps (S,) in m of a hand at closures (S,), compiled as one program."""
+    """Gaps (S,) in m of a hand at closures (S,)."""
     q = closure_pose(hand, closures[:, None])
     return jnp.min(_gaps(hand, _tips(hand, q)), -1)
 
@@ -168,7 +167,8 @@ def outline(hand: Hand) -> Outline:
     """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    ends, center = kinematics.untraced(_posed, hand, CLOSURES.astype(np.float32))
+    compiled_poses = jax.jit(_posed, static_argnums=0)
+    ends, center = kinematics.untraced(compiled_poses, hand, CLOSURES.astype(np.float32))
     from_center = np.asarray(ends, np.float64) - np.asarray(center, np.float64)[:, None]
     return Outline(
         points=from_center @ axes.T,
@@ -188,8 +188,7 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
     return -heights.min(-1)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _posed(hand: Hand, closures: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _posed(hand: Hand, closures: Array) -> tuple[Array, Array]:
     """Ends (S, E, 3) of the hand's capsules at closures (S,), and its centres (S, 3), in the wrist
     frame.
     """

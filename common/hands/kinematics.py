@@ -9,12 +9,11 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.types import Array
 
@@ -144,9 +143,8 @@ def hand_center(hand: Hand, points: Array) -> Array:
     return 0.5 * (tips[..., 0, :] + jnp.mean(tips[..., 1:, :], -2))
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _points(hand: Hand, q: Array) -> Array:
-    """`keypoints` (P, 3) of finger angles (F,), compiled as one program."""
+    """`keypoints` (P, 3) of finger angles (F,)."""
     return keypoints(hand, link_transforms(hand, q))
 
 
@@ -164,7 +162,8 @@ def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made
     orthogonal to w.
     """
-    points = np.asarray(untraced(_points, hand, np.array(hand.q_open, np.float32)))
+    compiled_points = jax.jit(_points, static_argnums=0)
+    points = np.asarray(untraced(compiled_points, hand, np.array(hand.q_open, np.float32)))
     tips = points[len(hand.links) :]
     center = 0.5 * (tips[0] + tips[1:].mean(0))
     across = tips[1:].mean(0) - tips[0]

@@ -51,9 +51,7 @@ def engine_title(name: str) -> str:
 PhysicsName = Annotated[
     str,
     tyro.conf.arg(
-        constructor_factory=lambda: Literal.__getitem__(("auto", *ENGINES)),  # type: ignore[attr-defined]
-        # Help shows such a choice as a list
-        help_behavior_hint=lambda default: "(default: " + default.strip("[']") + ")",
+        constructor_factory=lambda: Literal.__getitem__(("auto", *ENGINES))  # type: ignore[attr-defined]
     ),
 ]
 """`auto` or a key of `ENGINES`; a command line offers those registered when it is parsed."""

@@ -1,6 +1,7 @@
 """Decorators of the public functions that compute: they run under the library's own settings."""
 
 import functools
+import importlib
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -20,6 +21,7 @@ def entry(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         require_not_inherited("JAX")
+        importlib.import_module("jax")  # settings of a module that is not imported cannot change
         note_started("JAX")
         with library_settings():
             return function(*args, **kwargs)

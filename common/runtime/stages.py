@@ -9,8 +9,9 @@ import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax
 import psutil
+
+from congrasp.common.runtime.lazy_jax import jax
 
 _PROGRAM_SECONDS = 0.5
 """Least duration of the work on a compiled program that is a stage."""

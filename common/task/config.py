@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Annotated, NamedTuple, TypeVar
 
-import jax
 from typing_extensions import Doc
 
 from congrasp.common.task.constraints import CONSTRAINTS, OURS
@@ -68,7 +67,6 @@ def _with_outside_fields(settings: Iterable[_Setting]) -> Callable[[type[_Class]
     return extended
 
 
-@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 @_with_outside_fields(_weights())
 class RewardWeights:

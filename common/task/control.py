@@ -4,7 +4,6 @@ Space).
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
@@ -12,26 +11,9 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import known
 from congrasp.common.task.geometry import wrist_to_joints
 from congrasp.common.task.scene import Scene
-from congrasp.common.task.settings import ControlConfig, TaskSettings
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.traced_settings import ControlConfig
 from congrasp.common.task.types import Action, Array, SceneState
-
-jax.tree_util.register_dataclass(
-    ControlConfig,
-    data_fields=[
-        "finger_scale",
-        "wrist_position_scale",
-        "wrist_rotation_scale",
-        "guidance_position_limit",
-        "approach_position_limit",
-        "closing_position_limit",
-        "closing_distance",
-        "guidance_rotation_limit",
-        "wrist_acceleration",
-        "wrist_angular_acceleration",
-        "hold_acceleration",
-    ],
-    meta_fields=["load_rate", "lookahead", "follow_object", "finger_guidance"],
-)
 
 
 def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:

@@ -1,11 +1,9 @@
 """Frames and distances shared by control, features, observation and metrics."""
 
-import jax
-import jax.numpy as jnp
-
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.types import Array, SceneState
 
 FAR = 0.3

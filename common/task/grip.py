@@ -7,8 +7,7 @@ than contacts at one spot: friction mu f at a distance d from the others' centre
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array, SceneState
 
 _SAFETY = 2.0

@@ -16,10 +16,10 @@ hands of any size; deviations are converted to radians with the length of that w
 import functools
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array
 
 _BENDS = 0.4

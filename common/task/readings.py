@@ -4,8 +4,7 @@ pose.
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array, SceneState
 
 

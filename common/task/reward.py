@@ -5,10 +5,9 @@ in their files.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.geometry import FAR, square
 from congrasp.common.task.grip import resistance

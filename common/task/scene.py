@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.grip import ObjectLoad
 from congrasp.common.task.readings import Readings
 from congrasp.common.task.settings import TaskSettings

@@ -14,9 +14,7 @@ SENSORS: dict[str, Any] = {}
 SensorName = Annotated[
     str,
     tyro.conf.arg(
-        constructor_factory=lambda: Literal.__getitem__(tuple(SENSORS)),  # type: ignore[attr-defined]
-        # Help shows such a choice as a list
-        help_behavior_hint=lambda default: "(default: " + default.strip("[']") + ")",
+        constructor_factory=lambda: Literal.__getitem__(tuple(SENSORS))  # type: ignore[attr-defined]
     ),
 ]
 """A key of `SENSORS`; a command line offers those registered when it is parsed."""

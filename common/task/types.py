@@ -9,9 +9,9 @@ contacts kept per link, N surface points, K waypoints.
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+from congrasp.common.runtime.lazy_jax import jax, jnp, register_pytree
 
 Array = Any  # a jax.Array inside compiled functions, a numpy.ndarray outside
 
@@ -82,10 +82,12 @@ class Surface(NamedTuple):
     """
 
 
-@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Goal of an episode by constraint (`common.task.constraints`); object frame."""
+    """Goal of an episode by constraint (`common.task.constraints`); object frame.
+
+    A pytree of JAX.
+    """
 
     values: dict[str, Any]
     """Goal arrays (B, ...) of each constraint, as the NamedTuple that the constraint names
@@ -94,6 +96,10 @@ class Goal:
     active: dict[str, Array]
     """(B,) bool for each optional block of the observation: True if its constraint is active after
     the priority rules. Values gated by an inactive block are ignored."""
+
+    def __post_init__(self) -> None:
+        """Registers the class with JAX, which a program needs only once it makes a goal."""
+        register_pytree(Goal)
 
     def __getitem__(self, constraint: str) -> Any:
         """Returns the goal arrays of a constraint."""

@@ -1,6 +1,7 @@
 """`congrasp actor`: one actor."""
 
 import dataclasses
+import importlib
 import math
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,7 +59,7 @@ class Actor:
     """Write no journal."""
     references: pathlib.Path | None = None
     """File that preserves the reference poses from the policy's grasps for the next start."""
-    watch: Watch = Watch()  # noqa: RUF009
+    watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
     """Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on
@@ -73,6 +74,7 @@ class Actor:
             raise CongraspError(
                 f"--audit {self.audit} contradicts --no-audit.", "Leave out one of them."
             )
+        importlib.import_module("congrasp.actors.process")  # takes seconds, so before it connects
         name = urls.name_on_wire(self.id or process_name("actor"), self.certs)
         metrics = ActorMetrics()
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:

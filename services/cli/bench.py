@@ -2,11 +2,9 @@
 
 import dataclasses
 import pathlib
-import tempfile
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.train.presets import get_preset
 
 
@@ -29,9 +27,9 @@ def physics(
       congrasp bench physics
       congrasp bench physics --engines native warp --environments 1024
     """
-    from congrasp.services.bench import physics as bench
+    from congrasp.services.bench.physics import bench_physics, default_engines
 
-    bench.bench_physics(environments, threads or cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
+    bench_physics(environments, threads or cores(), repeats, engines or default_engines())
     return 0
 
 
@@ -50,27 +48,10 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-    import psutil
+    from congrasp.services.bench.query import bench_query
+    from congrasp.services.serve.load import Load
 
-    from congrasp.common.policy import bundle as bundles
-    from congrasp.services.serve.load import Load, Target, example_episode, measure, serving
-    from congrasp.services.train.command import untrained
-
-    with tempfile.TemporaryDirectory() as folder:
-        policy = pathlib.Path(folder, "policy.safetensors")
-        bundles.save(untrained(get_preset("quickstart")), policy)
-        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
-            episode = example_episode(1_000_000)
-            with PolicyClient(endpoint, wait=180.0) as client:
-                client.metadata()
-            process = psutil.Process(server)
-            before = process.cpu_times()
-            target = Target(endpoint, "policy", timeout=5.0)
-            result = measure(target, episode, Load(repeat, concurrency, states))
-            after = process.cpu_times()
-            # Of user and system
-            result["server_cpu_ms"] = 1e3 * (sum(after[:2]) - sum(before[:2])) / repeat / states
-    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
+    bench_query(Load(repeat, concurrency, states))
     return 0
 
 
@@ -107,7 +88,7 @@ class Scaling:
 
     def __call__(self) -> int:
         """Measures, prints and writes the results."""
-        from congrasp.services.bench.training import bench_scaling
+        from congrasp.services.bench.scaling import bench_scaling
 
         preset = get_preset(self.preset, environments=self.environments)
         bench_scaling(
@@ -145,7 +126,7 @@ def startup(
       congrasp bench startup
       congrasp bench startup --preset human --environments 1024
     """
-    from congrasp.services.bench.training import bench_startup
+    from congrasp.services.bench.startup import bench_startup
 
     config = get_preset(preset, environments=environments)
     pool = dataclasses.replace(config.objects, count=objects or config.objects.count)

@@ -5,7 +5,7 @@ import pathlib
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -13,26 +13,17 @@ from rich.console import Console
 from congrasp.actors.physics import PhysicsName, resolve_physics
 from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError, need_package
-from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import engine_title
-from congrasp.services.assets.objects import named
 from congrasp.services.cli.console import in_range, say, tracked
-from congrasp.services.evaluate import exams, pools, tables
-from congrasp.services.evaluate.captured import captured_objects
-from congrasp.services.evaluate.columns import object_table, tables_of
-from congrasp.services.evaluate.experiment import Experiment, Track, Variation
-from congrasp.services.evaluate.lineup import (
-    Entrant,
-    Lineup,
-    Table,
-    facts,
-    line_up,
-    read_entrants,
-)
-from congrasp.services.evaluate.results import provenance
-from congrasp.services.evaluate.scores import Row, write_json
-from congrasp.services.evaluate.variations import Noise
-from congrasp.services.viz.sheets import save_png
+from congrasp.services.evaluate.choices import Exam, Table
+
+if TYPE_CHECKING:
+    from congrasp.common.objects.spec import GraspObject
+    from congrasp.services.evaluate.experiment import Experiment, Track
+    from congrasp.services.evaluate.lineup import Entrant, Lineup
+    from congrasp.services.evaluate.pools import Pools
+    from congrasp.services.evaluate.scores import Row
+    from congrasp.services.evaluate.tables import Evaluation
 
 _PICTURES_OF_EACH_KIND = 4
 """Most failures, and most successes, drawn for a row."""
@@ -71,7 +62,7 @@ class Evaluate:
     objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of
     RobustDexGrasp and of Isaac Lab's dexsuite; all: every table of one policy. Several may be
     named."""
-    exam: exams.Exam = "figures"
+    exam: Exam = "figures"
     """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for
     published figures; development has seeds from 1,000,000. Training uses neither."""
     objects: pathlib.Path | None = None
@@ -115,6 +106,9 @@ class Evaluate:
 
     def __call__(self) -> int:
         """Evaluates, and prints and writes the results."""
+        from congrasp.services.evaluate.lineup import line_up, read_entrants
+        from congrasp.services.evaluate.tables import evaluate_tables
+
         self._check()
         entrants = read_entrants(self.policy, self.method)
         lineup = line_up(self.table, entrants, self.hand, self.method)
@@ -125,7 +119,7 @@ class Evaluate:
             evaluations = []
             for entrant, requested in lineup.entrants:
                 evaluations.append(
-                    tables.evaluate_tables(
+                    evaluate_tables(
                         dataclasses.replace(experiment, policy=entrant.policy),
                         requested,
                         many_objects,
@@ -158,8 +152,10 @@ class Evaluate:
                 "--constraints needs the sets' objects.", "Pass their folder with --objects."
             )
 
-    def _many_objects(self, engine: PhysicsName) -> pools.Pools | None:
+    def _many_objects(self, engine: PhysicsName) -> "Pools | None":
         """Returns the pools of the table `objects`; None if it is not requested."""
+        from congrasp.services.evaluate import exams, pools
+
         if not {"objects", "all"} & set(self.table):
             return None
         if self.objects:
@@ -168,11 +164,14 @@ class Evaluate:
         return pools.procedural_pools(count, engine, self.exam)
 
     def _experiment(
-        self, lineup: Lineup, engine: PhysicsName, track: Track
-    ) -> tuple[Experiment, list[str]]:
+        self, lineup: "Lineup", engine: PhysicsName, track: "Track"
+    ) -> "tuple[Experiment, list[str]]":
         """Returns the experiment of the first policy, and names of objects without a constraint
         set.
         """
+        from congrasp.services.evaluate.captured import captured_objects
+        from congrasp.services.evaluate.experiment import Experiment
+
         objects: list[GraspObject] = []
         if self.constraints is not None or set(self.table) != {"objects"}:
             objects = self._objects(track)
@@ -197,13 +196,16 @@ class Evaluate:
         )
         return experiment, sorted(without_set)
 
-    def _objects(self, track: Track) -> list[GraspObject]:
+    def _objects(self, track: "Track") -> "list[GraspObject]":
         """Returns the objects of all tables but `objects`."""
-        if self.objects:
-            return named.objects_of(self.objects, track=track)
-        return exams.exam_pool(self.exam, self.pool)
+        from congrasp.services.assets.objects.named import objects_of
+        from congrasp.services.evaluate.exams import exam_pool
 
-    def _folder_of_rows(self, entrant: Entrant) -> pathlib.Path | None:
+        if self.objects:
+            return objects_of(self.objects, track=track)
+        return exam_pool(self.exam, self.pool)
+
+    def _folder_of_rows(self, entrant: "Entrant") -> pathlib.Path | None:
         """Folder for a policy's rows, from which a stopped evaluation resumes."""
         if self.json is None:
             return None
@@ -219,11 +221,13 @@ class Evaluate:
         }
 
     def _print(
-        self, evaluations: Sequence[tables.Evaluation], lineup: Lineup, engine: PhysicsName
+        self, evaluations: "Sequence[Evaluation]", lineup: "Lineup", engine: PhysicsName
     ) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and
         skipped rows.
         """
+        from congrasp.services.evaluate.columns import object_table, tables_of
+
         width = None if sys.stdout.isatty() else _PIPE_WIDTH
         console = Console(highlight=False, markup=False, width=width)
         rows = _rows(evaluations)
@@ -249,11 +253,15 @@ class Evaluate:
     def _write(
         self,
         file: pathlib.Path,
-        evaluations: Sequence[tables.Evaluation],
-        lineup: Lineup,
+        evaluations: "Sequence[Evaluation]",
+        lineup: "Lineup",
         engine: PhysicsName,
     ) -> None:
         """Writes the rows, with policies, settings and provenance, to a JSON file."""
+        from congrasp.services.evaluate.lineup import facts
+        from congrasp.services.evaluate.results import provenance
+        from congrasp.services.evaluate.scores import write_json
+
         policies = [facts(entrant) for entrant, _ in lineup.entrants]
         heading_rules = {}
         for (entrant, _), evaluation in zip(lineup.entrants, evaluations, strict=True):
@@ -275,7 +283,7 @@ class Evaluate:
         write_json(_rows(evaluations), file, about)
 
     def _draw(
-        self, folder: pathlib.Path, evaluations: Sequence[tables.Evaluation], lineup: Lineup
+        self, folder: pathlib.Path, evaluations: "Sequence[Evaluation]", lineup: "Lineup"
     ) -> None:
         """Draws the episodes of each policy, of several into a folder each."""
         for (entrant, _), evaluation in zip(lineup.entrants, evaluations, strict=True):
@@ -290,18 +298,21 @@ def _partial_results(file: pathlib.Path) -> pathlib.Path:
     return file.with_name(f"{file.name}.parts")
 
 
-def _rows(evaluations: Sequence[tables.Evaluation]) -> list[Row]:
+def _rows(evaluations: "Sequence[Evaluation]") -> "list[Row]":
     """The rows of all policies."""
-    rows: list[Row] = []
+    rows = []
     for evaluation in evaluations:
         rows += evaluation.rows
     return rows
 
 
-def _draw_evaluation(evaluation: tables.Evaluation, folder: pathlib.Path) -> None:
+def _draw_evaluation(evaluation: "Evaluation", folder: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the rows without a change."""
+    from congrasp.services.evaluate.experiment import Variation
     from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
     from congrasp.services.evaluate.plots import draw_noise
+    from congrasp.services.evaluate.variations import Noise
+    from congrasp.services.viz.sheets import save_png
 
     experiment = evaluation.experiment
     policy = experiment.policy

@@ -12,7 +12,6 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_hands
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
-from congrasp.common.hands.skin import skin_of_meshes
 from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.shell import shell_command
@@ -108,6 +107,8 @@ def sheet(
 
 def _skin(name: str, hand: "Hand") -> "Skin | None":
     """Skin of the meshes next to a custom hand's file; None if it has none."""
+    from congrasp.common.hands.skin import skin_of_meshes
+
     if not hand.text:
         return None
     file = own_hands().get(name, pathlib.Path(name))

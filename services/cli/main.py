@@ -62,7 +62,7 @@ COMMANDS = {
     "doctor": "what is wrong with this machine or installation",
 }
 """Commands in the order of the help."""
-_MODULES = {"audit": "ops.audit", "doctor": "ops.doctor", "status": "ops.status"}
+_MODULES = {"doctor": "ops.doctor", "status": "ops.status"}
 """Modules in `services` of commands that are not in `services.cli`."""
 
 _NUMPY_WARNINGS = (

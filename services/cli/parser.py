@@ -36,11 +36,16 @@ def of_command(
     """
 
     def parse(rest: list[str]) -> Callable[[], Any]:
-        bound = functools.partial(_deferred(command), **defaults(rest))
+        cli = functools.partial(
+            tyro.cli, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY
+        )
+        values = defaults(rest)
         with _epilog(examples(command), rest):
-            return tyro.cli(
-                bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY
-            )
+            if not isinstance(command, type):
+                return cli(functools.partial(_deferred(command), **values))
+            if values:
+                cli = functools.partial(cli, default=command(**values))
+            return functools.partial(_run, command, **vars(cli(command)))
 
     return parse
 
@@ -51,13 +56,13 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
     def parse(rest: list[str]) -> Callable[[], Any]:
         if rest and rest[0] in commands:
             return of_command(commands[rest[0]], f"{prog} {rest[0]}")(rest[1:])
-        deferred = {name: _deferred(command) for name, command in commands.items()}
         first_examples = []
         for command in commands.values():
             first_examples += examples(command)[:1]
         with _epilog(first_examples, rest):
+            # Prints the help or an error: the first word is none of the commands
             return tyro.extras.subcommand_cli_from_dict(
-                deferred, prog=prog, description=description, args=rest
+                dict(commands), prog=prog, description=description, args=rest
             )
 
     return parse
@@ -90,7 +95,7 @@ def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
-    """Returns the command with its arguments bound, to be called once they are valid."""
+    """Returns a function with its arguments bound, to be called once they are valid."""
 
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(_run, command, *args, **options)
@@ -108,20 +113,8 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     vars(bind)["__signature__"] = signature.replace(parameters=parameters)
     bind.__name__ = command.__name__
     bind.__annotations__ = {**hints, "return": Any}
-    bind.__doc__ = _help(command)
+    bind.__doc__ = _CONTINUED_PARAMETER.sub(" ", inspect.getdoc(command) or "")
     return bind
-
-
-def _help(command: Command) -> str:
-    """Docstring of a command in the form that tyro parses, with each parameter's text on one
-    line.
-    """
-    text = _CONTINUED_PARAMETER.sub(" ", inspect.getdoc(command) or "")
-    fields = _meanings(command) if isinstance(command, type) else {}
-    if not fields:
-        return text
-    arguments = [f"  {name}: {meaning}" for name, meaning in fields.items()]
-    return "\n".join([text, "", "Args:", *arguments])
 
 
 def _run(command: Command, *args: Any, **options: Any) -> Any:
@@ -207,19 +200,12 @@ def _dataclass(
     for field in dataclasses.fields(info.type):
         option = tyro.constructors.StructFieldSpec(
             name=field.name,
-            type=_option(field, hints[field.name]),
+            type=_described(field.name, hints[field.name]),
             default=getattr(defaults, field.name, tyro.MISSING),
             helptext=functools.partial(meanings.get, field.name),
         )
         options.append(option)
     return tyro.constructors.StructConstructorSpec(instantiate=info.type, fields=tuple(options))
-
-
-def _option(field: "dataclasses.Field[Any]", hint: Any) -> Any:
-    """Type of a field for the parser; a field that commands compute is no option."""
-    if field.metadata.get("option", True):
-        return _described(field.name, hint)
-    return Annotated[hint, tyro.conf.Fixed, tyro.conf.Suppress]
 
 
 @functools.cache

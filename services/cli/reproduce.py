@@ -4,21 +4,17 @@ import dataclasses
 import pathlib
 import shlex
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.services.cli.console import in_range, tracked
-from congrasp.services.evaluate.lineup import Entrant, PolicyKey, read_entrants
-from congrasp.services.evaluate.paper.comparison import summary
-from congrasp.services.evaluate.paper.evaluation import PartSettings
-from congrasp.services.evaluate.paper.page import JSON, LATEX, PAGE, page_template
-from congrasp.services.evaluate.paper.parts import BASELINES, required_policies
-from congrasp.services.evaluate.paper.reproduction import Request, reproduce
 from congrasp.services.ops.lifetime import command
-from congrasp.services.train import accelerators
-from congrasp.services.train.reproduction import PolicyRequest, get_policies, policies_to_train
+
+if TYPE_CHECKING:
+    from congrasp.services.evaluate.lineup import Entrant, PolicyKey
+    from congrasp.services.evaluate.paper.evaluation import PartSettings
 
 _RUNS_FOLDER = "policies"
 """Folder of trainings within the output folder."""
@@ -83,6 +79,17 @@ class Reproduce:
 
     def __call__(self) -> int:
         """Trains, evaluates, and prints a summary."""
+        from congrasp.common.policy.pretrained import pretrained_hands
+        from congrasp.services.evaluate.paper.comparison import summary
+        from congrasp.services.evaluate.paper.page import JSON, LATEX, PAGE, page_template
+        from congrasp.services.evaluate.paper.parts import BASELINES, required_policies
+        from congrasp.services.evaluate.paper.reproduction import Request, reproduce
+        from congrasp.services.train.reproduction import (
+            PolicyRequest,
+            get_policies,
+            policies_to_train,
+        )
+
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
         hands = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands())
@@ -118,8 +125,10 @@ class Reproduce:
         print(f"The page is {self.out / PAGE}, next to {JSON} and {LATEX}.")
         return 1 if reproduction.failures else 0
 
-    def _settings(self) -> PartSettings:
+    def _settings(self) -> "PartSettings":
         """Numbers of episodes and objects, engine and seed."""
+        from congrasp.services.evaluate.paper.evaluation import PartSettings
+
         episodes = self.episodes or (_QUICK_EPISODES if self.quick else _FULL_EPISODES)
         many = _QUICK_MANY if self.quick else _FULL_MANY
         return PartSettings(
@@ -139,6 +148,8 @@ class Reproduce:
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for an unknown hand or method."""
+    from congrasp.services.evaluate.paper.parts import BASELINES
+
     for name in hands:
         if get_hand(name).name != name:
             raise CongraspError(
@@ -150,8 +161,10 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
         )
 
 
-def _given(texts: tuple[str, ...], needed: list[PolicyKey]) -> dict[PolicyKey, Entrant]:
+def _given(texts: tuple[str, ...], needed: "list[PolicyKey]") -> "dict[PolicyKey, Entrant]":
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
+    from congrasp.services.evaluate.lineup import read_entrants
+
     entrants = {entrant.key: entrant for entrant in read_entrants(texts)}
     for policy, entrant in entrants.items():
         if policy not in needed:
@@ -165,6 +178,8 @@ def _given(texts: tuple[str, ...], needed: list[PolicyKey]) -> dict[PolicyKey, E
 
 def _check_device(names: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
+    from congrasp.services.train import accelerators
+
     if names and accelerators.detect()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(names)} must be trained first, and this machine has no GPU.",

@@ -5,7 +5,9 @@ import dataclasses
 import os
 import pathlib
 import secrets
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
@@ -45,7 +47,7 @@ class Serve:
     """Endpoint for the clients."""
     name: str = "policy"
     """Name under which the policy is served."""
-    watch: Watch = Watch()  # noqa: RUF009
+    watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
     """Folder of a server's certificate (congrasp certs), for its clients and for the learner."""

@@ -11,11 +11,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
-from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.cli.arguments import option_value
 from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset, with_hand
-from congrasp.services.train.students import student_of
 
 
 def train(  # noqa: PLR0913
@@ -105,21 +103,31 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     hand = option_value("--hand", arguments) or None
     run_dir = option_value("--run-dir", arguments)
     resumes = not {"--resume", "--or-resume"}.isdisjoint(arguments)
-    if resumes and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
-        config = open_run(pathlib.Path(run_dir))
-        if preset and get_preset(preset, hand).task.hand != config.task.hand:
-            raise CongraspError(
-                f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset "
-                f"{preset} is not for.",
-                "Leave out --preset, or choose another --run-dir.",
-            )
-        return {"config": config}
+    if resumes and run_dir:
+        from congrasp.learner.run_directory import CONFIG_FILE, open_run
+
+        if (pathlib.Path(run_dir) / CONFIG_FILE).exists():
+            config = open_run(pathlib.Path(run_dir))
+            _check_hand(run_dir, config, preset, hand)
+            return {"config": config}
     config = get_preset(preset or "quickstart", hand)
     teacher = option_value("--teacher", arguments)
     if teacher:
+        from congrasp.services.train.students import student_of
+
         method = option_value("--method", arguments)
         config = student_of(config, teacher, method if method in STUDENTS else STUDENT)
     return {"config": config}
+
+
+def _check_hand(run_dir: str, config: RunConfig, preset: str, hand: str | None) -> None:
+    """Raises a CongraspError for a preset of another hand than that of the run to resume."""
+    if preset and get_preset(preset, hand).task.hand != config.task.hand:
+        raise CongraspError(
+            f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset "
+            f"{preset} is not for.",
+            "Leave out --preset, or choose another --run-dir.",
+        )
 
 
 COMMAND = train

@@ -1,16 +1,14 @@
 """Procedural objects of the two exams: one for published figures, one for development."""
 
 import zlib
-from typing import Literal
 
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool
 from congrasp.common.objects.spec import GraspObject
+from congrasp.services.evaluate.choices import Exam
 
-Exam = Literal["figures", "development"]
-"""Sets of procedural objects: one for published figures, one for development."""
 FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))
 """All families, cycled among the objects in an order that mixes basic and household ones."""
 MANY = 50_000

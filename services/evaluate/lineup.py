@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
@@ -14,21 +14,9 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.common.task.methods import STUDENTS, evaluated_as, get_method
 from congrasp.learner.run_directory import POLICY_FILE
+from congrasp.services.evaluate.choices import Table
 from congrasp.services.evaluate.plan import objects_label
 
-Table = Literal[
-    "single",
-    "composed",
-    "cross",
-    "hands",
-    "ablation",
-    "objects",
-    "noise",
-    "sensing",
-    "payload",
-    "peers",
-    "all",
-]
 ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
 """Methods of the table `ablation`."""
 

@@ -29,7 +29,8 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.object_headings import headings_of
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.evaluate.exams import FAMILIES, Exam, first_seed
+from congrasp.services.evaluate.choices import Exam
+from congrasp.services.evaluate.exams import FAMILIES, first_seed
 from congrasp.services.evaluate.experiment import (
     Experiment,
     silent,

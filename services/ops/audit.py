@@ -1,5 +1,4 @@
-"""`congrasp audit`: the outcome of every rollout of a run, from the journals of its actors and its
-learner.
+"""Audit: the outcome of every rollout of a run, from the journals of its actors and its learner.
 
 Actors record what they sent, with a checksum, and every reply; the learner records what it used,
 with a checksum from the start of the update, what it dropped, and where its sessions began and
@@ -16,10 +15,8 @@ import contextlib
 import dataclasses
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import tyro
-from rich.console import Console
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError
@@ -46,8 +43,6 @@ FAULTS = {
 """Faults of rollouts, and their kinds."""
 EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
 """Exit codes of `congrasp audit` by kind, the most serious first; 2 to 4 are those of errors."""
-_MAX_FAULTS = 20
-"""Faults that are printed."""
 UNJUDGED = "not in the journals"
 """Outcome of accepted rollouts that cannot be judged."""
 
@@ -500,35 +495,7 @@ def _without_trace(
     return "lost"
 
 
-def audit(
-    run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()
-) -> int:
-    """Compares the journals of a run's actors and of its learner: was every accepted rollout used
-    once, and unchanged?
-
-    Exits with 1 if a rollout was lost, else with 5 for a surplus (a rollout used twice, or made by
-    no actor), else with 6 if a rollout or a journal is damaged, else with 7 if something cannot be
-    judged, for lines are missing.
-
-    Args:
-      run_dir: Directory of the run.
-      journals: Journals of actors on other machines (`congrasp actor --audit FILE`).
-
-    Examples:
-      congrasp audit runs/mine
-      congrasp audit runs/mine --journals actor.1 actor.2
-    """
-    report = compare(run_dir, journals)
-    console = Console(markup=False)
-    console.print(_table(run_dir, report))
-    for line in _remarks(report):
-        console.print(line)
-    for line in report.faults[:_MAX_FAULTS]:
-        console.print(line)
-    return report.exit_code
-
-
-def _table(run_dir: pathlib.Path, report: Report) -> Table:
+def outcome_table(run_dir: pathlib.Path, report: Report) -> Table:
     """Table of the outcomes and of the journals' lines."""
     table = Table("rollouts", "number", "kind", title=f"Audit of {run_dir}")
     for name, value in report.counts.items():
@@ -542,7 +509,7 @@ def _table(run_dir: pathlib.Path, report: Report) -> Table:
     return table
 
 
-def _remarks(report: Report) -> Iterator[str]:
+def remarks(report: Report) -> Iterator[str]:
     """Yields lines about lag, and about what the journals lack."""
     yield (
         f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} "
@@ -568,6 +535,3 @@ def _remarks(report: Report) -> Iterator[str]:
         count = report.counts.get(UNJUDGED, 0)
         accepted = report.counts.get("accepted", 0)
         yield (f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}.")
-
-
-COMMAND = audit

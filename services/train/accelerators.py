@@ -3,12 +3,11 @@
 import subprocess
 import sys
 
-import jax
-
 from congrasp.actors.physics import resolve_physics
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.lazy_jax import jax
 from congrasp.common.runtime.stages import stage
 
 _START_TIMEOUT_S = 120.0

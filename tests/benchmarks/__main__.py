@@ -1,5 +1,5 @@
 """Benchmarks that inject faults, attack or compare with peers: `python -m tests.benchmarks NAME` in
-the repository.
+the repository. Those of a user's machine are in the package, as `congrasp bench`.
 """
 
 import importlib

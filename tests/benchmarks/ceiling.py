@@ -20,7 +20,8 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.runtime.engines import ENGINES, engine_title
 from congrasp.services.cli.console import in_range, tracked
-from congrasp.services.evaluate.exams import Exam, exam_pool
+from congrasp.services.evaluate.choices import Exam
+from congrasp.services.evaluate.exams import exam_pool
 from congrasp.services.evaluate.experiment import Experiment, Track, Variation
 from congrasp.services.evaluate.lineup import Entrant, facts, read_entrant
 from congrasp.services.evaluate.plan import batches

@@ -5,14 +5,13 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.markers import Marker, Paint
 from congrasp.common.task.constraints.redirect import REACH, redirected

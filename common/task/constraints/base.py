@@ -22,12 +22,12 @@ import operator
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar, get_type_hints
 
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.task.constraints.specs import (
     ErrorSpec,

@@ -6,12 +6,12 @@ captured path jitter. The size of the disturbance is drawn for each episode, bet
 maxima below.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import chance, rotations
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array
 
 JOINTS = 0.3

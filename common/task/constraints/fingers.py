@@ -6,14 +6,13 @@ import functools
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import chance
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.specs import (
     ErrorSpec,

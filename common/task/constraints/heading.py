@@ -5,7 +5,6 @@ active.
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import chance, rotations
@@ -13,6 +12,7 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.markers import Arrow, Marker

@@ -6,13 +6,13 @@ In training, references are disturbed like captured grasps (`constraints.disturb
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.disturbance import (
     disturbed_fingers,

@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints.heading import HeadingGoal
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
 from congrasp.common.task.types import Array, Surface

@@ -3,13 +3,12 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.disturbance import disturbed_wrist, wrist_numbers
 from congrasp.common.task.constraints.fingers import chosen_fingers

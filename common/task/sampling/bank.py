@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
+from congrasp.common.runtime.lazy_jax import jax
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Surface
 

@@ -19,9 +19,8 @@ Hooks that take batched arrays (leading axis B) are pure functions that may be t
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-import jax.numpy as jnp
-
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.readings import Readings, with_readings, without_privileged
 from congrasp.common.task.scene import Scene

@@ -9,10 +9,9 @@ start, both with the camera's constant error. The true pose is not part of that 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.geometry import flat

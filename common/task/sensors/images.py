@@ -9,13 +9,10 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.normals import estimated_normals
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.sensors.parameters import SensorParameters
 from congrasp.common.task.types import Array, Surface
 
@@ -101,6 +98,8 @@ def with_images(
 
 def _taken(hand: Capsules | None, images: Images) -> tuple[Array, Surface]:
     """Returns which points (B, N) are visible, and the clouds of B images, world frame."""
+    from congrasp.common.task.normals import estimated_normals  # imports JAX
+
     parameters = images.parameters
     origin = images.origin
     surface = images.surface

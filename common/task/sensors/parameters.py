@@ -7,11 +7,10 @@ rises, and arrives `delay` control steps later.
 import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import chance
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.settings import SensingConfig
 from congrasp.common.task.types import Array
 

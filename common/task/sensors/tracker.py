@@ -7,10 +7,8 @@ steps of it, with its joints and their targets, which substitute for contact for
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from congrasp.common import rotations
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.sensors.base import EpisodeStart, Moment, Sensor, robot_inputs
 from congrasp.common.task.sensors.parameters import SensorParameters, arrival, longest

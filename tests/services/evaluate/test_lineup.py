@@ -148,7 +148,7 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
 def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):
     sets = CapturedObjects([], None, "human", "captured")
     monkeypatch.setattr(
-        "congrasp.services.cli.evaluate.captured_objects", lambda folder, split, objects: sets
+        "congrasp.services.evaluate.captured.captured_objects", lambda folder, split, objects: sets
     )
     monkeypatch.setattr(
         "congrasp.services.assets.objects.named.objects_of", lambda *arguments, **options: []

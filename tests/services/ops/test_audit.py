@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.learner.run_directory import note_version
-from congrasp.services.ops.audit import audit as command
+from congrasp.services.cli.audit import audit as command
 from congrasp.services.ops.audit import compare as audit
 
 CONTENT = ["c0", "c1", "c2", "c3", "c4", "c5"]

@@ -7,7 +7,7 @@ from congrasp.actors.physics.native import NativePhysics
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.bench.physics import Recorder, replay, rolled
+from congrasp.services.bench.replay import Recorder, replay, rolled
 
 HAND = get_hand("human")
 TASK = TaskConfig()
