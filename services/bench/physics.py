@@ -46,8 +46,13 @@ _DEFINITION = (
 
 
 def engines() -> list[PhysicsName]:
-    """Engines to compare on this machine: all of them on a GPU, only the fastest one on a CPU."""
-    return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
+    """Engines to compare on this machine: all that it has on a GPU, only the fastest one on a
+    CPU.
+    """
+    backend = jax.default_backend()
+    if backend == "cpu":
+        return [resolve_physics("auto")]
+    return [name for name, engine in ENGINES.items() if engine.missing(backend) is None]
 
 
 _PEERS = {"native": "mujoco.rollout, no actor", "warp": "mujoco_warp without JAX, no actor"}
@@ -195,8 +200,10 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
                 twin.start(worker.state.reset_state)
                 physics.commands.clear()
                 bare = functools.partial(replay, twin, physics.commands, config.task.substeps)
-            else:
+            elif physics.compiled:
                 bare = _compiled_loop(worker, hand)
+            else:
+                bare = _plain_loop(worker, hand)
             actor_seconds.append(_timed(functools.partial(_collect, worker, policy)))
             if isinstance(physics, Recorder) and twin is not None:
                 peer_seconds.append(_timed(rolled(twin, physics.commands, config.task.substeps)))
@@ -253,11 +260,33 @@ def _compiled_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
     compiled = jax.jit(loop)
     state = worker.state
     assert state is not None
-    target = jax.numpy.concatenate([state.u_target, motor_positions(hand, state.q_target)], -1)
-    table = jax.numpy.ones(len(target), bool)
+    target, table = _last_targets(worker, hand)
 
     def run() -> object:
         return jax.block_until_ready(compiled(state.physics, target, table))
 
     run()
     return run
+
+
+def _plain_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
+    """Control steps of an engine that is not compiled, alone."""
+    physics = worker.physics
+    assert worker.state is not None
+    running = worker.state.physics
+    target, table = _last_targets(worker, hand)
+
+    def run() -> object:
+        for _ in range(_STEPS):
+            physics.step(running, target, table)
+        return running
+
+    return run
+
+
+def _last_targets(worker: RolloutWorker, hand: Hand) -> tuple[jax.Array, jax.Array]:
+    """Last targets (B, 6 + M) of an actor, and tables (B,) that are all present."""
+    state = worker.state
+    assert state is not None
+    target = jax.numpy.concatenate([state.u_target, motor_positions(hand, state.q_target)], -1)
+    return target, jax.numpy.ones(len(target), bool)
