@@ -13,7 +13,7 @@ _BITS = 32
 
 
 class Collisions(NamedTuple):
-    """Which bodies of a compiled scene collide."""
+    """Pairs of bodies of a compiled scene that collide."""
 
     own_bit: dict[int, int]
     """Mask with one bit for each body with shapes, the table excluded."""
