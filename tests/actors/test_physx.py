@@ -387,6 +387,22 @@ def test_a_tendon_pulls_its_joints(physx):
     np.testing.assert_allclose(lengths["physx"], lengths["native"], atol=5e-3)
 
 
+def test_more_links_than_its_filter_has_bits_are_refused(physx):
+    extra = tuple(
+        dataclasses.replace(HAND.links[-1], name=f"extra_{i}", joints=(), tip=None, parent="palm")
+        for i in range(32)
+    )
+    hand = dataclasses.replace(HAND, links=(*HAND.links, *extra))
+    with pytest.raises(CongraspError, match="at most 31 links"):
+        physx(hand=hand)
+
+
+def test_rollouts_are_made_on_it(physx):
+    worker = suite.worker(physics=physx(suite.OBJECTS))
+    rollout = worker.collect(suite.command(noise=0.3), 3)
+    assert np.all(np.isfinite(rollout.reward))
+
+
 def test_a_coupling_of_distant_joints_is_refused(physx):
     first, *_, last = HAND.joints
     hand = dataclasses.replace(HAND, couplings=(Coupling(last.name, first.name, 1.0),))
