@@ -14,13 +14,15 @@ from congrasp.actors import initial
 from congrasp.actors import stress as protocols
 from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
-from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.worker import RolloutWorker
+from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, acting
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import Resolution
@@ -77,6 +79,7 @@ class Attempts:
         *,
         threads: int,
         phases: Phases = PLAIN,
+        physics: PhysicsName = "native",
     ):
         """Sets up the attempts; nothing is compiled yet.
 
@@ -86,12 +89,14 @@ class Attempts:
           bundle: the policy.
           threads: threads of the physics.
           phases: durations and heights.
+          physics: engine, one that takes any object after another: not one that is compiled.
         """
         self.phases = phases
         self._hand = hand
         self._task = task
         self._bundle = bundle
         self._threads = threads
+        self._physics = physics
         self._worker: RolloutWorker | None = None
 
     @property
@@ -228,8 +233,16 @@ class Attempts:
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
         """Returns a worker of `batch` environments on this object that acts with the mean and
         traces all of them.
+
+        Raises:
+          CongraspError: the engine is missing here, or cannot simulate the hand or other objects.
         """
-        physics = NativePhysics(self._hand, self._task, [obj], self._threads)
+        physics = make_physics(self._physics, self._hand, self._task, [obj], threads=self._threads)
+        if physics.compiled:
+            raise CongraspError(
+                f"The '{physics.name}' engine is compiled for the shapes of certain objects.",
+                "Pass --physics native.",
+            )
         return RolloutWorker(
             self._hand,
             self._task,

@@ -62,6 +62,7 @@ _EXTRAS = {
     **dict.fromkeys(("onnx", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
     **dict.fromkeys(("daqp", "mink", "mujoco_menagerie", "qpsolvers"), "arm"),
     "gymnasium": "gym",
+    "sapien": "physx",
     "wandb": "wandb",
     "warp": "cuda",
 }

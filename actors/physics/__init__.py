@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, Engine, PhysicsName
@@ -55,6 +55,20 @@ def _make_native(*arguments: Any) -> "Physics":
     return NativePhysics(*arguments)
 
 
+def _make_physx(*arguments: Any) -> "Physics":
+    """Builds PhysX on threads."""
+    from congrasp.actors.physics.physx.batch import PhysxPhysics
+
+    return PhysxPhysics(*arguments)
+
+
+def _missing_physx(backend: str) -> CongraspError | None:
+    """Error if the package is missing."""
+    if importlib.util.find_spec("sapien") is None:
+        return MissingPackageError("The 'physx' engine", "sapien")
+    return None
+
+
 def _missing_warp(backend: str) -> CongraspError | None:
     """Error if the NVIDIA GPU or the package is missing."""
     if backend not in _NVIDIA:
@@ -84,6 +98,7 @@ ENGINES["jax"] = Engine(
 ENGINES["native"] = Engine(
     _make_native, 64, lambda backend: backend == "cpu", title="MuJoCo C (CPU)"
 )
+ENGINES["physx"] = Engine(_make_physx, 64, missing=_missing_physx, title="PhysX 5 (CPU)")
 
 
 def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:

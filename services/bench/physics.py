@@ -96,10 +96,13 @@ class _Seconds(NamedTuple):
 
 
 def default_engines() -> list[PhysicsName]:
-    """Engines to compare on this machine: all of them on a GPU, only the fastest one on a CPU."""
-    if jax.default_backend() == "cpu":
+    """Engines to compare on this machine: all that it has on a GPU, only the fastest one on a
+    CPU.
+    """
+    backend = jax.default_backend()
+    if backend == "cpu":
         return [resolve_physics("auto")]
-    return list(ENGINES)
+    return [name for name, engine in ENGINES.items() if engine.missing(backend) is None]
 
 
 def bench_physics(
@@ -120,7 +123,7 @@ def bench_physics(
         if name == "native":
             seconds = _measure_native(setting, repeats)
         else:
-            seconds = _measure_compiled(name, setting, repeats)
+            seconds = _measure(name, setting, repeats)
         table.add_row(name, *_row(environments, seconds.actor, seconds.engine))
         if seconds.peer:
             table.add_row(_PEERS[name], *_row(environments, seconds.peer, seconds.engine))
@@ -166,13 +169,14 @@ def _measure_native(setting: _Setting, repeats: int) -> _Seconds:
     return seconds
 
 
-def _measure_compiled(name: PhysicsName, setting: _Setting, repeats: int) -> _Seconds:
-    """Times an actor on a compiled engine, and this engine without it."""
+def _measure(name: PhysicsName, setting: _Setting, repeats: int) -> _Seconds:
+    """Times an actor on another engine, and this engine without it."""
     physics = make_physics(
         name, setting.hand, setting.task, setting.objects, threads=setting.threads
     )
     worker = setting.worker(physics)
-    engine_alone = _compiled_loop(worker, setting.hand)
+    loop = _compiled_loop if physics.compiled else _plain_loop
+    engine_alone = loop(worker, setting.hand)
     seconds = _Seconds([], [], [])
     for _ in range(repeats):
         seconds.actor.append(_timed(functools.partial(setting.collect, worker)))
@@ -203,8 +207,7 @@ def _compiled_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
     compiled = jax.jit(loop)
     state = worker.state
     assert state is not None
-    target = jax.numpy.concatenate([state.u_target, motor_positions(hand, state.q_target)], -1)
-    table = jax.numpy.ones(len(target), bool)
+    target, table = _last_targets(worker, hand)
 
     def run() -> object:
         """Advances the engine, and waits for it."""
@@ -212,6 +215,30 @@ def _compiled_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
 
     run()
     return run
+
+
+def _plain_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
+    """Control steps of an engine that is not compiled, alone."""
+    physics = worker.physics
+    assert worker.state is not None
+    running = worker.state.physics
+    target, table = _last_targets(worker, hand)
+
+    def run() -> object:
+        """Advances the engine by whole episodes."""
+        for _ in range(_STEPS):
+            physics.step(running, target, table)
+        return running
+
+    return run
+
+
+def _last_targets(worker: RolloutWorker, hand: Hand) -> tuple[jax.Array, jax.Array]:
+    """Last targets (B, 6 + M) of an actor, and tables (B,) that are all present."""
+    state = worker.state
+    assert state is not None
+    target = jax.numpy.concatenate([state.u_target, motor_positions(hand, state.q_target)], -1)
+    return target, jax.numpy.ones(len(target), bool)
 
 
 def _row(

@@ -79,6 +79,9 @@ class Evaluate:
     """Episodes of each row; for the table 'objects', the total."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
+    reference_physics: PhysicsName = "auto"
+    """Engine of the reference policy's grasps; auto takes that of --physics. Pass the same one to
+    compare engines on the same episodes."""
     pool: int = 0
     """Number of procedural objects; 0 uses one of each family, and for the table 'objects' one per
     episode, at most 50,000."""
@@ -113,6 +116,8 @@ class Evaluate:
         entrants = read_entrants(self.policy, self.method)
         lineup = line_up(self.table, entrants, self.hand, self.method)
         engine = resolve_physics(self.physics)
+        if self.reference_physics != "auto":
+            resolve_physics(self.reference_physics)
         many_objects = self._many_objects(engine)
         with tracked() as track:
             experiment, without_set = self._experiment(lineup, engine, track)
@@ -213,8 +218,12 @@ class Evaluate:
 
     def _settings(self, engine: PhysicsName) -> dict[str, Any]:
         """Settings of all episodes."""
+        reference_engine = engine
+        if self.reference_physics != "auto":
+            reference_engine = self.reference_physics
         return {
             "physics": engine,
+            "reference_physics": reference_engine,
             "batch": self.batch,
             "seed": self.seed,
             "friction": self.friction,

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
+from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError, printable
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.specs import Option
@@ -95,6 +96,8 @@ class Grasp:
     """Number of attempts simulated in parallel, at most 1024."""
     seed: int = 0
     """Seed of the attempts."""
+    physics: PhysicsName = "native"
+    """Engine of the attempts: native (MuJoCo C) or physx."""
     approach: float | None = None
     """Seconds in which the hand first comes from the side of the table; longer where an arm needs
     it (1 m/s). By default 0, and 0.7 with --video.
@@ -119,13 +122,22 @@ class Grasp:
     def __call__(self) -> int:
         """Grasps one object after another."""
         from congrasp.actors.attempts import Phases
+        from congrasp.actors.physics import resolve_physics
         from congrasp.services.grasp.interface import open_grasper
         from congrasp.services.grasp.jobs import find_objects
         from congrasp.services.grasp.summary import save_summary
 
         self._check()
         phases = Phases(self._approach, self._lift)
-        grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
+        grasper = open_grasper(
+            self.policy,
+            self.hand,
+            self.attempts,
+            self.seed,
+            phases,
+            self.arm,
+            resolve_physics(self.physics),
+        )
         entries, results = find_objects(self.objects, self.folder)
         settings = self._settings()
         for result in results:

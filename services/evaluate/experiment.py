@@ -134,6 +134,9 @@ class Experiment:
     """Least number of episodes of a row."""
     physics: PhysicsName = "native"
     """Engine, except `auto`."""
+    reference_physics: PhysicsName = ""
+    """Engine of the reference policy's grasps; that of the episodes if empty. With the same one,
+    the episodes of different engines have the same references."""
     batch: int = 0
     """Most parallel worlds; 0 uses the engine's default."""
     seed: int = 0
@@ -208,7 +211,7 @@ class Experiment:
             self.task,
             self.scaled,
             self.bank,
-            physics=self.physics,
+            physics=self.reference_physics or self.physics,
             progress=lambda done, of: advance(done),
         )
 

@@ -18,6 +18,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
@@ -108,6 +109,7 @@ class Grasper:
         seed: int = 0,
         arm: "ArmPlanner | None" = None,
         left: bool = False,
+        physics: PhysicsName = "native",
     ):
         """Compiles nothing yet.
 
@@ -121,6 +123,7 @@ class Grasper:
           arm: the arm that must be able to execute the motion.
           left: grasps with the left hand; the policy's right hand grasps the mirrored object
             (`common.mirror`).
+          physics: engine, except `auto` and those that are compiled.
         """
         if attempts < 1:
             raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
@@ -136,8 +139,14 @@ class Grasper:
         self._rounds = rounds
         self._seed = seed
         self._compiled = False
+        self.physics = physics
         self._attempts = Attempts(
-            self._hand, self.task, policy, threads=threads or cores(), phases=phases
+            self._hand,
+            self.task,
+            policy,
+            threads=threads or cores(),
+            phases=phases,
+            physics=physics,
         )
 
     @functools.cached_property
@@ -145,6 +154,8 @@ class Grasper:
         """Inputs of a grasp other than object and request."""
         policy = bundles.content_hash(encode(self._policy.to_message()))
         arm = self._arm.identity if self._arm else ""
+        # Grasps of the default engine have the identity that they had before there was a choice.
+        engine = () if self.physics == "native" else (self.physics,)
         return (
             policy,
             self._attempts_count,
@@ -153,6 +164,7 @@ class Grasper:
             *self._attempts.phases,
             self._left,
             arm,
+            *engine,
         )
 
     @compiling_entry
@@ -361,6 +373,7 @@ class Grasper:
         obj = attempts.obj
         about = {
             "actor": "grasp",
+            "physics": self.physics,
             "attempts": attempted.attempts,
             "attempts_held": attempted.held,
             "object_file_scale": obj.file_scale,

@@ -12,6 +12,7 @@ from congrasp.common.hands.left import right_name
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.named import one_object
@@ -30,6 +31,7 @@ def open_grasper(
     seed: int = 0,
     phases: Phases = PLAIN,
     arm: ArmOptions = ArmOptions(),  # noqa: B008
+    physics: PhysicsName = "native",
 ) -> Grasper:
     """Returns a grasper with a policy file, or with the pretrained policy of a hand.
 
@@ -40,6 +42,7 @@ def open_grasper(
       seed: seed of the attempts.
       phases: approach, lift and hold.
       arm: the arm that carries the hand, if it names one.
+      physics: engine, except `auto` and those that are compiled.
 
     Raises:
       CongraspError: there is no such policy, hand or arm, or the hand on the arm is a left one.
@@ -53,7 +56,15 @@ def open_grasper(
         from congrasp.services.arm.planner import ArmPlanner
 
         planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
-    return Grasper(bundle, attempts=attempts, phases=phases, seed=seed, arm=planner, left=left)
+    return Grasper(
+        bundle,
+        attempts=attempts,
+        phases=phases,
+        seed=seed,
+        arm=planner,
+        left=left,
+        physics=physics,
+    )
 
 
 @compiling_entry

@@ -220,6 +220,7 @@ def _save(job: _Job, obj: GraspObject, grasp: Grasp, progress: Progress) -> dict
         "shape_reliable": obj.shape_reliable,
         "notes": notes,
         "rules": list(grasp.active),
+        "physics": grasp.motion.about.get("physics", "native"),
         "drawn": settings.drawn,
     }
     save_grasp(

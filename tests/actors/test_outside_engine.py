@@ -85,5 +85,5 @@ def test_command_lines_offer_it():
         "ENGINES['counting'] = Engine(None, batch=1); run(['train', '--help'])"
     )
     done = python("-c", program)
-    assert "--physics {auto,warp,jax,native,counting}" in done.stdout
+    assert "--physics {auto,warp,jax,native,physx,counting}" in done.stdout
     assert "(default: native)" in done.stdout.split("--physics")[1][:200]

@@ -99,8 +99,8 @@ def test_gains_scale_the_finger_servos_alone(native, env):
     np.testing.assert_array_equal(*(physics.instances[i].model.actuator_forcerange for i in (0, 2)))
 
 
-def test_objects_rest_and_the_hand_stays_without_commands(native, env):
-    physics = native(OBJECTS)
+def test_objects_rest_and_the_hand_stays_without_commands(on_cpu, env):
+    physics = on_cpu(OBJECTS)
     state = physics.start(above(env, 0.3))
     still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     for _ in range(50):
@@ -110,8 +110,8 @@ def test_objects_rest_and_the_hand_stays_without_commands(native, env):
     assert not after.contact_found.any() and not after.diverged.any()
 
 
-def test_a_removed_table_lets_objects_fall_freely(native, env):
-    physics = native(OBJECTS)
+def test_a_removed_table_lets_objects_fall_freely(on_cpu, env):
+    physics = on_cpu(OBJECTS)
     state = physics.start(above(env, 0.3))
     still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     table = np.array([True, False, False])
@@ -122,8 +122,8 @@ def test_a_removed_table_lets_objects_fall_freely(native, env):
     np.testing.assert_allclose(drop[1:], 0.5 * 9.81 * 0.2**2, rtol=0.05)
 
 
-def test_a_stationary_object_stays_when_pushed(native, env):
-    physics = native(OBJECTS)
+def test_a_stationary_object_stays_when_pushed(on_cpu, env):
+    physics = on_cpu(OBJECTS)
     start = above(env, 0.19)._replace(stationary=np.ones(ENVIRONMENTS, bool))
     state = physics.start(start)
     touched = np.zeros(ENVIRONMENTS, bool)
@@ -156,10 +156,10 @@ def test_a_scaled_mass_is_the_mass_of_a_heavier_object(native, env):
                 )
 
 
-def test_contact_force_is_that_of_the_object_on_the_link(native, env):
+def test_contact_force_is_that_of_the_object_on_the_link(on_cpu, env):
     """An object that lies on a flat, upturned hand presses it down with its weight."""
     box = dataclasses.replace(OBJECTS[0])
-    physics = native([box])
+    physics = on_cpu([box])
     height = float(np.abs(box.points[:, 2]).max())
     start = suite.start_of(
         base_position=np.array([[0.0, -0.05, 0.5]]),
@@ -208,9 +208,9 @@ def test_environments_whose_solver_reached_its_limit_are_counted(native, env):
         np.testing.assert_allclose(after.occupancy, [0.0, 0.0, limited / ENVIRONMENTS], rtol=1e-6)
 
 
-def test_an_environment_that_was_used_before_is_as_good_as_new(native, env):
+def test_an_environment_that_was_used_before_is_as_good_as_new(on_cpu, env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
-    physics, fresh = native(OBJECTS), native(OBJECTS)
+    physics, fresh = on_cpu(OBJECTS), on_cpu(OBJECTS)
     start = above(env, 0.19)
     everywhere = np.ones(ENVIRONMENTS, bool)
     state = physics.start(
@@ -228,8 +228,8 @@ def test_an_environment_that_was_used_before_is_as_good_as_new(native, env):
         np.testing.assert_array_equal(a, b)
 
 
-def test_reset_changes_only_the_masked_environments(native, env):
-    physics = native(OBJECTS)
+def test_reset_changes_only_the_masked_environments(on_cpu, env):
+    physics = on_cpu(OBJECTS)
     start = above(env, 0.3)
     state = physics.start(start)
     moving = np.concatenate([np.full((ENVIRONMENTS, 6), 0.05), np.asarray(start.q)], 1)
