@@ -81,13 +81,8 @@ class ExportMotion:
 
     def __call__(self) -> int:
         """Writes the motions, and prints the number of their frames."""
-        from congrasp.services.export.motion_file import (
-            FORMATS,
-            at_rate,
-            default_name,
-            export_motions,
-            pick_motion,
-        )
+        from congrasp.services.export.formats import FORMATS, default_name, export_motions
+        from congrasp.services.export.motions import at_rate, pick_motion
 
         if not self.paths:
             raise CongraspError(
@@ -101,7 +96,7 @@ class ExportMotion:
             motions = [at_rate(motion, self.fps) for motion in motions]
         target = self.out or default_name(motions[0], self.to)
         export_motions(motions, self.to, target, camera=self.camera, force=self.force)
-        frames = sum(len(motion.time) for motion in motions)
+        frames = sum(motion.steps for motion in motions)
         print(f"{target}: {frames} frames")
         return 0
 

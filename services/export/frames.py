@@ -13,16 +13,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import Mesh
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.hand_arrays import hand_arrays
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
 from congrasp.common.hands.flesh import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.common.rotations import continuous
-from congrasp.services.export.motion_file import GraspMotion, hand_arrays
-from congrasp.services.record import palette
-from congrasp.services.record.episode import Mesh
-from congrasp.services.record.palette import painted
+from congrasp.services.appearance import palette
+from congrasp.services.appearance.surface_colours import painted
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
@@ -74,7 +75,7 @@ class Capsule(NamedTuple):
     """Rotation from its frame to the link's."""
 
 
-def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
+def capsules(motion: Episode, link: int) -> Iterator[Capsule]:
     """The capsules of a link by its index."""
     for k in np.flatnonzero(motion.capsule_link == link):
         start, end = motion.capsule_ends[k].astype(float)
@@ -85,7 +86,7 @@ def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
         yield Capsule(int(k), length, float(motion.capsule_radius[k]), (start + end) / 2, turn)
 
 
-def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def object_mesh(motion: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """The object's mesh (V, 3), (F, 3), and the sRGB (V, 3) in [0, 1] of its points, for which it
     is refined.
     """
@@ -95,7 +96,7 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return vertices, faces, colours.astype(np.float32) / 255
 
 
-def skin_of_motion(motion: GraspMotion) -> Skin:
+def skin_of_motion(motion: Episode) -> Skin:
     """Returns the surface of the motion's hand; that of its file's meshes if it is a custom hand
     and readable.
     """
@@ -118,7 +119,7 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
     return skin_on(skeleton)
 
 
-def link_origins(motion: GraspMotion) -> np.ndarray:
+def link_origins(motion: Episode) -> np.ndarray:
     """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of
     their first joints.
     """
@@ -128,13 +129,13 @@ def link_origins(motion: GraspMotion) -> np.ndarray:
     return origins
 
 
-def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
+def _same_hand(motion: Episode, hand: Hand) -> bool:
     """True if the hand of the motion's name is unchanged."""
     arrays = hand_arrays(hand)
     return all(np.array_equal(arrays[name], getattr(motion, name)) for name in _KINEMATICS)
 
 
-def bodies(motion: GraspMotion) -> list[Body]:
+def bodies(motion: Episode) -> list[Body]:
     """Links of the hand in their order, each after its parent, the object, and the links of the
     arm.
     """
@@ -179,7 +180,7 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
     return matrices
 
 
-def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
+def arm_meshes(motion: Episode) -> dict[str, list[Mesh]]:
     """Meshes of each link of the arm that has any; empty without an arm."""
     found: dict[str, list[Mesh]] = {}
     if arm := motion.arm:
@@ -188,7 +189,7 @@ def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
     return found
 
 
-def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
+def facts(motion: Episode, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
     """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
     about = {
         "generator": "congrasp",

@@ -13,6 +13,8 @@ import numpy as np
 import pygltflib as gltf
 import trimesh
 
+from congrasp.common.episode.arm import Mesh
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import Skin
 from congrasp.services.export.frames import (
     COLOURS,
@@ -26,8 +28,6 @@ from congrasp.services.export.frames import (
     skin_of_motion,
     unwrapped,
 )
-from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.record.episode import Mesh
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners
 
@@ -35,7 +35,7 @@ _KINDS = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT
 _NUMBERS = {"<f4": gltf.FLOAT, "<u4": gltf.UNSIGNED_INT, "<u2": gltf.UNSIGNED_SHORT}
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion."""
     (motion,) = motions
     scene = _Scene()
@@ -147,7 +147,7 @@ class _Scene:
         return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
 
-def _object(scene: _Scene, motion: GraspMotion) -> gltf.Primitive:
+def _object(scene: _Scene, motion: Episode) -> gltf.Primitive:
     """The object's mesh with normals and the last material, which becomes white if the points have
     colours.
     """

@@ -19,11 +19,12 @@ import pyarrow.parquet as pq
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.skin import Skin
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.export.frames import facts, skin_of_motion
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.joint_trajectory import robot_joints
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.hand_shapes import skin_shape
@@ -58,7 +59,7 @@ _KEYFRAMES = ("-g", "2")  # for random access in training
 _COUNTED = 64  # pixels between those that the statistics count
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode], *, camera: bool = False) -> None:
     """Writes motions of one hand and one control step as a dataset folder, optionally with a
     camera's video.
 
@@ -102,7 +103,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
         (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1))
 
 
-def _frame_rate(motions: Sequence[GraspMotion]) -> int:
+def _frame_rate(motions: Sequence[Episode]) -> int:
     """Frames a second of motions of one robot."""
     dt = motions[0].control_dt
     fps = round(1 / dt)
@@ -121,7 +122,7 @@ def _prefixed(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
     return {f"{prefix}/{name}": value for name, value in entries.items()}
 
 
-def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
+def _about(motions: Sequence[Episode]) -> dict[str, Any]:
     """Meaning of the dataset's numbers, and origin of its motions."""
     about = facts(
         motions[0],
@@ -168,12 +169,12 @@ def _video_feature(fps: int) -> dict[str, Any]:
     }
 
 
-def _task(motion: GraspMotion) -> str:
+def _task(motion: Episode) -> str:
     """A motion's task as a sentence."""
     return f"Grasp the object {motion.object} under {' and '.join(motion.constraints)}."
 
 
-def _robot(motion: GraspMotion) -> tuple[Any, ...]:
+def _robot(motion: Episode) -> tuple[Any, ...]:
     """Identity of the hand, the arm, and the control step."""
     arm = motion.arm
     return (
@@ -184,7 +185,7 @@ def _robot(motion: GraspMotion) -> tuple[Any, ...]:
 
 
 def _columns(
-    motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]
+    motion: Episode, episode: int, start: int, tasks: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """A motion's columns (T, ...) by name; `start` is the number of rows before them."""
     count = len(motion.time)
@@ -268,7 +269,7 @@ def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
     pq.write_table(table, path, compression="snappy")
 
 
-def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
+def _info(motion: Episode, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
     """Description of the data set: features with their shapes and names, counts, paths of files."""
     joints, count = robot_joints(motion), len(motion.joint_names)
     arm, fingers = joints[:-count], joints[-count:]
@@ -316,7 +317,7 @@ class Film(NamedTuple):
     """(n, 3) from 0 to 1 for each motion: some pixels of every frame."""
 
 
-def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) -> Film:
+def film(path: pathlib.Path, motions: Sequence[Episode], frame_rate: int) -> Film:
     """Writes the video of all motions in sequence, from a camera that shows all of them."""
     camera, pixels = camera_for(motions), list[np.ndarray]()
 
@@ -333,13 +334,13 @@ def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) ->
     return Film(calibration(camera), pixels)
 
 
-def camera_for(motions: Sequence[GraspMotion]) -> Camera:
+def camera_for(motions: Sequence[Episode]) -> Camera:
     """Returns a camera that shows hands and objects of all motions."""
     points = np.concatenate([_extent(motion) for motion in motions])
     return fit(points[ConvexHull(points).vertices], _DIRECTION, SIZE[0] / SIZE[1])
 
 
-def _extent(motion: GraspMotion) -> np.ndarray:
+def _extent(motion: Episode) -> np.ndarray:
     """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
     found = []
     skin = skin_of_motion(motion)
@@ -353,7 +354,7 @@ def _extent(motion: GraspMotion) -> np.ndarray:
     return np.concatenate(found)
 
 
-def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
+def pictures(motion: Episode, camera: Camera) -> Iterator[np.ndarray]:
     """(height, width, 3) uint8 of every frame of a motion."""
     skin = skin_of_motion(motion)
     with ThreadPoolExecutor(cores()) as pool:
@@ -388,7 +389,7 @@ def calibration(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
+def _shapes(motion: Episode, skin: Skin, frame: int) -> list[Shape]:
     """Shapes of the hand, the object, the arm, and the table while it is present."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
     mesh = motion.object_vertices, motion.object_faces

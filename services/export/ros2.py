@@ -25,10 +25,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from congrasp.common.episode.episode import Episode
+from congrasp.services.appearance.surface_colours import colours_at
 from congrasp.services.export.frames import COLOURS, OBJECT, arm_meshes, bodies, facts
-from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
+from congrasp.services.export.joint_trajectory import joint_trajectory, robot_joints
 from congrasp.services.export.urdf import robot_urdf
-from congrasp.services.record.palette import colours_at
 
 _WORLD = "world"
 _OFTEN = ("/joint_states", "/tf")
@@ -52,7 +53,7 @@ or empty.
 """
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero
     means any time.
     """
@@ -75,7 +76,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 
 def _topics(
-    motion: GraspMotion, position: np.ndarray, velocity: np.ndarray, stamps: Sequence[int]
+    motion: Episode, position: np.ndarray, velocity: np.ndarray, stamps: Sequence[int]
 ) -> dict[str, tuple[str, Sequence[_Content]]]:
     """Types and messages of all topics, from the joints' positions and velocities (T, N) at T times
     in ns.
@@ -143,7 +144,7 @@ def _message(store: Typestore, kind: str, content: _Content) -> Any:
     )
 
 
-def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
+def _transforms(motion: Episode, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
     """TF of all bodies at each of T times in ns."""
     found = bodies(motion)
     parents = [found[body.parent].name if body.parent >= 0 else _WORLD for body in found]

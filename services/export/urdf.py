@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import UNLIMITED, MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.services.export.frames import capsules, link_origins, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
-from congrasp.services.record.episode import UNLIMITED, MovedArm
+from congrasp.services.export.joint_trajectory import robot_joints
 
 _MASS, _INERTIA = "0.01", "1e-6"
 """Placeholders for every link: only the kinematics is exported, but some readers need them."""
@@ -34,7 +35,7 @@ class _Joint(NamedTuple):
     """Largest speed, rad/s or m/s."""
 
 
-def robot_urdf(motion: GraspMotion) -> str:
+def robot_urdf(motion: Episode) -> str:
     """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the
     arm's base.
 
@@ -54,7 +55,7 @@ def robot_urdf(motion: GraspMotion) -> str:
     return ET.tostring(robot, "unicode")
 
 
-def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
+def _add_hand(robot: ET.Element, motion: Episode) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     names = robot_joints(motion)[-len(motion.joint_names) :]
     origins = link_origins(motion)
@@ -183,7 +184,7 @@ def _joint(
     return joint
 
 
-def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
+def _add_capsules(link: ET.Element, motion: Episode, index: int) -> None:
     """Adds each capsule as a cylinder and two spheres, because URDF has no capsules."""
     for number, length, radius, middle, turn in capsules(motion, index):
         for end in motion.capsule_ends[number]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import MATERIALS, Skin
 from congrasp.services.export.frames import (
     COLOURS,
@@ -28,14 +29,13 @@ from congrasp.services.export.frames import (
     skin_of_motion,
     unwrapped,
 )
-from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion."""
     (motion,) = motions
     stage = Usd.Stage.CreateNew(str(path))
@@ -78,7 +78,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     stage.Save()
 
 
-def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
+def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: Episode, link: int) -> None:
     """Adds the link's capsules in its frame, which are its collision shapes; viewers hide
     guides.
     """

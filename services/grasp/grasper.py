@@ -10,6 +10,7 @@ import numpy as np
 from congrasp.actors.attempts import PLAIN, Attempts, Outcome, Phases
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common import mirror
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.left import LEFT
@@ -25,7 +26,6 @@ from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.client.left_policy import mirrored_request
-from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.motion import Grasp
@@ -350,21 +350,17 @@ class Grasper:
             except NoReachError:
                 refusals["contact of every reach"] += 1
                 continue
-            episode = planned.moved.recorded(grasp.episode)
-            return dataclasses.replace(
-                grasp, episode=episode, motion=motion_of_episode(episode), arm=planned
-            )
+            episode = dataclasses.replace(grasp.episode, arm=planned.moved)
+            return dataclasses.replace(grasp, episode=episode, arm=planned)
         return None
 
     def _grasp_of(self, attempts: Round, index: int, attempted: Attempted) -> Grasp:
-        """Returns an attempt with its episode, motion and active constraints."""
+        """Returns an attempt with its episode and active constraints."""
         obj = attempts.obj
         about = {
             "actor": "grasp",
             "attempts": attempted.attempts,
             "attempts_held": attempted.held,
-            "object_file_scale": obj.file_scale,
-            "object_file_origin": [-x for x in obj.origin],
         }
         surface = surface_of(self.task, obj)
         episode = self._attempts.episode(attempts.outcome, index, surface, obj, about)
@@ -378,7 +374,6 @@ class Grasper:
             episode = _mirrored(episode, self.hand)
         return Grasp(
             episode=episode,
-            motion=motion_of_episode(episode),
             attempts=attempted.attempts,
             held=attempted.held,
             rest=int(attempts.rests[index]),
@@ -400,11 +395,13 @@ class Grasper:
         return (*sentences, *(conflict.message for conflict in conflicts))
 
 
-def _mirrored(episode: Message, hand: Hand) -> Message:
+def _mirrored(episode: Episode, hand: Hand) -> Episode:
     """Returns the episode of the left hand, from one of the right hand with the mirrored object."""
-    origin = mirror.vector(episode.meta["object_file_origin"]).tolist()
-    meta = {**episode.meta, "hand": hand.reference, "object_file_origin": origin}
-    return Message(mirror.fields(episode.arrays), meta)
+    message = episode.to_message()
+    meta = {**message.meta, "hand": hand.reference}
+    mirrored = Episode.from_message(Message(mirror.fields(message.arrays), meta))
+    origin = mirror.vector(episode.object_file_origin)
+    return dataclasses.replace(mirrored, object_file_origin=origin)
 
 
 def _no_motion(

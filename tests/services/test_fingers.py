@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from congrasp.actors.attempts import Phases
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
@@ -17,7 +18,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp.files import RESULT
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.parse import read_request

@@ -21,6 +21,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.constraints import active_blocks, active_constraints
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
@@ -28,15 +31,18 @@ from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
-from congrasp.services.record import palette, scene
-from congrasp.services.record.episode import active_blocks, active_constraints
-from congrasp.services.record.palette import JOINT, SKIN, colours_at, finer, painted
-from congrasp.services.record.palette import MATERIALS as COLOURS
-from congrasp.services.record.recorder import Converter
-from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
+from congrasp.services.appearance import palette
+from congrasp.services.appearance.palette import JOINT, SKIN
+from congrasp.services.appearance.palette import MATERIALS as COLOURS
+from congrasp.services.appearance.subdivision import finer
+from congrasp.services.appearance.surface_colours import colours_at, painted
+from congrasp.services.export.formats import default_name
+from congrasp.services.record import hand_parts
+from congrasp.services.record.converter import Converter
+from congrasp.services.record.hand_parts import surface_parts, surface_points
+from congrasp.services.record.scene import SPACING_M
 from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, flatten, nest
-from tests.episodes import CONTROL_DT, FORCE, episode, older
+from tests.episodes import CONTROL_DT, FORCE, episode_message, older
 
 HAND = get_hand("human")
 START = 1_000_000_000_000
@@ -45,7 +51,7 @@ KEY = "congrasp/run/log/episode/actor/a0"
 
 @pytest.fixture(scope="module")
 def entries() -> list[Entry]:
-    return Converter()(KEY, episode(), START)
+    return Converter()(KEY, episode_message(), START)
 
 
 def of(entries: list[Entry], name: str) -> list[Entry]:
@@ -61,7 +67,7 @@ def quaternion(q: object) -> np.ndarray:
 
 
 def test_every_link_and_the_object_has_its_frame_at_every_step(entries: list[Entry]) -> None:
-    arrays = episode().arrays
+    arrays = episode_message().arrays
     messages = of(entries, "tf")
     assert [e.time for e in messages] == [START + round(1e9 * CONTROL_DT) * i for i in range(12)]
     for i, entry in enumerate(messages):
@@ -105,7 +111,7 @@ def test_approach_arrow_points_at_the_heading_position(entries: list[Entry]) -> 
         [1, 0, 0]
     )
     tip = vector(arrow.pose.position) + (arrow.shaft_length + arrow.head_length) * direction
-    arrays = episode().arrays
+    arrays = episode_message().arrays
     np.testing.assert_allclose(tip, arrays["goal/heading_position"], atol=1e-6)
     np.testing.assert_allclose(direction, arrays["goal/heading_direction"], atol=1e-6)
     assert entities["constraint/heading"].frame_id == "a0/object"
@@ -121,7 +127,7 @@ def test_approach_arrow_points_at_the_heading_position(entries: list[Entry]) -> 
     ],
 )
 def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str]) -> None:
-    (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
+    (entry,) = of(Converter()(KEY, episode_message(mask=mask), START), "scene")
     ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
     assert {
         name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")
@@ -129,7 +135,7 @@ def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str
 
 
 def test_an_older_recording_is_drawn_as_it_is_now() -> None:
-    made = episode(mask=(1, 1, 0, 1))
+    made = episode_message(mask=(1, 1, 0, 1))
     (now,), (before,) = (
         of(Converter()(KEY, message, START), "scene") for message in (made, older(made))
     )
@@ -151,7 +157,7 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     cloud = PointCloud.FromString(entry.data)
     offsets = {field.name: field.offset for field in cloud.fields}
     raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
-    arrays = episode().arrays
+    arrays = episode_message().arrays
     points = np.stack(
         [raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1
     )
@@ -197,7 +203,7 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
     step, k = 9, [link.name for link in HAND.links].index("thumb_distal")
     writer = LogWriter(tmp_path, "log")
-    writer.write(*Converter()(KEY, episode(), START))
+    writer.write(*Converter()(KEY, episode_message(), START))
     writer.close()
     with writer.files[0].open("rb") as file:
         found = [
@@ -222,7 +228,7 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
         + 2 * np.cross(axis, np.cross(axis, local))
         + vector(frame.translation)
     )
-    arrays, skin = episode().arrays, skin_of(HAND)
+    arrays, skin = episode_message().arrays, skin_of(HAND)
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
     posed = skin.posed(arrays["link_position"][step], turns)[0]
     own = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
@@ -272,21 +278,24 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
     assert last["links_in_contact"] == 5 and last["table"] is False
     assert list(last["q"]) == [joint.name for joint in HAND.joints]
     index = [joint.name for joint in HAND.joints].index("index_pip")
-    assert last["q"]["index_pip"] == pytest.approx(float(episode().arrays["q"][-1, index]))
+    assert last["q"]["index_pip"] == pytest.approx(float(episode_message().arrays["q"][-1, index]))
 
 
 def test_the_raw_episode_is_kept_whole(entries: list[Entry]) -> None:
     (entry,) = of(entries, "raw")
-    kept, sent = decode(entry.data), episode()
+    kept, sent = decode(entry.data), episode_message()
     assert kept.meta == sent.meta
     assert all(np.array_equal(kept.arrays[name], sent.arrays[name]) for name in sent.arrays)
 
 
 def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side() -> None:
     convert = Converter()
-    first, second = convert(KEY, episode(), START), convert(KEY, episode(), START + 1)
+    first, second = (
+        convert(KEY, episode_message(), START),
+        convert(KEY, episode_message(), START + 1),
+    )
     assert min(e.time for e in second) > max(e.time for e in first)
-    other = convert("congrasp/run/log/episode/actor/b", episode(), START)
+    other = convert("congrasp/run/log/episode/actor/b", episode_message(), START)
     transforms = [
         FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data)
         for es in (first, other)
@@ -295,14 +304,14 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
         next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x
         for tf in transforms
     ]
-    assert places == [0.0, pytest.approx(SPACING)]
+    assert places == [0.0, pytest.approx(SPACING_M)]
 
 
 def test_a_clock_that_is_set_back_drops_no_episode() -> None:
     convert, day = Converter(), 86_400_000_000_000
-    first = convert(KEY, episode(), START)
+    first = convert(KEY, episode_message(), START)
     left = max(entry.time for entry in first) - START
-    times = [entry.time for entry in convert(KEY, episode(), START - day)]
+    times = [entry.time for entry in convert(KEY, episode_message(), START - day)]
     assert left < min(times) - (START - day) < 2 * left
 
 
@@ -369,7 +378,7 @@ def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(
         weights=np.eye(len(balls), dtype=np.float32)[own],
         material=np.full(len(own), MATERIALS.index("link")),
     )
-    monkeypatch.setattr(scene, "skin_of", lambda hand: fine)
+    monkeypatch.setattr(hand_parts, "skin_of", lambda hand: fine)
     parts = surface_parts(dataclasses.replace(hand, name="fine"))
     assert sum(len(part.faces) for links in parts for part in links) <= 12_000
     for (part,) in parts:
@@ -383,31 +392,35 @@ def test_meshes_that_cannot_be_read_leave_the_capsules_surface(
         raise CongraspError("The file is damaged.")
 
     hand = dataclasses.replace(get_hand("allegro"), name="torn")
-    monkeypatch.setattr(scene, "skin_of", damaged)
+    monkeypatch.setattr(hand_parts, "skin_of", damaged)
     assert (
         all(surface_parts(hand)) and sum(len(points) for points, _ in surface_points(hand)) > 2000
     )
 
 
 def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
-    whole = episode()
+    whole = episode_message()
     colours = {
         "colour_points": np.zeros((2, 3), np.float32),
         "colour_values": np.zeros((2, 3), np.uint8),
     }
-    check_episode(Message(whole.arrays | colours, whole.meta))
+    Episode.from_message(Message(whole.arrays | colours, whole.meta))
     for name in colours:
         with pytest.raises(
             CongraspError, match="colour_points without colour_values, or the reverse"
         ):
-            check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
+            Episode.from_message(Message(whole.arrays | {name: colours[name]}, whole.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
-        check_episode(Message(whole.arrays | far, whole.meta))
+        Episode.from_message(Message(whole.arrays | far, whole.meta))
+    evil = Episode.from_message(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
     with pytest.raises(CongraspError, match="object of a motion"):
-        motion_of_episode(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
+        save_motion(tmp_path / "motion.npz", evil)
+    with pytest.raises(CongraspError, match="object of a motion"):
+        default_name(evil, "glb")
     motion = dataclasses.replace(
-        motion_of_episode(whole), colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5))
+        Episode.from_message(whole).normalised(),
+        colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)),
     )
     save_motion(tmp_path / "motion.npz", motion)
     with pytest.raises(CongraspError, match="not from 0 to 255"):
