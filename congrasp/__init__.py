@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from congrasp.common.episode.episode import Episode
-    from congrasp.common.episode.episode import Episode as GraspMotion
     from congrasp.common.episode.motion_file import load_motion, save_motion
     from congrasp.common.errors import (
         CongraspError,
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
     from congrasp.services.grasp.motion import Grasp
     from congrasp.services.gym.vector_env import make_vec
     from congrasp.services.serve.inference import load_policy
+
+    GraspMotion = Episode
 
 __all__ = [
     "Answer",

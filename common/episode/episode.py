@@ -349,7 +349,8 @@ class Episode:
         end = int(np.sum(self.table))
         if "lift" in phases:
             end = self._step_at(phases["lift"])
-        return self._step_at(phases.get("grasp", 0.0)), end
+        start = self._step_at(phases.get("grasp", 0.0))
+        return min(start, end), end
 
     def _step_at(self, seconds: float) -> int:
         """The step nearest to a time, T at most."""

@@ -12,7 +12,6 @@ from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.scene import compile_scene
-from congrasp.common.episode.constraints import grasp_span
 from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -138,7 +137,7 @@ def benchmark_grasp(name: str, motion: Episode) -> Grasp:
     """
     match, hand = match_hand(motion), get_hand(motion.hand)
     obj = convex_object(motion)
-    last = max(grasp_span(motion.about, motion.control_dt, motion.table)[1] - 1, 0)
+    last = max(motion.grasp_span[1] - 1, 0)
     clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
     grasp = _state(motion, last)
     squeeze = grasp._replace(q=squeezed(hand, motion, last, match.hand.kp))

@@ -169,6 +169,7 @@ def make_episode(**about: Any) -> Episode:
         ({"grasp": 0.02, "hold": 0.08}, (2, 8)),
         ({"grasp": 0.02, "lift": 0.05}, (2, 5)),
         ({"grasp": 9e3, "lift": 9e3}, (12, 12)),
+        ({"grasp": 9e3}, (8, 8)),
         ({"grasp": -1.0, "lift": "soon"}, (0, 8)),
         ({"grasp": float("nan"), "lift": 1e300}, (0, 8)),
         ("soon", (0, 8)),
