@@ -242,7 +242,7 @@ def for_page(episode: Episode) -> Message:
     """The episode for the page's player: poses, forces, rewards, object, lanes, and markers
     `KIND/CONSTRAINT/FIELD`.
     """
-    message = episode.to_message()
+    recorded = episode.require_recorded()
     arrays: dict[str, Any] = {
         "link_position": episode.link_position,
         "link_quaternion": episode.link_quaternion,
@@ -257,7 +257,7 @@ def for_page(episode: Episode) -> Message:
         **_coloured_mesh(episode),
     }
     terms: dict[str, str] = {}
-    for term, values in episode.require_recorded().rewards.items():
+    for term, values in recorded.rewards.items():
         arrays[f"reward/{term}"] = values
         terms[term] = MEANINGS.get(term, "")
     legends: dict[str, str] = {}
@@ -268,7 +268,17 @@ def for_page(episode: Episode) -> Message:
         for unit, value in lane.errors.items():
             arrays[f"lane/{name}/{unit}"] = np.asarray(value, np.float32)
     arrays |= _marker_arrays(episode)
-    return Message(arrays, {**message.meta, "lanes": legends, "terms": terms})
+    meta = {
+        **episode.about,
+        "hand": recorded.hand_reference,
+        "object": episode.object,
+        "control_dt": episode.control_dt,
+        "success": episode.success,
+        "metrics": episode.metrics,
+        "lanes": legends,
+        "terms": terms,
+    }
+    return Message(arrays, meta)
 
 
 def _coloured_mesh(episode: Episode) -> dict[str, np.ndarray]:

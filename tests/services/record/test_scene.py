@@ -1,6 +1,4 @@
-"""An episode is drawn where the simulation had it; meshes keep their surface when painted; JSON
-channels keep names.
-"""
+"""An episode is drawn where the simulation had it."""
 
 import dataclasses
 import json
