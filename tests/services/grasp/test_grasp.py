@@ -123,7 +123,7 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
     found = grasper.grasp(
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
     )
-    arrays = {name: np.asarray(value) for name, value in found.episode.arrays.items()}
+    arrays = found.episode.to_message().arrays
     assert found.motion.hand == "human_left" and found.success
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
     np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)

@@ -93,10 +93,8 @@ def test_everything_a_run_publishes_is_in_the_file(
     assert json.loads(topics["/version/learner/0"][0]) == {"version": 7, "hash": "ab"}
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0, 1, 2])
     (kept,) = read_episodes(tmp_path)
-    np.testing.assert_array_equal(
-        kept.arrays["link_position"], episode_message().arrays["link_position"]
-    )
-    assert kept.meta["metrics"] == {"return": 1.0}
+    np.testing.assert_array_equal(kept.link_position, episode_message().arrays["link_position"])
+    assert kept.metrics == {"return": 1.0}
     (read,) = read_rollouts(tmp_path)
     assert dict(read.meta) == dict(rollout.meta) and set(read.arrays) == set(rollout.arrays)
     for name, array in rollout.arrays.items():
