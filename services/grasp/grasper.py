@@ -9,12 +9,10 @@ import numpy as np
 
 from congrasp.actors.attempts import PLAIN, Attempts, Outcome, Phases
 from congrasp.actors.initial import RequestedEpisodes
-from congrasp.common import mirror
-from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.mirrored import mirrored_episode
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.left import LEFT
-from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
@@ -23,7 +21,7 @@ from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
-from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.codec import encode
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.client.left_policy import mirrored_request
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
@@ -371,7 +369,7 @@ class Grasper:
                 episode, self._hand, obj, seconds, self._attempts.speed, side
             )
         if self._left:
-            episode = _mirrored(episode, self.hand)
+            episode = mirrored_episode(episode, self.hand)
         return Grasp(
             episode=episode,
             attempts=attempted.attempts,
@@ -393,15 +391,6 @@ class Grasper:
         goal = attempts.episodes.goal.row(index)
         conflicts = contradictions(self._hand, obj.points, obj.non_graspable_points, goal, complete)
         return (*sentences, *(conflict.message for conflict in conflicts))
-
-
-def _mirrored(episode: Episode, hand: Hand) -> Episode:
-    """Returns the episode of the left hand, from one of the right hand with the mirrored object."""
-    message = episode.to_message()
-    meta = {**message.meta, "hand": hand.reference}
-    mirrored = Episode.from_message(Message(mirror.fields(message.arrays), meta))
-    origin = mirror.vector(episode.object_file_origin)
-    return dataclasses.replace(mirrored, object_file_origin=origin)
 
 
 def _no_motion(

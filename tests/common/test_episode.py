@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from congrasp.common import mirror
 from congrasp.common.episode.arm import MovedArm
 from congrasp.common.episode.episode import Episode
 from congrasp.common.episode.hand_arrays import hand_arrays
+from congrasp.common.episode.mirrored import mirrored_episode
 from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode, encode
 from tests.episodes import CONTROL_DT, episode, episode_message, moved_arm, older
 
@@ -204,6 +207,23 @@ def test_parts_of_an_episode_join_to_the_whole(cut: int) -> None:
     joined = whole.at_frames(steps[cut:]).preceded_by(whole.at_frames(steps[:cut]))
     assert_equal_messages(joined.to_message(), whole.to_message())
     np.testing.assert_array_equal(joined.time, whole.time)
+
+
+def test_mirror_image_is_that_of_the_message() -> None:
+    """By the names of the message's arrays (`common.mirror.fields`); twice is the episode again."""
+    whole = dataclasses.replace(
+        episode(4, mask=(1, 1, 1, 1)),
+        colours=Colours(np.ones((2, 3), np.float32), np.full((2, 3), 7, np.uint8)),
+        object_file_origin=np.array([0.1, 0.2, 0.3]),
+    )
+    left = get_hand("human:left")
+    image = mirrored_episode(whole, left)
+    message = whole.to_message()
+    meta = {**message.meta, "hand": left.reference, "object_file_origin": [-0.1, 0.2, 0.3]}
+    assert_equal_messages(image.to_message(), Message(mirror.fields(message.arrays), meta))
+    np.testing.assert_array_equal(image.joint_anchor, hand_arrays(left)["joint_anchor"])
+    again = mirrored_episode(image, get_hand("human"))
+    assert_equal_messages(again.to_message(), message)
 
 
 def test_normalised_has_unit_quaternions() -> None:
