@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.markers import Marker
@@ -14,9 +15,18 @@ _BLOCKS_OF_MASK = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 
 
 def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
-    """Activity of each block of the observation by name, from the arrays of a message."""
+    """Activity of each block of the observation by name, from the arrays of a message.
+
+    Raises:
+      CongraspError: an older message has another number of blocks.
+    """
     if _MASK in arrays:
-        return dict(zip(_BLOCKS_OF_MASK, (arrays[_MASK] > 0).tolist(), strict=True))
+        mask = arrays[_MASK]
+        if mask.shape != (len(_BLOCKS_OF_MASK),):
+            raise CongraspError(
+                f"The episode's {_MASK} has shape {mask.shape}, not ({len(_BLOCKS_OF_MASK)},)."
+            )
+        return dict(zip(_BLOCKS_OF_MASK, (mask > 0).tolist(), strict=True))
     blocks = {}
     for name, value in arrays.items():
         if name.startswith("active/"):

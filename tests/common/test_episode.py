@@ -117,7 +117,8 @@ def test_damaged_message_is_a_one_line_error(data: st.DataObject) -> None:
     meta = dict(message.meta)
     required = sorted(name for name in arrays if "/" not in name)
     name = data.draw(st.sampled_from(required))
-    change = data.draw(st.sampled_from(["absent", "rank", "type", "nan", "entry", "frame"]))
+    kinds = ["absent", "rank", "type", "nan", "mask", "entry", "frame"]
+    change = data.draw(st.sampled_from(kinds))
     if change == "absent":
         del arrays[name]
     elif change == "rank":
@@ -127,6 +128,8 @@ def test_damaged_message_is_a_one_line_error(data: st.DataObject) -> None:
     elif change == "nan":
         name = data.draw(st.sampled_from(["q", "goal/pose_q", "visual_vertices"]))
         arrays[name] = np.full_like(arrays[name], np.nan)
+    elif change == "mask":
+        arrays["goal/mask"] = np.ones(data.draw(st.sampled_from([(), (3,), (4, 1)])), np.float32)
     elif change == "entry":
         entry = data.draw(st.sampled_from(["hand", "object", "control_dt", "success", "metrics"]))
         meta[entry] = data.draw(st.sampled_from([None, [], {"held": "yes"}, 1e9]))
