@@ -12,11 +12,12 @@ import numpy as np
 
 from congrasp.actors import initial
 from congrasp.actors import stress as protocols
-from congrasp.actors.episode import episode_message
+from congrasp.actors.episode import EpisodeFacts, traced_episode
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.worker import RolloutWorker
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
@@ -28,7 +29,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import Resolution
 from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Goal, Surface
-from congrasp.common.wire.codec import Message
 
 
 class Phases(NamedTuple):
@@ -206,18 +206,14 @@ class Attempts:
         surface: Surface,
         obj: GraspObject,
         about: dict[str, Any],
-    ) -> Message:
-        """Returns one attempt as an episode for logs and pictures; `about` has further metadata."""
+    ) -> Episode:
+        """Returns one attempt as an episode for logs and pictures; `about` has its origin."""
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         trace = Trace(*(field[:, index] for field in outcome.trace))
-        meta = {
-            "version": self._bundle.version,
-            "success": metrics["success"] > 0,
-            "metrics": metrics,
-        }
-        meta |= {"phases": self.begins, **about}
-        return episode_message(
-            self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta
+        origin = {"version": self._bundle.version, "phases": self.begins, **about}
+        facts = EpisodeFacts(metrics["success"] > 0, metrics, origin)
+        return traced_episode(
+            self._hand, self._task, trace, outcome.goal.row(index), surface, obj, facts
         )
 
     def renew(self, bundle: PolicyBundle) -> None:

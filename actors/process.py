@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from congrasp.actors.env_state import EnvState
-from congrasp.actors.episode import episode_message
+from congrasp.actors.episode import EpisodeFacts, traced_episode
 from congrasp.actors.failure_weights import FailureWeights
 from congrasp.actors.follower import Follower, TracedEpisode
 from congrasp.actors.link import (
@@ -399,17 +399,16 @@ class _Actor:
             if "episode/" in name:
                 metrics[name.removeprefix("episode/")] = float(value)
         obj = self._objects[episode.object_index]
-        meta = {
+        origin = {
             "time": time.time(),
             "version": bundle.version,
             "actor": self._link.actor,
-            "success": metrics["success"] > 0,
-            "metrics": metrics,
         }
-        message = episode_message(
-            self._hand, self._config.task, episode.trace, episode.goal, episode.surface, obj, meta
+        facts = EpisodeFacts(metrics["success"] > 0, metrics, origin)
+        traced = traced_episode(
+            self._hand, self._config.task, episode.trace, episode.goal, episode.surface, obj, facts
         )
-        self._publish("episode", message)
+        self._publish("episode", traced.to_message())
 
     def _publish(self, kind: str, message: Message) -> None:
         """Publishes a message for logs under this actor's name."""

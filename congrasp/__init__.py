@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     __version__: str
+    from congrasp.common.episode.episode import Episode
+    from congrasp.common.episode.motion_file import load_motion, save_motion
     from congrasp.common.errors import (
         CongraspError,
         ContradictionError,
@@ -38,21 +40,21 @@ if TYPE_CHECKING:
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.client.ticker import Ticker
-    from congrasp.services.export.motion import GraspMotion
-    from congrasp.services.export.motion_file import load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.interface import grasp
     from congrasp.services.grasp.motion import Grasp
     from congrasp.services.gym.vector_env import make_vec
     from congrasp.services.serve.inference import load_policy
 
+    GraspMotion = Episode
+
 __all__ = [
     "Answer",
     "Command",
     "CongraspError",
     "ContradictionError",
+    "Episode",
     "Grasp",
-    "GraspMotion",
     "GraspRequest",
     "Grasper",
     "Guard",
@@ -78,8 +80,8 @@ __all__ = [
 _MODULES = {
     "Answer": "congrasp.services.client.policy",
     "Command": "congrasp.services.client.guard",
+    "Episode": "congrasp.common.episode.episode",
     "Grasp": "congrasp.services.grasp.motion",
-    "GraspMotion": "congrasp.services.export.motion",
     "GraspRequest": "congrasp.common.request",
     "Grasper": "congrasp.services.grasp.grasper",
     "Guard": "congrasp.services.client.guard",
@@ -90,12 +92,14 @@ _MODULES = {
     "PolicyClient": "congrasp.services.client.policy_client",
     "Ticker": "congrasp.services.client.ticker",
     "grasp": "congrasp.services.grasp.interface",
-    "load_motion": "congrasp.services.export.motion_file",
+    "load_motion": "congrasp.common.episode.motion_file",
     "load_policy": "congrasp.services.serve.inference",
     "make_vec": "congrasp.services.gym.vector_env",
-    "save_motion": "congrasp.services.export.motion_file",
+    "save_motion": "congrasp.common.episode.motion_file",
 }
 """Where each name is defined; the others are errors."""
+_OLDER_NAMES = {"GraspMotion": "Episode"}
+"""Present names of older ones, which still work."""
 
 
 def __getattr__(name: str) -> Any:
@@ -106,6 +110,7 @@ def __getattr__(name: str) -> Any:
             return metadata.version("congrasp")
         except metadata.PackageNotFoundError:
             return "not installed"
+    name = _OLDER_NAMES.get(name, name)
     if name not in __all__:
         raise AttributeError(f"module 'congrasp' has no attribute '{name}'")
     errors = importlib.import_module("congrasp.common.errors")
@@ -118,8 +123,9 @@ def __getattr__(name: str) -> Any:
         if package == "congrasp":
             raise
         raise errors.MissingPackageError(f"congrasp.{name}", package) from None
-    globals()[name] = found = getattr(module, name)
-    return found
+    value = getattr(module, name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

@@ -19,6 +19,8 @@ from typing_extensions import Doc
 
 from congrasp.common import errors
 from congrasp.common.config import RunConfig
+from congrasp.common.episode.arm import ARM_ARRAYS
+from congrasp.common.episode.motion_file import MOTION_ARRAYS
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -28,8 +30,6 @@ from congrasp.common.task.methods import METHODS
 from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.record.episode import ARM_ARRAYS
 from congrasp.services.train.students import CAMERAS, TRACKERS
 from congrasp.services.viz.metric_titles import TITLES
 
@@ -169,13 +169,8 @@ class MotionArrays(Directive):
 
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
-        hints = typing.get_type_hints(GraspMotion, include_extras=True)
-        arrays = {
-            name: hint.__metadata__[0]
-            for name, hint in hints.items()
-            if hasattr(hint, "__metadata__")
-        }
-        return [_table(("array", "shape, unit, frame"), [*arrays.items(), *ARM_ARRAYS.items()])]
+        arrays = [*MOTION_ARRAYS.items(), *ARM_ARRAYS.items()]
+        return [_table(("array", "shape, unit, frame"), arrays)]
 
 
 class Sensing(Directive):

@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 import congrasp
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mano import read_mano
 from congrasp.common.objects.spec import GraspObject
@@ -70,7 +71,7 @@ def main(arguments: Arguments) -> None:
             print(f"dropped: {row['sequence']}: {row['reason']}")
         for obj, constraints in zip(objects, sets, strict=True):
             episode = imitate(arguments, name, obj, constraints)
-            result = "held" if episode.meta["success"] else "not held"
+            result = "held" if episode.success else "not held"
             images, labels = pictures.setdefault(obj.name, ([], []))
             new = episode_strip(episode, _FRAMES, (360, 270), f"{name}: 0.00 s", f", {result}")
             images += new[0]
@@ -83,7 +84,7 @@ def main(arguments: Arguments) -> None:
         )
 
 
-def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Message) -> Message:
+def imitate(arguments: Arguments, hand: str, obj: GraspObject, constraints: Message) -> Episode:
     """Grasps an object as its constraint set's first demonstration did; returns the episode."""
     fitting = obj.scaled(constraints.meta["object_scale"])
     done = congrasp.grasp(

@@ -2,10 +2,14 @@
 table.
 """
 
+from typing import Any
+
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import mujoco_link_poses
@@ -17,7 +21,7 @@ RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
 FORCE = 1.5  # N on each fingertip while it touches
 
 
-def episode(
+def episode_message(
     steps: int = 12, *, removal: int = 8, mask: tuple[int, ...] = (1, 1, 1, 1), success: bool = True
 ) -> Message:
     """`steps` control steps; the table goes at `removal`, the tips touch from two thirds of that
@@ -105,6 +109,38 @@ def episode(
         "metrics": {"return": 12.5, "links_at_removal": 5.0},
     }
     return Message(arrays, meta)
+
+
+def episode(steps: int = 12, **changes: Any) -> Episode:
+    """The episode of `episode_message`."""
+    return Episode.from_message(episode_message(steps, **changes))
+
+
+def moved_arm(steps: int) -> MovedArm:
+    """An arm of a base and one link, each a triangle, that turns by 0.1 rad a step."""
+    return MovedArm(
+        name="two",
+        joint_names=np.array(["turn"]),
+        joint_position=0.1 * np.arange(steps)[:, None],
+        joint_slides=np.array([False]),
+        joint_link=np.array([1], np.int32),
+        joint_axis=np.array([[0.0, 0.0, 1.0]]),
+        joint_anchor=np.zeros((1, 3)),
+        joint_limits=np.array([[-2.0, 2.0]]),
+        joint_speed=np.array([3.0]),
+        link_names=np.array(["base", "link"]),
+        link_parent=np.array([-1, 0], np.int32),
+        link_position=np.tile([[0.4, 0.0, 0.0], [0.4, 0.0, 0.1]], (steps, 1, 1)),
+        link_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (steps, 2, 1)),
+        hand_link=np.array(1, np.int32),
+        hand_position=np.array([0.0, 0.0, 0.2]),
+        hand_quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+        mesh_link=np.array([0, 1], np.int32),
+        mesh_colour=np.array([[0.5, 0.5, 0.5], [1.0, 0.4, 0.0]]),
+        mesh_vertices=np.concatenate([np.eye(3), 2 * np.eye(3)]),
+        mesh_faces=np.array([[0, 1, 2], [3, 4, 5]], np.int32),
+        face_mesh=np.array([0, 1], np.int32),
+    )
 
 
 def older(message: Message) -> Message:

@@ -18,8 +18,8 @@ from mcap_ros2.decoder import DecoderFactory
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.services.export.frames import pose_matrices
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import arm_meshes, object_mesh
 
 FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -286,7 +286,7 @@ def _poses(rows: np.ndarray) -> np.ndarray:
     return pose_matrices(rows[:, :3], Rotation.from_quat(rows[:, 3:], scalar_first=True))
 
 
-def error_mm(motion: GraspMotion, track: Track) -> float:
+def error_mm(motion: Episode, track: Track) -> float:
     """Largest distance in mm between points of the motion and of the file.
 
     The points are each frame's origin and three a decimetre away along its axes, at every time, and

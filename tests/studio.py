@@ -1,5 +1,6 @@
 """A studio with a fake policy, and a run without a learner."""
 
+import dataclasses
 import functools
 import pathlib
 import time
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from congrasp.actors.attempts import Phases
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -15,13 +17,13 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.scene import episode_entries
+from congrasp.services.record.episode_entries import raw_entry, scene_entries
 from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.studio.catalogue import Catalogue
 from congrasp.services.studio.grasping import Progress
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
-from tests.episodes import episode
+from tests.episodes import episode, episode_message
 
 STEPS, REMOVAL = 60, 40
 DIP = 30
@@ -43,7 +45,7 @@ class FakePolicy:
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
-    ) -> Message:
+    ) -> Episode:
         self.asked.append((obj, request, phases))
         progress("grasping", 0.5)
         if self.fails:
@@ -56,10 +58,8 @@ class FakePolicy:
                 for name in ("affordance", "pose", "pose", "trajectory")
             ),
         )
-        return Message(
-            found.arrays,
-            {**found.meta, "metrics": {**found.meta["metrics"], "held": 1.0}, "note": ""},
-        )
+        metrics = {**found.metrics, "held": 1.0}
+        return dataclasses.replace(found, metrics=metrics, about={**found.about, "note": ""})
 
 
 def objects() -> Catalogue:
@@ -72,7 +72,7 @@ def objects() -> Catalogue:
 
 @functools.cache
 def _short() -> Message:
-    return episode(6, removal=4)
+    return episode_message(6, removal=4)
 
 
 def actor_episode(number: int, success: bool = True) -> Message:
@@ -150,9 +150,9 @@ def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     """Recordings of episodes: times (s since 1970) and numbers of actors."""
     writer, channels = LogWriter(folder, "log", run="fake"), JsonChannels()
     for when, number in moments:
-        writer.write(
-            *episode_entries(f"a{number:03d}", actor_episode(number), int(1e9 * when), 0, channels)
-        )
+        actor, message, start = f"a{number:03d}", actor_episode(number), int(1e9 * when)
+        shown = scene_entries(actor, Episode.from_message(message), start, 0, channels)
+        writer.write(raw_entry(actor, message, start), *shown)
     writer.close()
 
 

@@ -58,6 +58,10 @@ def test_every_public_name_is_there_and_documented():
         congrasp.grab  # noqa: B018
 
 
+def test_older_name_of_an_episode_still_works():
+    assert congrasp.GraspMotion is congrasp.Episode
+
+
 def test_a_source_tree_without_an_installed_distribution_has_a_version_too(monkeypatch):
     assert congrasp.__version__ == importlib.metadata.version("congrasp")
     monkeypatch.setattr(importlib.metadata.Distribution, "discover", lambda **context: iter(()))

@@ -7,10 +7,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import UNLIMITED, MovedArm
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm.robot import Pose, Robot
 from congrasp.services.assets.hands.link_geometry import geom_mesh
-from congrasp.services.record.episode import UNLIMITED, MovedArm
 
 _MIN_DOUBLE_AREA = 1e-12  # of triangles, m^2; smaller ones are left out
 _BALL_RADIUS = 0.02  # of the balls that stand for the links of an arm without geometry, m

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.arrays import numbers_in
@@ -17,8 +19,6 @@ from congrasp.services.arm.moved_arm import moved_arm
 from congrasp.services.arm.path_tracking import Path, Track, follow
 from congrasp.services.arm.robot import Pose, Robot, build_robot, default_mount
 from congrasp.services.export.frames import NOT_LINKS
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.record.episode import MovedArm
 
 _REMOVED_TABLE_M = -10.0  # height of a table that was removed
 
@@ -97,7 +97,7 @@ class ArmPlanner:
         """Side of the object on which the base is, rad from the x axis of the world frame."""
         return float(np.arctan2(self._base.position[1], self._base.position[0]))
 
-    def plan(self, obj: GraspObject, motion: GraspMotion) -> ArmMotion:
+    def plan(self, obj: GraspObject, motion: Episode) -> ArmMotion:
         """Computes the joints along a motion.
 
         Raises:
@@ -119,7 +119,7 @@ class ArmPlanner:
         return self._robot
 
 
-def _path(motion: GraspMotion, base: Pose) -> Path:
+def _path(motion: Episode, base: Pose) -> Path:
     """Wrist, object and table of a motion in the frame of a base that is fixed in the world."""
     to_base = base.rotation.inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)

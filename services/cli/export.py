@@ -96,7 +96,7 @@ class ExportMotion:
             motions = [at_rate(motion, self.fps) for motion in motions]
         target = self.out or default_name(motions[0], self.to)
         export_motions(motions, self.to, target, camera=self.camera, force=self.force)
-        frames = sum(len(motion.time) for motion in motions)
+        frames = sum(motion.steps for motion in motions)
         print(f"{target}: {frames} frames")
         return 0
 

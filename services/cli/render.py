@@ -54,7 +54,6 @@ def episode(
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
     from congrasp.services.grasp.arm_files import save_robot_video
-    from congrasp.services.record.episode import arm_of_episode
     from congrasp.services.record.reader import pick_episode
     from congrasp.services.viz.film import Film, save_episode_video
     from congrasp.services.viz.render import episode_sheet
@@ -66,10 +65,9 @@ def episode(
     print(out)
     if video is not None:
         film = Film(overlays=True)
-        if arm := arm_of_episode(chosen):
-            save_robot_video(
-                video, arm, chosen, film, range(0, len(chosen.arrays["table"]), _FRAMED)
-            )
+        if chosen.arm:
+            framed = range(0, chosen.steps, _FRAMED)
+            save_robot_video(video, chosen.arm, chosen, film, framed)
         else:
             save_episode_video(video, chosen, film)
         print(video)

@@ -12,12 +12,13 @@ import numpy as np
 
 from congrasp.actors import stress as protocols
 from congrasp.actors.env_state import EnvState, View
-from congrasp.actors.episode import episode_message
+from congrasp.actors.episode import EpisodeFacts, traced_episode
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Trace, finished_episodes
 from congrasp.actors.worker import RolloutWorker
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
@@ -29,7 +30,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Array, Goal
-from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.plan import two_seconds
 
 PROBED_EPISODES = 2000
@@ -104,7 +104,7 @@ class Batch(NamedTuple):
     sample: Sample
     final: View
     """Hand and object at the end of the hold."""
-    message: Callable[[int], Message]
+    episode: Callable[[int], Episode]
     """Recording of an episode, if traces are kept."""
 
 
@@ -225,12 +225,12 @@ class Episodes:
             self._in_window(samples.torque_share),
         )
 
-        def message(episode: int) -> Message:
+        def episode(index: int) -> Episode:
             """Returns the recording of one episode."""
-            metrics = {name: float(column[episode]) for name, column in values.items()}
-            return self._message(begun, _trace_of_episode(traces, episode), metrics, episode)
+            metrics = {name: float(column[index]) for name, column in values.items()}
+            return self._episode(begun, _trace_of_episode(traces, index), metrics, index)
 
-        return Batch(conditions, sample, final, message)
+        return Batch(conditions, sample, final, episode)
 
     def _chunk_steps(self) -> int:
         """Control steps of a chunk, a divisor of the steps before and after the removal of the
@@ -281,23 +281,19 @@ class Episodes:
             stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
             self._worker.adjust(protocol=stress, probe_data=field)
 
-    def _message(
-        self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int
-    ) -> Message:
+    def _episode(
+        self, begun: EnvState, trace: Trace, metrics: dict[str, float], index: int
+    ) -> Episode:
         """Returns one episode, from the initial state of all of them and its recording."""
-        return episode_message(
+        origin = {"version": self._bundle.version, "actor": "evaluation"}
+        return traced_episode(
             self._hand,
             self._task,
             trace,
-            begun.goal.row(episode),
-            jax.tree.map(lambda array: np.asarray(array)[episode], begun.surface),
-            self.objects[int(np.asarray(begun.reset_state.object_index)[episode])],
-            {
-                "version": self._bundle.version,
-                "actor": "evaluation",
-                "success": metrics["success"] > 0,
-                "metrics": metrics,
-            },
+            begun.goal.row(index),
+            jax.tree.map(lambda array: np.asarray(array)[index], begun.surface),
+            self.objects[int(np.asarray(begun.reset_state.object_index)[index])],
+            EpisodeFacts(metrics["success"] > 0, metrics, origin),
         )
 
 

@@ -18,6 +18,7 @@ import congrasp.actors
 import congrasp.common
 import congrasp.services.evaluate
 from congrasp.actors.initial import InitialConditions
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -110,12 +111,12 @@ class Result(NamedTuple):
     variation: Variation
     sample: Sample
     row: Row
-    held: list[Message]
+    held: list[Episode]
     """Kept episodes in which the object is held to the end."""
-    lost: list[Message]
+    lost: list[Episode]
     """Other kept episodes."""
 
-    def examples(self, successes: int, failures: int) -> list[Message]:
+    def examples(self, successes: int, failures: int) -> list[Episode]:
         """Returns some of the kept episodes, failures first."""
         return [*self.lost[:failures], *self.held[:successes]]
 
@@ -381,15 +382,15 @@ class Experiment:
         keep: bool,
     ) -> Result:
         """Simulates a row, and keeps some episodes."""
-        held: list[Message] = []
-        lost: list[Message] = []
+        held: list[Episode] = []
+        lost: list[Episode] = []
 
         def keep_some(batch: Batch, count: int) -> None:
             """Keeps the first episodes of each outcome."""
             for i in range(count):
                 episodes = held if batch.sample.values["held"][i] > 0 else lost
                 if len(episodes) < _MAX_KEPT:
-                    episodes.append(batch.message(i))
+                    episodes.append(batch.episode(i))
 
         visit = keep_some if keep else _ignore
         sample = self.sample(running, variation, plan, progress, visit)

@@ -11,14 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands import known_hand
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import skin_of
-from congrasp.common.wire.codec import Message
+from congrasp.services.appearance.palette import OBJECT
 from congrasp.services.evaluate.experiment import Experiment, Result
-from congrasp.services.record.episode import phases_of
-from congrasp.services.record.palette import OBJECT
 from congrasp.services.viz.hand_shapes import skin_colours
-from congrasp.services.viz.render import episode_strip, grasp_steps
+from congrasp.services.viz.render import episode_strip
 from congrasp.services.viz.shapes import Shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.triangles import triangles_of
@@ -33,35 +31,35 @@ _MARGIN = 0.05
 """Margin around hand and object in the view of an interactive grasp, m."""
 
 
-def cause(episode: Message, drop_height: float) -> str:
+def cause(episode: Episode, drop_height: float) -> str:
     """Cause of an episode's end with the object `drop_height` (m) or more below its initial height,
     or `held`.
     """
-    metrics = episode.meta["metrics"]
+    metrics = episode.metrics
     if metrics.get("diverged"):
         return "the physics diverged"
     if metrics["held"]:
         return "held"
-    moment = "the lift began" if "lift" in phases_of(episode.meta) else "the table was removed"
+    moment = "the lift began" if "lift" in episode.phases else "the table was removed"
     if metrics["moved_at_removal"] > _PUSHED:
         return f"pushed away before {moment}"
     if not metrics["links_at_removal"]:
         return f"not touched when {moment}"
-    _, removal = grasp_steps(episode)
+    _, removal = episode.grasp_span
     steps = fall_step(episode, drop_height) - removal
-    return f"slipped {steps * episode.meta['control_dt']:.2f} s after {moment}"
+    return f"slipped {steps * episode.control_dt:.2f} s after {moment}"
 
 
-def fall_step(episode: Message, drop_height: float) -> int:
+def fall_step(episode: Episode, drop_height: float) -> int:
     """Step at which the object is `drop_height` (m) below its height at the table's removal, or the
     last one.
 
     In a lift the height is relative to the wrist.
     """
-    _, removal = grasp_steps(episode)
-    height = np.asarray(episode.arrays["object_position"])[:, 2]
-    if "lift" in phases_of(episode.meta):
-        height = height - episode.arrays["link_position"][:, 0, 2]
+    _, removal = episode.grasp_span
+    height = episode.object_position[:, 2]
+    if "lift" in episode.phases:
+        height = height - episode.wrist_position[:, 2]
     below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
     if not len(below):
         return len(height) - 1
@@ -99,7 +97,7 @@ def failure_sheets(
             strips.append(
                 _Strip(
                     episode,
-                    first_caption=episode.meta["object"],
+                    first_caption=episode.object,
                     last_caption=f": {outcome}",
                     last_step=fall_step(episode, drop_height),
                 )
@@ -133,7 +131,7 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
             continue
         episode = result.held[0]
         variation = result.variation
-        caption = f"{variation.constraint}, {variation.label}: {episode.meta['object']}"
+        caption = f"{variation.constraint}, {variation.label}: {episode.object}"
         strips.append(_Strip(episode, first_caption=caption, last_caption=", held"))
     if strips:
         text = "Requested: the blue hand or the violet path, with noise. Executed: the grey hand"
@@ -143,7 +141,7 @@ def save_noise_examples(results: Sequence[Result], path: pathlib.Path) -> None:
 class _Strip(NamedTuple):
     """Key frames of an episode in a sheet."""
 
-    episode: Message
+    episode: Episode
     first_caption: str
     last_caption: str
     """Added to the caption of the last frame."""
@@ -186,7 +184,7 @@ class _SkinnedMesh(NamedTuple):
     """(V, 4), with the sum 1."""
 
 
-def turntable(episode: Message) -> Mapping[str, Any]:
+def turntable(episode: Episode) -> Mapping[str, Any]:
     """Returns the data of an episode for motion.html: skin, object and table as one skinned mesh.
 
     They move with bones: the hand's links, then the object, then the world. The matrix of a bone
@@ -200,11 +198,10 @@ def turntable(episode: Message) -> Mapping[str, Any]:
       `table`'s first and last corner in `faces`, and the `centre` (3,) and `radius`, m, of the
       grasp.
     """
-    arrays = episode.arrays
-    hand = known_hand(episode.meta["hand"])
-    control_dt = float(episode.meta["control_dt"])
+    hand = episode.known_hand()
+    control_dt = episode.control_dt
     steps_per_frame = max(1, round(FRAME_SECONDS / control_dt))
-    steps = np.arange(0, len(arrays["table"]), steps_per_frame)
+    steps = np.arange(0, episode.steps, steps_per_frame)
     frames = _frames(episode, steps)
     object_bone = len(hand.links)
     skin = skin_of(hand)
@@ -213,11 +210,11 @@ def turntable(episode: Message) -> Mapping[str, Any]:
         skin.points, skin.normals, skin_colours(skin), skin.faces, links, weights
     )
     obj = Shape(
-        "mesh", (0, 0), OBJECT, vertices=arrays["visual_vertices"], faces=arrays["visual_faces"]
+        "mesh", (0, 0), OBJECT, vertices=episode.object_vertices, faces=episode.object_faces
     )
-    table_mesh = _rigid_mesh(table_shape(arrays["object_position"][0]), object_bone + 1)
+    table_mesh = _rigid_mesh(table_shape(episode.object_position[0]), object_bone + 1)
     mesh = _join([hand_mesh, _rigid_mesh(obj, object_bone), table_mesh])
-    removal = int(np.sum(arrays["table"][steps]))
+    removal = int(np.sum(episode.table[steps]))
     centre, radius = _bounds(episode, steps, frames, removal)
     data = {
         "position": _encoded(mesh.points, "<f4"),
@@ -234,7 +231,7 @@ def turntable(episode: Message) -> Mapping[str, Any]:
         "centre": centre.round(4).tolist(),
         "radius": round(radius, 4),
     }
-    return {"data": json.dumps(data), "object": episode.meta["object"]}
+    return {"data": json.dumps(data), "object": episode.object}
 
 
 def _rigid_mesh(shape: Shape, bone: int) -> _SkinnedMesh:
@@ -263,7 +260,7 @@ def _join(meshes: Sequence[_SkinnedMesh]) -> _SkinnedMesh:
 
 
 def _bounds(
-    episode: Message, steps: np.ndarray, frames: np.ndarray, removal: int
+    episode: Episode, steps: np.ndarray, frames: np.ndarray, removal: int
 ) -> tuple[np.ndarray, float]:
     """Returns centre (3,) and radius, m, of hand and object in the second half of the approach.
 
@@ -274,22 +271,21 @@ def _bounds(
       removal: frame of the table's removal.
     """
     links = frames[:, :-2, :, 3]
-    obj = episode.arrays["object_position"][steps][:, None]
+    obj = episode.object_position[steps][:, None]
     positions = np.concatenate([links, obj], 1)[removal // 2 : removal + 1].reshape(-1, 3)
     centre = (positions.min(0) + positions.max(0)) / 2
     radius = float(np.linalg.norm(positions - centre, axis=-1).max()) + _MARGIN
     return centre, radius
 
 
-def _frames(episode: Message, steps: np.ndarray) -> np.ndarray:
+def _frames(episode: Episode, steps: np.ndarray) -> np.ndarray:
     """Matrices (T, B, 3, 4) of all bones at some steps."""
-    arrays = episode.arrays
-    skin = skin_of(known_hand(episode.meta["hand"]))
+    skin = skin_of(episode.known_hand())
     positions = np.concatenate(
-        [arrays["link_position"][steps], arrays["object_position"][steps][:, None]], 1
+        [episode.link_position[steps], episode.object_position[steps][:, None]], 1
     )
     quaternions = np.concatenate(
-        [arrays["link_quaternion"][steps], arrays["object_quaternion"][steps][:, None]], 1
+        [episode.link_quaternion[steps], episode.object_quaternion[steps][:, None]], 1
     )
     matrices = Rotation.from_quat(quaternions.reshape(-1, 4), scalar_first=True).as_matrix()
     rotations = matrices.reshape(*quaternions.shape[:2], 3, 3)

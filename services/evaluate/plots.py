@@ -14,11 +14,11 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_json
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.appearance.palette import INK
 from congrasp.services.evaluate.columns import RATE, paper_rate, row_title
 from congrasp.services.evaluate.scores import ERRORS, Row
 from congrasp.services.evaluate.text_table import Table, percent
 from congrasp.services.evaluate.variations import NOISE
-from congrasp.services.record.palette import INK
 from congrasp.services.viz.plots import (
     COLOURS,
     QUIET,

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import TO_Y_UP, bodies, identifiers
-from congrasp.services.export.motion import GraspMotion
 
 _CM = 100.0
 _ORDER = "ZYX"
@@ -21,7 +21,7 @@ _ROTATION = tuple(f"{axis}rotation" for axis in _ORDER)
 _ROOT = "world"
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion, and the description of its numbers next to it."""
     (motion,) = motions
     motion_bodies = bodies(motion)
@@ -86,7 +86,7 @@ def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.7f}" for value in values)
 
 
-def _end(motion: GraspMotion, index: int) -> np.ndarray:
+def _end(motion: Episode, index: int) -> np.ndarray:
     """Drawn end of a last link, in its frame, m: the far end of its last capsule."""
     capsules = np.flatnonzero(motion.capsule_link == index)
     return motion.capsule_ends[capsules[-1], 1] if len(capsules) else np.array([0.0, 0.0, 0.01])

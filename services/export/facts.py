@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from congrasp.services.export.motion import GraspMotion
+from congrasp.common.episode.episode import Episode
 
 
-def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
+def facts(motion: Episode, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
     """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
     about = {
         "generator": "congrasp",

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import Skin
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.hand_shapes import skin_shape
@@ -40,7 +40,7 @@ class Film(NamedTuple):
     """(n, 3) from 0 to 1 for each motion: some pixels of every frame."""
 
 
-def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) -> Film:
+def film(path: pathlib.Path, motions: Sequence[Episode], frame_rate: int) -> Film:
     """Writes the video of all motions in sequence, from a camera that shows all of them."""
     camera = camera_for(motions)
     pixels: list[np.ndarray] = []
@@ -58,14 +58,14 @@ def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) ->
     return Film(calibration(camera), pixels)
 
 
-def camera_for(motions: Sequence[GraspMotion]) -> Camera:
+def camera_for(motions: Sequence[Episode]) -> Camera:
     """Returns a camera that shows hands and objects of all motions."""
     points = np.concatenate([_extent(motion) for motion in motions])
     corners = points[ConvexHull(points).vertices]
     return fit(corners, _DIRECTION, SIZE[0] / SIZE[1])
 
 
-def _extent(motion: GraspMotion) -> np.ndarray:
+def _extent(motion: Episode) -> np.ndarray:
     """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
     points: list[np.ndarray] = []
     skin = skin_of_motion(motion)
@@ -79,7 +79,7 @@ def _extent(motion: GraspMotion) -> np.ndarray:
     return np.concatenate(points)
 
 
-def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
+def pictures(motion: Episode, camera: Camera) -> Iterator[np.ndarray]:
     """(height, width, 3) uint8 of every frame of a motion."""
     skin = skin_of_motion(motion)
 
@@ -118,7 +118,7 @@ def calibration(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
+def _shapes(motion: Episode, skin: Skin, frame: int) -> list[Shape]:
     """Shapes of the hand, the object, the arm, and the table while it is present."""
     shapes = [_hand(motion, skin, frame), _object(motion, frame)]
     if motion.arm:
@@ -128,12 +128,12 @@ def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
     return shapes
 
 
-def _hand(motion: GraspMotion, skin: Skin, frame: int) -> Shape:
+def _hand(motion: Episode, skin: Skin, frame: int) -> Shape:
     """Shape of the hand in a frame."""
     return skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
 
 
-def _object(motion: GraspMotion, frame: int) -> Shape:
+def _object(motion: Episode, frame: int) -> Shape:
     """Shape of the object in a frame."""
     mesh = (motion.object_vertices, motion.object_faces)
     position = motion.object_position[frame]

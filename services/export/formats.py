@@ -1,16 +1,15 @@
-"""Formats of other programs, and motions written in them."""
+"""The formats of motions: their names, and the files that hold them."""
 
 import importlib
 import pathlib
 import tempfile
 from collections.abc import Sequence
-from typing import Any
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import check_free
+from congrasp.common.io.inputs import file_name
 from congrasp.common.io.spelling import check_spelling
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.export.motion_file import check_quaternions
 
 FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": ""}
 """Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are
@@ -20,14 +19,8 @@ DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""
 
 
-def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
-    """Default path of a motion: the object's name in the working directory."""
-    ending = FORMATS[kind] or f"-{kind}"
-    return pathlib.Path(f"{motion.object}{ending}")
-
-
 def export_motions(
-    motions: Sequence[GraspMotion],
+    motions: Sequence[Episode],
     kind: str,
     path: pathlib.Path,
     *,
@@ -37,7 +30,8 @@ def export_motions(
     """Writes motions in a format.
 
     Args:
-      motions: one, or several if the format supports them.
+      motions: one, or several if the format supports them; those of recordings normalised
+        (`Episode.normalised`).
       kind: one of `FORMATS`.
       path: the file or folder to write.
       camera: also records videos, if the format has them.
@@ -47,26 +41,27 @@ def export_motions(
       CongraspError: `path` exists already, has another suffix or cannot be written, a motion has
         invalid poses, or the format cannot hold what was given.
     """
-    _check_content(kind, len(motions), camera)
-    _check_suffix(kind, path)
+    _check_content(len(motions), kind, camera)
+    _check_suffix(path, kind)
     if path.is_dir():
         raise CongraspError(
             f"The folder {path} exists already.", "Remove it or pass another with --out."
         )
     check_free(path, force=force)
     for motion in motions:
-        check_quaternions(motion, "The motion")
-    options: dict[str, Any] = {"camera": True} if camera else {}
+        motion.check_quaternions("The motion")
     module = importlib.import_module(f"congrasp.services.export.{kind}")
+    options = {"camera": True} if camera else {}
     with os_errors_as(f"{path} cannot be written", "Pass another with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workplace:
-            module.write(pathlib.Path(workplace, path.name), motions, **options)
-            _move_content(pathlib.Path(workplace), path.parent, force=force)
+            folder = pathlib.Path(workplace)
+            module.write(folder / path.name, motions, **options)
+            _move_files(folder, path, force=force)
 
 
-def _check_content(kind: str, count: int, camera: bool) -> None:
-    """Raises a CongraspError for a number of motions, or a video, that a format cannot hold."""
+def _check_content(count: int, kind: str, camera: bool) -> None:
+    """Raises a CongraspError for several motions, or videos, in a format that cannot hold them."""
     if kind in DATASETS:
         return
     if count > 1:
@@ -79,29 +74,42 @@ def _check_content(kind: str, count: int, camera: bool) -> None:
         )
 
 
-def _check_suffix(kind: str, path: pathlib.Path) -> None:
-    """Raises a CongraspError, which names a path that fits, for a file with another suffix than
-    its format's.
-    """
+def _check_suffix(path: pathlib.Path, kind: str) -> None:
+    """Raises a CongraspError for a path without the suffix of its format."""
     suffix = FORMATS[kind]
     if not suffix or path.suffix.lower() == suffix:
         return
+    stem = path
+    if path.suffix and suffix.startswith(path.suffix):
+        stem = path.with_suffix("")
+    name = f"{stem}{suffix}"
     if path.is_dir():
-        name = path / f"grasp{suffix}"
-    elif path.suffix and suffix.startswith(path.suffix):
-        name = path.with_suffix(suffix)
-    else:
-        name = pathlib.Path(f"{path}{suffix}")
+        name = str(path / f"grasp{suffix}")
     raise CongraspError(
         f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}"
     )
 
 
-def _move_content(source: pathlib.Path, target: pathlib.Path, *, force: bool) -> None:
-    """Moves everything in a folder to another, unless one of the files exists there already."""
-    files = list(source.iterdir())
-    for file in files:
-        check_spelling(target / file.name)
-        check_free(target / file.name, force=force)
-    for file in files:
-        file.replace(target / file.name)
+def _move_files(folder: pathlib.Path, path: pathlib.Path, *, force: bool) -> None:
+    """Moves all written files of a folder to that of `path`.
+
+    Raises:
+      CongraspError: one of them exists already, or cannot have its name.
+    """
+    targets = {file: path.with_name(file.name) for file in folder.iterdir()}
+    for target in targets.values():
+        check_spelling(target)
+        check_free(target, force=force)
+    for file, target in targets.items():
+        file.replace(target)
+
+
+def default_name(motion: Episode, kind: str) -> pathlib.Path:
+    """Default path of a motion: the object's name in the working directory.
+
+    Raises:
+      CongraspError: the object's name cannot name a file.
+    """
+    name = file_name(motion.object, "the object of a motion")
+    suffix = FORMATS[kind] or f"-{kind}"
+    return pathlib.Path(f"{name}{suffix}")

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.rotations import continuous
-from congrasp.services.export.motion import GraspMotion
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
@@ -40,7 +40,7 @@ class Body(NamedTuple):
         return continuous(self.rotation.as_quat(scalar_first=scalar_first))
 
 
-def bodies(motion: GraspMotion) -> list[Body]:
+def bodies(motion: Episode) -> list[Body]:
     """Links of the hand in their order, each after its parent, the object, and the links of the
     arm.
     """
@@ -87,7 +87,7 @@ def _without_noise(translation: np.ndarray) -> np.ndarray:
     return translation
 
 
-def link_origins(motion: GraspMotion) -> np.ndarray:
+def link_origins(motion: Episode) -> np.ndarray:
     """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of
     their first joints.
     """
@@ -112,7 +112,7 @@ class Capsule(NamedTuple):
     """Rotation from its frame to the link's."""
 
 
-def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
+def capsules(motion: Episode, link: int) -> Iterator[Capsule]:
     """The capsules of a link by its index."""
     for number in np.flatnonzero(motion.capsule_link == link):
         start, end = motion.capsule_ends[number].astype(float)

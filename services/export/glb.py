@@ -13,13 +13,13 @@ import numpy as np
 import pygltflib as gltf
 import trimesh
 
+from congrasp.common.episode.arm import Mesh
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import Skin
 from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import OBJECT, SKIN, TO_Y_UP, bodies
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import COLOURS, arm_meshes, object_mesh, skin_of_motion
 from congrasp.services.export.texture_coordinates import unwrapped
-from congrasp.services.record.episode import Mesh
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners
 
@@ -32,7 +32,7 @@ _NUMBERS = {_FLOAT: gltf.FLOAT, _INDEX: gltf.UNSIGNED_INT, _JOINT: gltf.UNSIGNED
 """Types of components by NumPy's dtype."""
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion."""
     (motion,) = motions
     scene = _Scene()
@@ -131,7 +131,7 @@ class _Scene:
         return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
 
-def _add_bodies(scene: _Scene, motion: GraspMotion) -> gltf.Animation:
+def _add_bodies(scene: _Scene, motion: Episode) -> gltf.Animation:
     """Adds a node for each body, nested as the bodies are; returns their animation."""
     animation = gltf.Animation(name="grasp")
     meshes_of_link = arm_meshes(motion)
@@ -159,7 +159,7 @@ def _add_bodies(scene: _Scene, motion: GraspMotion) -> gltf.Animation:
     return animation
 
 
-def _object(scene: _Scene, motion: GraspMotion) -> gltf.Primitive:
+def _object(scene: _Scene, motion: Episode) -> gltf.Primitive:
     """The object's mesh with normals and the last material, which becomes white if the points have
     colours.
     """

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.services.export.motion import GraspMotion
+from congrasp.common.episode.episode import Episode
 
 TRAJECTORY_START_NS = 10**9
 """Time of the first point of a trajectory."""
 
 
-def robot_joints(motion: GraspMotion) -> list[str]:
+def robot_joints(motion: Episode) -> list[str]:
     """Returns the names of the arm's joints, if there is an arm, and of the hand's, all
     different.
     """
@@ -34,7 +34,7 @@ class JointTrajectory(NamedTuple):
     """T times since the start, ns."""
 
 
-def joint_trajectory(motion: GraspMotion, fingers: np.ndarray) -> JointTrajectory:
+def joint_trajectory(motion: Episode, fingers: np.ndarray) -> JointTrajectory:
     """Returns the points of a trajectory for a controller: it begins and ends at rest, one second
     after its start.
 

@@ -16,13 +16,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from congrasp.common.episode.arm import MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.services.export.facts import facts
 from congrasp.services.export.film import SIZE, Film, film
 from congrasp.services.export.joint_trajectory import robot_joints
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.urdf import robot_urdf
-from congrasp.services.record.episode import MovedArm
 
 VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -47,7 +47,7 @@ _PANDAS_COLUMNS = (("task_index", "int64", "int64"), ("task", "unicode", "object
 class _Dataset(NamedTuple):
     """Motions as episodes of a dataset."""
 
-    motions: Sequence[GraspMotion]
+    motions: Sequence[Episode]
     fps: int
     """Frames a second."""
     tasks: list[str]
@@ -61,7 +61,7 @@ class _Dataset(NamedTuple):
         return self.starts[-1]
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode], *, camera: bool = False) -> None:
     """Writes motions of one hand and one control step as a dataset folder, optionally with a
     camera's video.
 
@@ -98,7 +98,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
         (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1))
 
 
-def _dataset(motions: Sequence[GraspMotion]) -> _Dataset:
+def _dataset(motions: Sequence[Episode]) -> _Dataset:
     """Returns the dataset of motions of one robot.
 
     Raises:
@@ -142,7 +142,7 @@ def _episode_row(
     return row
 
 
-def _frame_rate(motions: Sequence[GraspMotion]) -> int:
+def _frame_rate(motions: Sequence[Episode]) -> int:
     """Frames a second of motions of one robot."""
     dt = motions[0].control_dt
     fps = round(1 / dt)
@@ -162,7 +162,7 @@ def _prefixed(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
     return {f"{prefix}/{name}": value for name, value in entries.items()}
 
 
-def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
+def _about(motions: Sequence[Episode]) -> dict[str, Any]:
     """Meaning of the dataset's numbers, and origin of its motions."""
     about = facts(
         motions[0],
@@ -210,12 +210,12 @@ def _video_feature(fps: int) -> dict[str, Any]:
     }
 
 
-def _task(motion: GraspMotion) -> str:
+def _task(motion: Episode) -> str:
     """A motion's task as a sentence."""
     return f"Grasp the object {motion.object} under {' and '.join(motion.constraints)}."
 
 
-def _robot(motion: GraspMotion) -> tuple[Any, ...]:
+def _robot(motion: Episode) -> tuple[Any, ...]:
     """Identity of the hand, the control step, and the arm."""
     identity = (motion.hand, motion.control_dt)
     arm = motion.arm
@@ -332,7 +332,7 @@ def _info(dataset: _Dataset) -> dict[str, Any]:
     }
 
 
-def _features(motion: GraspMotion) -> dict[str, Any]:
+def _features(motion: Episode) -> dict[str, Any]:
     """Types, shapes and names of the columns of a motion."""
     joints = robot_joints(motion)
     count = len(motion.joint_names)

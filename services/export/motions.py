@@ -5,17 +5,16 @@ import pathlib
 
 import numpy as np
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion import ARRAYS, GraspMotion
-from congrasp.services.export.motion_file import load_motion
 
-_TIMED_SHAPES = ("(T,", "(T)")
-"""Beginnings of the meanings of arrays with a row for each frame."""
+_RATE_TOLERANCE = 1e-6  # frames
 
 
-def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
-    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`).
+def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> Episode:
+    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`), with
+    normalised quaternions.
 
     Raises:
       CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor
@@ -37,29 +36,28 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
         )
     from congrasp.services.record.reader import pick_episode  # with MCAP's packages
 
-    return motion_of_episode(pick_episode(path, index, success=success))
+    return pick_episode(path, index, success=success).normalised()
 
 
-def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
-    """Returns the motion at another frame rate: for each of its times the nearest frame, at most
-    half a step off.
+def at_rate(motion: Episode, fps: float) -> Episode:
+    """Returns the motion at another frame rate, from the frames nearest in time.
+
+    Args:
+      motion: the motion.
+      fps: frames per second, at most its own rate.
 
     Raises:
       CongraspError: the rate is above the motion's own, or not above zero.
     """
-    motion_fps = 1 / motion.control_dt
-    if not 0 < fps <= motion_fps + 1e-6:
+    rate = 1 / motion.control_dt
+    if not 0 < fps <= rate + _RATE_TOLERANCE:
         raise CongraspError(
-            f"--fps is {fps:g}.",
-            f"The motion has {motion_fps:g} frames a second: set at most as many.",
+            f"--fps is {fps:g}.", f"The motion has {rate:g} frames a second: set at most as many."
         )
-    last_frame = len(motion.time) - 1
-    time = np.arange(int(last_frame * fps / motion_fps + 1e-6) + 1) / fps
-    nearest = np.minimum(np.round(time * motion_fps).astype(int), last_frame)
-    arrays = {}
-    for name, meaning in ARRAYS.items():
-        if meaning.startswith(_TIMED_SHAPES):
-            arrays[name] = getattr(motion, name)[nearest]
-    arrays["time"] = time.astype(motion.time.dtype)
-    arm = motion.arm.at(nearest) if motion.arm else None
-    return dataclasses.replace(motion, **arrays, control_dt=1 / fps, arm=arm)
+    last = motion.steps - 1
+    count = int(last * fps / rate + _RATE_TOLERANCE) + 1
+    time = np.arange(count) / fps
+    nearest = np.minimum(np.round(time * rate).astype(int), last)
+    return dataclasses.replace(
+        motion.at_frames(nearest), time=time.astype(motion.time.dtype), control_dt=1 / fps
+    )

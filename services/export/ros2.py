@@ -25,6 +25,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from congrasp.common.episode.episode import Episode
+from congrasp.services.appearance.surface_colours import colours_at
 from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import OBJECT, bodies
 from congrasp.services.export.joint_trajectory import (
@@ -32,10 +34,8 @@ from congrasp.services.export.joint_trajectory import (
     joint_trajectory,
     robot_joints,
 )
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import COLOURS, arm_meshes
 from congrasp.services.export.urdf import robot_urdf
-from congrasp.services.record.palette import colours_at
 
 _WORLD = "world"
 _OFTEN = ("/joint_states", "/tf")
@@ -67,7 +67,7 @@ class _Topic(NamedTuple):
     messages: Sequence[_Content]
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero
     means any time.
     """
@@ -92,7 +92,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
                 bag.write(channel, stamp, store.serialize_cdr(message, topic.kind))
 
 
-def _topics(motion: GraspMotion, trajectory: JointTrajectory) -> dict[str, _Topic]:
+def _topics(motion: Episode, trajectory: JointTrajectory) -> dict[str, _Topic]:
     """All topics by name, from the trajectory of arm and fingers."""
     transforms = _transforms(motion, trajectory.stamps)
     palm = next(i for i, link in enumerate(transforms[0]) if link["header"]["frame_id"] == _WORLD)
@@ -161,7 +161,7 @@ def _field(store: Typestore, node: Nodetype, field_type: Any, content: Any) -> A
     return [_field(store, item, item_type, element) for element in content or ()]
 
 
-def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
+def _transforms(motion: Episode, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
     """TF of all bodies at each of T times in ns."""
     motion_bodies = bodies(motion)
     names = [body.name for body in motion_bodies]
@@ -182,7 +182,7 @@ def _transforms(motion: GraspMotion, stamps: Sequence[int]) -> list[list[dict[st
     return frames
 
 
-def _object_marker(motion: GraspMotion) -> dict[str, Any]:
+def _object_marker(motion: Episode) -> dict[str, Any]:
     """The object, with the colours of its corners if they are known, as a marker."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
     marker = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
@@ -192,7 +192,7 @@ def _object_marker(motion: GraspMotion) -> dict[str, Any]:
     return marker
 
 
-def _arm_markers(motion: GraspMotion, arm: str) -> list[dict[str, Any]]:
+def _arm_markers(motion: Episode, arm: str) -> list[dict[str, Any]]:
     """The meshes of the links of an arm as markers; `arm` is its name."""
     markers = []
     for link, meshes in arm_meshes(motion).items():

@@ -4,23 +4,24 @@ import contextlib
 
 import numpy as np
 
+from congrasp.common.episode.arm import Mesh
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.hand_arrays import hand_arrays
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
 from congrasp.common.hands.flesh import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
+from congrasp.services.appearance import palette
+from congrasp.services.appearance.surface_colours import painted
 from congrasp.services.export.frames import OBJECT, link_origins
-from congrasp.services.export.motion import GraspMotion, hand_arrays
-from congrasp.services.record import palette
-from congrasp.services.record.episode import Mesh
-from congrasp.services.record.palette import painted
 
 COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
 """Colours of the materials of hands, and of the object."""
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
 
 
-def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def object_mesh(motion: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """The object's mesh (V, 3), (F, 3), and the sRGB (V, 3) in [0, 1] of its points, for which it
     is refined.
     """
@@ -30,7 +31,7 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return vertices, faces, colours.astype(np.float32) / 255
 
 
-def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
+def arm_meshes(motion: Episode) -> dict[str, list[Mesh]]:
     """Meshes of each link of the arm that has any; empty without an arm."""
     meshes: dict[str, list[Mesh]] = {}
     if motion.arm is None:
@@ -41,7 +42,7 @@ def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
     return meshes
 
 
-def skin_of_motion(motion: GraspMotion) -> Skin:
+def skin_of_motion(motion: Episode) -> Skin:
     """Returns the surface of the motion's hand; that of its file's meshes if it is a custom hand
     and readable.
     """
@@ -65,7 +66,7 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
     return skin_on(skeleton)
 
 
-def _custom_hand(motion: GraspMotion) -> Hand | None:
+def _custom_hand(motion: Episode) -> Hand | None:
     """Returns the custom hand of the motion's name; None if there is none or its kinematics has
     changed.
 

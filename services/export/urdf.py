@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import UNLIMITED, MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.services.export.frames import capsules, link_origins, pose_matrices
 from congrasp.services.export.joint_trajectory import robot_joints
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.record.episode import UNLIMITED, MovedArm
 
 _MASS = "0.01"
 """Placeholder for every link: only the kinematics is exported, but some readers need a mass."""
@@ -39,7 +39,7 @@ class _Joint(NamedTuple):
     """Largest speed, rad/s or m/s."""
 
 
-def robot_urdf(motion: GraspMotion) -> str:
+def robot_urdf(motion: Episode) -> str:
     """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the
     arm's base.
 
@@ -60,7 +60,7 @@ def robot_urdf(motion: GraspMotion) -> str:
     return ET.tostring(robot, "unicode")
 
 
-def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
+def _add_hand(robot: ET.Element, motion: Episode) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     joint_names = robot_joints(motion)[-len(motion.joint_names) :]
     link_names = [str(name) for name in motion.link_names]
@@ -203,7 +203,7 @@ def _add_joint(
     return joint
 
 
-def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
+def _add_capsules(link: ET.Element, motion: Episode, index: int) -> None:
     """Adds each capsule as a cylinder and two spheres, because URDF has no capsules."""
     for capsule in capsules(motion, index):
         radius = _number(capsule.radius)

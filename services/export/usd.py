@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import MATERIALS, Skin
 from congrasp.services.export.facts import facts
 from congrasp.services.export.frames import OBJECT, SKIN, Body, bodies, capsules, identifiers
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.surfaces import COLOURS, arm_meshes, object_mesh, skin_of_motion
 from congrasp.services.export.texture_coordinates import Unwrapped, unwrapped
 from congrasp.services.viz.kernels import GAMMA
@@ -25,7 +25,7 @@ _NAME = "congrasp:name"
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
 
 
-def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
+def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     """Writes one motion."""
     (motion,) = motions
     stage = Usd.Stage.CreateNew(str(path))
@@ -47,7 +47,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     stage.Save()
 
 
-def _add_bodies(stage: Usd.Stage, root: Sdf.Path, motion: GraspMotion) -> list[Body]:
+def _add_bodies(stage: Usd.Stage, root: Sdf.Path, motion: Episode) -> list[Body]:
     """Adds an animated transform for each body, with its meshes and capsules; returns the
     bodies.
     """
@@ -83,14 +83,14 @@ def _add_transform(stage: Usd.Stage, path: Sdf.Path, body: Body) -> None:
             translate.Set(Gf.Vec3d(*body.translation[t]), t)
 
 
-def _add_object(stage: Usd.Stage, path: Sdf.Path, motion: GraspMotion) -> None:
+def _add_object(stage: Usd.Stage, path: Sdf.Path, motion: Episode) -> None:
     """Adds the object's mesh, in one colour or with those of its points."""
     vertices, faces, point_colours = object_mesh(motion)
     colours = COLOURS[OBJECT] if point_colours is None else point_colours
     _add_mesh(stage, path, vertices, faces, colours)
 
 
-def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
+def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: Episode, link: int) -> None:
     """Adds the link's capsules in its frame, which are its collision shapes; viewers hide
     guides.
     """

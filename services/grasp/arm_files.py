@@ -8,11 +8,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import MovedArm
+from congrasp.common.episode.episode import Episode
 from congrasp.common.io.files import write_atomically
-from congrasp.common.wire.codec import Message
 from congrasp.services.export.joint_trajectory import joint_trajectory, robot_joints
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.record.episode import MovedArm
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.episode_scene import episode_shapes
 from congrasp.services.viz.film import Film, save_episode_video
@@ -31,7 +30,7 @@ _TABLE_MARGIN = 0.6  # m, around arm and object
 _TABLE_DEPTH = 0.001  # m, of its top below height zero
 
 
-def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) -> None:
+def save_trajectories(folder: pathlib.Path, motion: Episode, arm: MovedArm) -> None:
     """Writes the joints of arm and hand at every control step: `arm.csv` and `arm_trajectory.json`.
 
     Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which
@@ -43,13 +42,13 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
     """
     targets = np.clip(motion.joint_target, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
     names = robot_joints(motion)
-    joints, velocities, nanoseconds = joint_trajectory(motion, targets)
+    trajectory = joint_trajectory(motion, targets)
     lines = [",".join(["time", *names])]
-    for time, row in zip(motion.time, joints, strict=True):
+    for time, row in zip(motion.time, trajectory.positions, strict=True):
         lines.append(",".join(f"{x:.6f}" for x in (time, *row)))
     write_atomically(folder / ARM_CSV, ("\n".join(lines) + "\n").encode())
     points = []
-    for position, velocity, ns in zip(joints, velocities, nanoseconds, strict=True):
+    for position, velocity, ns in zip(*trajectory, strict=True):
         point = {
             "positions": position.round(6).tolist(),
             "velocities": velocity.round(6).tolist(),
@@ -60,7 +59,7 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
     write_atomically(folder / ARM_TRAJECTORY, json.dumps(message).encode())
 
 
-def save_robot_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step: int) -> None:
+def save_robot_picture(path: pathlib.Path, arm: MovedArm, episode: Episode, step: int) -> None:
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
     shapes = [*_robot_shapes(arm, episode, step), *_grasp_shapes(episode, step)]
     camera = _robot_camera(arm, episode, [step], _PICTURE_SIZE[0] / _PICTURE_SIZE[1])
@@ -70,7 +69,7 @@ def save_robot_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step
 def save_robot_video(
     path: pathlib.Path,
     arm: MovedArm,
-    episode: Message,
+    episode: Episode,
     film: Film,
     steps: Sequence[int],
     progress: Callable[[float], None] = lambda share: None,
@@ -93,7 +92,7 @@ def save_robot_video(
     save_episode_video(path, episode, film, camera, progress, around=around)
 
 
-def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:
+def _robot_camera(arm: MovedArm, episode: Episode, steps: Sequence[int], aspect: float) -> Camera:
     """Returns a camera that shows the whole robot and the object in all of the control steps."""
     points = []
     for step in steps:
@@ -103,19 +102,19 @@ def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect:
     return fit(np.concatenate(points), base.apply(_TOWARDS_CAMERA), aspect)
 
 
-def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
+def _robot_shapes(arm: MovedArm, episode: Episode, step: int) -> list[Shape]:
     """Returns the arm at a control step of its episode and the table on which arm and object
     stand.
     """
     base = arm.link_position[0, 0, :2]
-    obj = episode.arrays["object_position"][0][:2]
+    obj = episode.object_position[0][:2]
     radius = float(np.linalg.norm(base - obj)) / 2 + _TABLE_MARGIN
     middle = np.array([*np.mean((base, obj), axis=0), -_TABLE_DEPTH])
     table = Shape("table", (radius, 0.0), _GREY, middle, shine=0.0, shadow=False)
     return [*arm_shapes(arm, step), table]
 
 
-def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
+def _grasp_shapes(episode: Episode, step: int) -> list[Shape]:
     """Returns hand and object, without the table of `episode_shapes`."""
     return [
         shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.io.files import write_atomically
-from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.arm_files import (
     ARM_PICTURE,
     save_robot_picture,
@@ -18,12 +18,11 @@ from congrasp.services.grasp.arm_files import (
 )
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.progress import Progress, ignore_progress
-from congrasp.services.record.scene import save_episode
+from congrasp.services.record.episode_file import save_episode
 from congrasp.services.viz.film import Film, save_episode_video
 from congrasp.services.viz.render import (
     episode_sheet,
     grasp_picture,
-    grasp_steps,
     render_episode_frames,
 )
 from congrasp.services.viz.sheets import save_png
@@ -74,8 +73,8 @@ def save_grasp(
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, grasp.motion)
     save_episode(folder / RECORDING, "grasp", grasp.episode)
-    if grasp.motion.arm:
-        save_trajectories(folder, grasp.motion, grasp.motion.arm)
+    if grasp.episode.arm:
+        save_trajectories(folder, grasp.motion, grasp.episode.arm)
     if pictures:
         _save_pictures(folder, grasp, view, progress)
     if film:
@@ -111,8 +110,8 @@ def steps_to_draw(first: int, end: int, last: int) -> list[int]:
 
 def _drawn_steps(grasp: Grasp) -> list[int]:
     """Control steps of a grasp's contact sheet."""
-    first, end = grasp_steps(grasp.episode)
-    return steps_to_draw(first, end, len(grasp.episode.arrays["table"]) - 1)
+    first, end = grasp.episode.grasp_span
+    return steps_to_draw(first, end, grasp.episode.steps - 1)
 
 
 def _save_pictures(
@@ -120,10 +119,9 @@ def _save_pictures(
 ) -> None:
     """Writes the contact sheet, the portrait, the thumbnail and, with an arm, the arm's picture."""
     episode = grasp.episode
-    arm = grasp.motion.arm
     steps = _drawn_steps(grasp)
     last = steps[-1]
-    pictures = 4 if arm else 3
+    pictures = 4 if episode.arm else 3
 
     def save(number: int, name: str, image: np.ndarray) -> None:
         """Writes a picture and reports it."""
@@ -137,8 +135,8 @@ def _save_pictures(
     save(2, PORTRAIT, grasp_picture(episode, last, view=view))
     thumbnail = next(render_episode_frames(episode, [last], _THUMBNAIL_SIZE, camera))
     save(3, THUMBNAIL, thumbnail)
-    if arm:
-        save_robot_picture(folder / ARM_PICTURE, arm, episode, grasp.first("hold"))
+    if episode.arm:
+        save_robot_picture(folder / ARM_PICTURE, episode.arm, episode, grasp.first("hold"))
         progress("Drawing pictures", 4, pictures)
 
 
@@ -146,7 +144,7 @@ def _save_video(
     path: pathlib.Path, grasp: Grasp, film: Film, view: View | None, progress: Progress
 ) -> None:
     """Writes the MP4 of a grasp, from the reach to the end of the hold."""
-    arm = grasp.motion.arm
+    arm = grasp.episode.arm
     progress("Choosing the view", 0, 0)
     frames = _frame_counter("Drawing the video", progress)
     if arm:

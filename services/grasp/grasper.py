@@ -9,11 +9,10 @@ import numpy as np
 
 from congrasp.actors.attempts import PLAIN, Attempts, Outcome, Phases
 from congrasp.actors.initial import RequestedEpisodes
-from congrasp.common import mirror
+from congrasp.common.episode.mirrored import mirrored_episode
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.left import LEFT
-from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
@@ -23,10 +22,9 @@ from congrasp.common.runtime.entry import compiling_entry
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
-from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.codec import encode
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.client.left_policy import mirrored_request
-from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.motion import Grasp
@@ -362,22 +360,18 @@ class Grasper:
             except NoReachError:
                 refusals["contact of every reach"] += 1
                 continue
-            episode = planned.moved.recorded(grasp.episode)
-            return dataclasses.replace(
-                grasp, episode=episode, motion=motion_of_episode(episode), arm=planned
-            )
+            episode = dataclasses.replace(grasp.episode, arm=planned.moved)
+            return dataclasses.replace(grasp, episode=episode, arm=planned)
         return None
 
     def _grasp_of(self, attempts: Round, index: int, attempted: Attempted) -> Grasp:
-        """Returns an attempt with its episode, motion and active constraints."""
+        """Returns an attempt with its episode and active constraints."""
         obj = attempts.obj
         about = {
             "actor": "grasp",
             "physics": self.physics,
             "attempts": attempted.attempts,
             "attempts_held": attempted.held,
-            "object_file_scale": obj.file_scale,
-            "object_file_origin": [-x for x in obj.origin],
         }
         surface = surface_of(self.task, obj)
         episode = self._attempts.episode(attempts.outcome, index, surface, obj, about)
@@ -388,10 +382,9 @@ class Grasper:
                 episode, self._hand, obj, seconds, self._attempts.speed, side
             )
         if self._left:
-            episode = _mirrored(episode, self.hand)
+            episode = mirrored_episode(episode, self.hand)
         return Grasp(
             episode=episode,
-            motion=motion_of_episode(episode),
             attempts=attempted.attempts,
             held=attempted.held,
             rest=int(attempts.rests[index]),
@@ -411,13 +404,6 @@ class Grasper:
         goal = attempts.episodes.goal.row(index)
         conflicts = contradictions(self._hand, obj.points, obj.non_graspable_points, goal, complete)
         return (*sentences, *(conflict.message for conflict in conflicts))
-
-
-def _mirrored(episode: Message, hand: Hand) -> Message:
-    """Returns the episode of the left hand, from one of the right hand with the mirrored object."""
-    origin = mirror.vector(episode.meta["object_file_origin"]).tolist()
-    meta = {**episode.meta, "hand": hand.reference, "object_file_origin": origin}
-    return Message(mirror.fields(episode.arrays), meta)
 
 
 def _no_motion(

@@ -1,13 +1,13 @@
-"""A grasp: the best of several attempts as a motion, and its facts."""
+"""A grasp: the best of several attempts as an episode, and its facts."""
 
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from congrasp.actors.stress import ASSESSED
-from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion import GraspMotion
+from congrasp.common.episode.episode import Episode
 from congrasp.services.grasp.costs import errors_of
 
 if TYPE_CHECKING:
@@ -18,10 +18,8 @@ if TYPE_CHECKING:
 class Grasp:
     """The best of several attempts."""
 
-    episode: Message
-    """The whole episode, in the format of recordings."""
-    motion: GraspMotion
-    """Content of the NPZ."""
+    episode: Episode
+    """The whole episode, as in recordings."""
     attempts: int
     """Number of simulated attempts."""
     held: int
@@ -37,37 +35,45 @@ class Grasp:
     otherwise.
     """
 
+    @functools.cached_property
+    def motion(self) -> Episode:
+        """The episode with normalised quaternions, for motion files and exports."""
+        return self.episode.normalised()
+
     @property
     def success(self) -> bool:
         """True if this attempt held the object to the end."""
-        return self.motion.metrics["held"] > 0
+        return self.episode.metrics["held"] > 0
 
     @property
     def sink(self) -> float:
         """Largest drop of the wrist during the hold, m."""
-        height = self.motion.wrist_position[self.first("hold") :, 2]
+        height = self.episode.wrist_position[self.first("hold") :, 2]
         return float(max(height[0] - height.min(), 0.0))
 
     @property
     def shove(self) -> float:
         """Largest displacement of the object before it is lifted or the table is removed, m."""
-        phase = "lift" if "lift" in self.motion.about["phases"] else "hold"
-        moved = self.motion.object_position[: self.first(phase)] - self.motion.object_position[0]
+        phase = "lift" if "lift" in self.episode.phases else "hold"
+        positions = self.episode.object_position
+        moved = positions[: self.first(phase)] - positions[0]
         return float(np.linalg.norm(moved, axis=-1).max())
 
     def first(self, phase: str) -> int:
         """The first step of a phase."""
-        begin = self.motion.about["phases"][phase]
-        return min(int(np.searchsorted(self.motion.time, begin - 1e-6)), len(self.motion.time) - 1)
+        begin = self.episode.phases[phase]
+        step = int(np.searchsorted(self.episode.time, begin - 1e-6))
+        return min(step, self.episode.steps - 1)
 
     def facts(self) -> dict[str, Any]:
         """Result, attempts and errors, for tables and files."""
-        metrics = self.motion.metrics
+        episode = self.episode
+        metrics = episode.metrics
         facts: dict[str, Any] = {
-            "object": self.motion.object,
-            "hand": self.motion.hand,
+            "object": episode.object,
+            "hand": episode.hand,
             "success": self.success,
-            "held_quarter_second": self.motion.success,
+            "held_quarter_second": episode.success,
             "attempts": self.attempts,
             "attempts_held": self.held,
         }
@@ -75,14 +81,14 @@ class Grasp:
             facts["cause"] = self.cause
         facts |= {
             "rest": self.rest + 1,
-            "phases": self.motion.about.get("phases", {}),
-            "constraints": list(self.motion.constraints),
+            "phases": episode.about.get("phases", {}),
+            "constraints": list(episode.constraints),
             "sink_mm": 1e3 * self.sink,
             "shove_mm": 1e3 * self.shove,
             "links_at_removal": metrics["links_at_removal"],
         }
         facts |= {name: value for name, value in metrics.items() if name in ASSESSED}
-        facts |= {name: metrics[name] for name in errors_of(self.motion.constraints)}
+        facts |= {name: metrics[name] for name in errors_of(episode.constraints)}
         if self.arm:
             facts |= self.arm.facts()
         return facts

@@ -6,6 +6,7 @@ policy takes over: s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = 
 Rotation and fingers come to rest (m = 0).
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
@@ -17,13 +18,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from congrasp.common import rotations
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.wire.codec import Message
-from congrasp.common.wire.messages import EPISODE
 from congrasp.services.viz.hand_shapes import link_frames, upright
 
 SPEED = 1.0
@@ -67,17 +67,6 @@ _UP = (0.0, 0.10, 0.20, 0.32)
 """Distances of the curve's middle point above its end, m."""
 _TOLERANCE = 1e-3
 """Tolerance of the clearance, m."""
-_BEGIN = (
-    "object_position",
-    "object_quaternion",
-    "link_position",
-    "link_quaternion",
-    "q",
-    "goal/heading_direction",
-)
-
-_OF_STEPS = {name for name, spec in EPISODE.arrays.items() if spec.shape and spec.shape[0] == "T"}
-"""Arrays of an episode that have a row for each control step."""
 
 
 class NoReachError(CongraspError):
@@ -297,82 +286,81 @@ def _duration(curve: _Curve, seconds: float, speed: float) -> float:
 
 
 def with_planned_reach(
-    episode: Message,
+    episode: Episode,
     hand: Hand,
     obj: GraspObject,
     seconds: float,
     speed: float,
     side: float | None = None,
-) -> Message:
+) -> Episode:
     """The episode with the planned approach before it; see `plan_reach` for the arguments and
     errors.
     """
-    arrays = {
-        name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN
-    }
-    rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
-    turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
-    first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
-    heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(
-        arrays["goal/heading_direction"]
+    position = episode.object_position[0].astype(float)
+    quaternion = episode.object_quaternion[0].astype(float)
+    rest = np.concatenate([position, quaternion])
+    turns = Rotation.from_quat(episode.wrist_quaternion[:1].astype(float), scalar_first=True)
+    first = Reach(
+        episode.wrist_position[:1].astype(float), turns, episode.joint_position[:1].astype(float)
     )
-    dt = float(episode.meta["control_dt"])
-    return with_reach(
-        episode, hand, plan_reach(hand, obj, rest, heading, first, seconds, dt, speed, side)
-    )
+    direction = episode.goal["heading_direction"].astype(float)
+    heading = Rotation.from_quat(quaternion, scalar_first=True).apply(direction)
+    dt = episode.control_dt
+    reach = plan_reach(hand, obj, rest, heading, first, seconds, dt, speed, side)
+    return with_reach(episode, hand, reach)
 
 
-def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
-    """The episode with an approach before it; `phases` of its metadata are shifted accordingly.
+def with_reach(episode: Episode, hand: Hand, reach: Reach) -> Episode:
+    """The episode with an approach before it; its `phases` are shifted accordingly.
 
     During the approach the object rests, there is no contact, and errors are those of the first
     step.
     """
-    arrays = episode.arrays
     steps = len(reach.q)
-    moving = [
-        name for name in arrays if name in _OF_STEPS or f"{name.partition('/')[0]}/*" in _OF_STEPS
-    ]
-    before = {name: np.repeat(arrays[name][:1], steps, 0) for name in moving}
-    for name in before:
-        if name.startswith("reward/") or name in ("action", "contact_force"):
-            before[name] = np.zeros_like(before[name])
-    frames = [
-        link_frames(hand, *pose)
-        for pose in zip(reach.q, reach.position, reach.rotation, strict=True)
-    ]
-    before["link_position"], before["link_quaternion"] = map(np.stack, zip(*frames, strict=True))
-    before["q"] = before["q_target"] = reach.q
-    before["u"] = before["u_target"] = _wrist_joints(episode, reach)
-    joined = {
-        name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]])
-        for name, part in before.items()
-    }
-    later = steps * episode.meta["control_dt"]
-    phases = {
-        "approach": 0.0,
-        **{name: begin + later for name, begin in episode.meta["phases"].items()},
-    }
-    return Message({**arrays, **joined}, {**episode.meta, "phases": phases})
+    resting = episode.at_frames(np.zeros(steps, int))
+    recorded = resting.require_recorded()
+    joints = _wrist_joints(episode, reach)
+    frames = []
+    for pose in zip(reach.q, reach.position, reach.rotation, strict=True):
+        frames.append(link_frames(hand, *pose))
+    approach = dataclasses.replace(
+        resting,
+        link_position=np.stack([position for position, _ in frames]),
+        link_quaternion=np.stack([quaternion for _, quaternion in frames]),
+        link_force=np.zeros_like(resting.link_force),
+        joint_position=reach.q,
+        joint_target=reach.q,
+        recorded=dataclasses.replace(
+            recorded,
+            wrist_joints=joints,
+            wrist_targets=joints,
+            action=np.zeros_like(recorded.action),
+            rewards={name: np.zeros_like(values) for name, values in recorded.rewards.items()},
+        ),
+    )
+    seconds = steps * episode.control_dt
+    phases = {"approach": 0.0}
+    for name, begin in episode.phases.items():
+        phases[name] = begin + seconds
+    longer = episode.preceded_by(approach)
+    return dataclasses.replace(longer, about={**episode.about, "phases": phases})
 
 
-def _wrist_joints(episode: Message, reach: Reach) -> np.ndarray:
+def _wrist_joints(episode: Episode, reach: Reach) -> np.ndarray:
     """(N, 6) virtual wrist joints, with the base that follows from joints and pose of the first
     step.
     """
-    first = np.asarray(episode.arrays["u"][0], float)
+    first = episode.require_recorded().wrist_joints[0].astype(float)
     turn = Rotation.from_quat(
         np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True
     )
-    base = (
-        Rotation.from_quat(episode.arrays["link_quaternion"][0, 0], scalar_first=True) * turn.inv()
-    )
-    origin = episode.arrays["link_position"][0, 0] - base.apply(first[:3])
+    base = Rotation.from_quat(episode.wrist_quaternion[0], scalar_first=True) * turn.inv()
+    origin = episode.wrist_position[0] - base.apply(first[:3])
     turned = (base.inv() * reach.rotation).as_quat(scalar_first=True)
     hinges = np.zeros((len(turned), 3))
     near = first[3:]
     for i in reversed(range(len(turned))):  # from the grasp backwards, so that no angle jumps
-        near = hinges[i] = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))[
-            0
-        ]
+        angles = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))
+        hinges[i] = angles[0]
+        near = hinges[i]
     return np.concatenate([base.inv().apply(reach.position - origin), hinges], 1)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
@@ -18,12 +20,9 @@ from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.csv_paths import HUGE, read_csv
 from congrasp.services.grasp.target import Target, unit_vector
 from congrasp.services.grasp.wrist_paths import read_wrist_path
-from congrasp.services.record.episode import grasp_span
 
 _MAX_BYTES = 4 << 20
 """Of a JSON or CSV file."""
@@ -127,7 +126,7 @@ def _numbered(text: str) -> tuple[pathlib.Path, int]:
     return pathlib.Path(text), 0
 
 
-def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
+def _motion(path: pathlib.Path, hand: Hand, index: int) -> Episode:
     """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
     if index:
         raise CongraspError(
@@ -139,16 +138,16 @@ def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
     return motion
 
 
-def grasp_part(motion: GraspMotion) -> tuple[int, int]:
+def grasp_part(motion: Episode) -> tuple[int, int]:
     """The first frame of the grasp itself, and the last one before the lift or the table's
     removal.
     """
-    first, end = grasp_span(motion.about, motion.control_dt, motion.table)
+    first, end = motion.grasp_span
     last = max(end - 1, 0)
     return min(first, last), last
 
 
-def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:
+def _wrist_on_object(motion: Episode, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """The wrist (T, 3), (T, 4) in the object frame of one frame of the motion."""
     turn = Rotation.from_quat(motion.object_quaternion[frame], scalar_first=True).inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)

@@ -1,5 +1,4 @@
-"""Logs of a run, published under `congrasp/<run>/log/<kind>/<role>/<name>`: recording to MCAP,
-reading and drawing.
+"""Recording of the logs of a run, published under `congrasp/<run>/log/<kind>/<role>/<name>`.
 
 Kinds of messages (`common.wire.codec.Message`):
 
@@ -8,14 +7,11 @@ Kinds of messages (`common.wire.codec.Message`):
 * event: meta `time`, `level` (debug, info, warning, error, fatal), `text`.
 * version: meta with the description of a policy version.
 * rollout: a rollout as sent to the learner.
-* episode: T control steps of one world. Arrays: `link_position` (T, L, 3), `link_quaternion` (T, L,
-  4), `object_position` (T, 3), `object_quaternion` (T, 4), `contact_force` (T, L, 3) in the world
-  frame, m and N; `q`, `q_target` (T, F), `u`, `u_target` (T, 6), `action` (T, M + 6), `table` (T,)
-  bool, `reward/<term>` (T,); `goal/<field>` of `common.task.types.Goal` for this world, in the
-  object frame; `surface_points` (N, 3), `surface_avoid` (N,) bool, `visual_vertices` (V, 3),
-  `visual_faces` (F, 3), `piece_*` in the object frame, and for an object with colours
-  `colour_values` (P, 3) uint8 at `colour_points` (P, 3). Meta: `hand`, `object`, `control_dt` (s),
-  `version`, `actor`, `success`, `metrics` {name: number}. Quaternions are (w, x, y, z).
+* episode: the message of an `Episode` (`common.episode.episode`): T control steps of one world.
+
+`recorder` receives them, `converter` makes entries of them within the `budget` of each publisher,
+and `writer` writes these to MCAP files; `live` serves them to viewers, `metric_writers` passes
+metrics on. `reader` reads the files.
 
 Topics of a recording: `/metrics/<role>/<name>`, `/version/<role>/<name>`, `/events/<role>/<name>`,
 `/rollout/<actor>`, and for each actor `/episode/<actor>/` with `tf` (frames of all links and the

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.inputs import open_file, parse_json
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.record.mcap_messages import Dropped, read_messages
-from congrasp.services.record.scene import EPISODE_SCHEMA, check_episode
-from congrasp.services.record.writer import PART, ROLLOUT_SCHEMA, flatten
+from congrasp.services.record.writer import EPISODE_SCHEMA, PART, ROLLOUT_SCHEMA, flatten
 
 _METRICS_PREFIX = "/metrics/"
 _MAX_TOPIC_CHARACTERS = 100  # in messages
@@ -161,19 +161,17 @@ def _has_metrics(message: Any) -> bool:
     return all(isinstance(number, int | float) for number in [*flatten(values).values(), *steps])
 
 
-def read_episodes(path: pathlib.Path) -> Iterator[Message]:
-    """Yields the recorded episodes at `path`, a file or a folder, as sent by the actors, in the
-    order of recording.
+def read_episodes(path: pathlib.Path) -> Iterator[Episode]:
+    """Yields the recorded episodes at `path`, a file or a folder, in the order of recording.
 
     Raises:
       CongraspError: an episode is not valid.
     """
-    for episode in _messages(path, EPISODE_SCHEMA, is_episode):
-        check_episode(episode)
-        yield episode
+    for message in _messages(path, EPISODE_SCHEMA, is_episode):
+        yield Episode.from_message(message)
 
 
-def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:
+def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Episode:
     """Returns one of the recorded episodes at `path`.
 
     Args:
@@ -184,10 +182,10 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Me
     Raises:
       CongraspError: there is no such index; the message gives their number.
     """
-    last: collections.deque[Message] = collections.deque(maxlen=max(1, -index))
+    last: collections.deque[Episode] = collections.deque(maxlen=max(1, -index))
     count = 0
     for episode in read_episodes(path):
-        if success and not episode.meta["success"]:
+        if success and not episode.success:
             continue
         last.append(episode)
         count += 1

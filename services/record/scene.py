@@ -1,43 +1,25 @@
-"""An episode as a 3-D scene: link frames, the hand's surface, object, constraints, contacts and
-signals, step by step.
+"""An episode as a 3-D scene of Foxglove: hand, object and constraints, and for each control step
+frames and contacts.
 
-Each actor has a separate frame in a row under `world`. Constant parts of an episode are sent once,
-at its start; link frames, contacts and signals follow at each control step.
+Each actor has a separate frame in a row under `world`.
 """
 
-import contextlib
-import functools
-import pathlib
-import time
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError, os_errors_as
-from congrasp.common.hands import known_hand
-from congrasp.common.hands.flesh import skeleton_of
-from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
-from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
-from congrasp.common.hands.spec import Hand, Link, capsule_ends
-from congrasp.common.io.spelling import check_spelling
-from congrasp.common.objects.object_checks import LARGEST
-from congrasp.common.objects.spec import Colours
+from congrasp.common.episode.episode import Episode
+from congrasp.common.hands.mjcf import mujoco_link_poses
+from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
-from congrasp.common.wire.codec import Message, encode
-from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.services.record.episode import MovedArm, arm_of_episode, markers
-from congrasp.services.record.palette import (
+from congrasp.services.appearance.palette import (
     AVOID,
     FLESH,
     GRASPABLE,
@@ -45,313 +27,190 @@ from congrasp.services.record.palette import (
     OBJECT,
     TABLE,
     WAYPOINT,
-    Colour,
-    colours_at,
 )
-from congrasp.services.record.palette import MATERIALS as COLOURS
-from congrasp.services.record.writer import (
-    Entry,
-    JsonChannels,
-    LogWriter,
-    opaque_channel,
-    protobuf_channel,
+from congrasp.services.appearance.surface_colours import colours_at
+from congrasp.services.record.hand_parts import surface_parts
+from congrasp.services.record.primitives import (
+    Rgba,
+    add_arrow,
+    add_ball,
+    add_capsules,
+    add_triangles,
+    new_entity,
+    point_cloud,
+    set_colour,
+    set_quaternion,
+    set_vector,
 )
 
-_OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
-_MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
-_GRID = 2.0**-14  # resolution of coordinates, m: few digits compress well
-_POINTS = 2048  # points on a hand
-
-
-class Part(NamedTuple):
-    """A rigid part of a link in one colour, in the link's frame, m."""
-
-    colour: Colour
-    points: np.ndarray
-    """(V, 3), within 0.05 mm."""
-    faces: np.ndarray
-    """(E, 3) int, with outward normals."""
-
-
-@functools.lru_cache(maxsize=16)
-def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
-    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is
-    sent once.
-
-    A human hand's skin deforms, but its points at every step would make a recording many times as
-    large. A triangle of skin therefore belongs to every link with a noticeable weight on it, so
-    that the parts of two links overlap at a bent joint.
-    """
-    skin = _skin(hand)
-    strongest = np.eye(len(hand.links), dtype=bool)[skin.weights[skin.faces].sum(1).argmax(-1)]
-    members = strongest | (skin.weights[skin.faces].max(1) >= _OVERLAP)
-    kept = min(1.0, _MOST_FACES / len(skin.faces))
-    found = []
-    for member, origin in zip(members.T, skin.origins, strict=True):
-        parts = []
-        for number, name in enumerate(MATERIALS):
-            faces = skin.faces[member & (skin.material[skin.faces[:, 0]] == number)]
-            if len(faces):
-                parts.append(Part(COLOURS[name], *_light(skin.points[faces] - origin, kept)))
-        found.append(tuple(parts))
-    return tuple(found)
-
-
-@functools.lru_cache(maxsize=16)
-def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Points (n, 3) on the parts of each link, in its frame, and their colours (n, 3), for viewers
-    without meshes.
-    """
-    parts = surface_parts(hand)
-    area = sum(_mesh(part).area for own in parts for part in own)
-    found = []
-    for own in parts:
-        points, colours = [np.zeros((0, 3))], [np.zeros((0, 3))]
-        for part in own:
-            mesh = _mesh(part)
-            points.append(
-                trimesh.sample.sample_surface(mesh, round(_POINTS * mesh.area / area), seed=0)[0]
-            )
-            colours.append(np.tile(part.colour, (len(points[-1]), 1)))
-        found.append((np.concatenate(points), np.concatenate(colours)))
-    return tuple(found)
-
-
-def _skin(hand: Hand) -> Skin:
-    """Surface of the hand; made of its capsules if custom meshes cannot be read."""
-    with contextlib.suppress(CongraspError):
-        return skin_of(hand)
-    return skin_on(skeleton_of(hand))
-
-
-def _light(corners: np.ndarray, kept: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate
-    points.
-    """
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
-    if kept < 1.0:
-        mesh = mesh.simplify_quadric_decimation(face_count=max(4, int(kept * len(mesh.faces))))
-    points, found = np.unique(np.round(mesh.vertices / _GRID), axis=0, return_inverse=True)
-    faces = found.reshape(-1)[mesh.faces]
-    a, b, c = faces.T
-    return points * _GRID, faces[(a != b) & (b != c) & (c != a)]
-
-
-def _mesh(part: Part) -> trimesh.Trimesh:
-    """Returns a part as a trimesh mesh."""
-    return trimesh.Trimesh(part.points, part.faces, process=False)
-
-
-EPISODE_SCHEMA = "congrasp.Episode"
-_MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_000}
-_GOAL, _ARRAYS = 10_000, 128
-_OPEN = ("reward/", "error/", "goal/", "active/")
-SPACING = 0.8
-"""Distance between the frames of two actors in the world frame, m."""
-Rgba = tuple[float, float, float, float]
-_GHOST, _OBJECT, _TABLE = (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
-_HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
-_AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
-_ARROW = 0.10  # length of the approach arrow, m
-_FORCE_LENGTH, _FORCE_MAX = 0.01, 0.10  # m per newton, and the longest arrow
-_FORCE_LEAST = 0.05  # N
+SPACING_M = 0.8
+"""Distance between the frames of two actors in the world frame."""
+LEAST_FORCE_N = 0.05
+"""Force from which a link is in contact."""
+_GHOST: Rgba = (*HEADING, 0.25)
+_OBJECT: Rgba = (*OBJECT, 1.0)
+_TABLE: Rgba = (*TABLE, 1.0)
+_HEADING: Rgba = (*HEADING, 1.0)
+_WAYPOINT: Rgba = (*WAYPOINT, 1.0)
+_FORCE: Rgba = (0.93, 0.26, 0.21, 1.0)
+_TEXT: Rgba = (0.15, 0.17, 0.2, 1.0)
+_AXES: tuple[Rgba, ...] = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
+"""Colours of the axes x, y and z of a wrist."""
+_APPROACH_LENGTH_M = 0.10
+_APPROACH_WIDTH_M = 0.006
+_AXIS_LENGTH_M = 0.05
+_AXIS_WIDTH_M = 0.003
+_LINE_WIDTH_M = 0.003
+_BEAD_RADIUS_M = 0.004
+_FORCE_LENGTH_M = 0.01
+"""Length of a force's arrow, for each newton."""
+_LONGEST_FORCE_M = 0.10
+_FORCE_WIDTH_M = 0.004
+_LABEL_SIZE_M = 0.015
+_LABEL_HEIGHT_M = 0.12
+"""Height of the text above the object."""
+_TABLE_SIZE_M = (0.6, 0.6, 0.02)
+_TABLE_CENTRE_M = (0.0, 0.0, -0.01)
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def check_episode(episode: Message) -> None:
-    """Validates an episode from an untrusted peer.
+class _Frame(NamedTuple):
+    """Pose of a frame in another one."""
 
-    Raises:
-      CongraspError: the episode is invalid; the text names the array or the entry, and the violated
-        rule.
-    """
-    hand = known_hand(episode.meta.get("hand"))
-    sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))
-    for symbol, most in _MOST.items():
-        if not 1 <= sizes.get(symbol, 1) <= most:
-            raise CongraspError(f"The episode's {symbol} is {sizes[symbol]}, not 1 to {most}.")
-    if not 0.0 < episode.meta["control_dt"] <= 1.0:
-        raise CongraspError("The episode's control_dt is not above 0 and at most 1 s.")
-    faces = episode.arrays["visual_faces"]
-    if faces.min() < 0 or faces.max() >= sizes["V"]:
-        raise CongraspError("The episode's visual_faces name vertices that do not exist.")
-    if ("colour_points" in episode.arrays) != ("colour_values" in episode.arrays):
-        raise CongraspError("The episode has colour_points without colour_values, or the reverse.")
-    for name in ("visual_vertices", "colour_points"):
-        if np.abs(episode.arrays.get(name, 0.0)).max() > LARGEST:
-            raise CongraspError(
-                f"The episode's {name} are more than {LARGEST:g} m from the object's centre."
-            )
-    if any(
-        array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")
-    ):
-        raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
-    arm_of_episode(episode)
-    if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
-        raise CongraspError(f"The episode has more than {_ARRAYS} rewards, errors and goal arrays.")
+    parent: str
+    name: str
+    position: np.ndarray
+    """(3,) m."""
+    quaternion: np.ndarray
+    """(4,)."""
 
 
-def save_episode(path: pathlib.Path, actor: str, episode: Message) -> None:
-    """Writes an episode, under this name of an actor, as an MCAP file.
-
-    Raises:
-      CongraspError: the file cannot be written.
-    """
-    with os_errors_as(f"{path} could not be written"):
-        check_spelling(path)
-        writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
-        writer.write(*episode_entries(actor, episode, time.time_ns(), 0, JsonChannels()))
-        writer.close()
-        writer.files[-1].rename(path)
+def link_frame(actor: str, link: str) -> str:
+    """Name of the frame of a link of an actor's hand."""
+    return f"{actor}/{link}"
 
 
-def episode_entries(
-    actor: str, episode: Message, start: int, slot: int, channels: JsonChannels
-) -> Iterator[Entry]:
-    """Yields all entries of a recorder for one episode.
+def _object_frame(actor: str) -> str:
+    """Name of the frame of an actor's object."""
+    return f"{actor}/object"
+
+
+def _arm_frame(actor: str, link: str) -> str:
+    """Name of the frame of a link of an actor's arm."""
+    return f"{actor}/arm/{link}"
+
+
+def transforms(episode: Episode, actor: str, step: int, slot: int, now: int) -> FrameTransforms:
+    """Frames of the actor, its links and its object at a control step.
 
     Args:
-      actor: name of the actor, the prefix of topics and frames.
-      episode: the message (see `services.record`).
-      start: time of its first step, ns.
+      episode: the episode.
+      actor: name of the actor.
+      step: the control step.
       slot: position of the actor in the row of actors.
-      channels: schemas of the JSON signals.
-
-    Raises:
-      LookupError, ValueError: a goal array of an active block is missing, or has the wrong shape.
+      now: time of the step, ns.
     """
-    topic = f"/episode/{actor}"
-    arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    hand, arm = known_hand(episode.meta["hand"]), arm_of_episode(episode)
-    step = round(1e9 * episode.meta["control_dt"])
-    yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
-    yield _protobuf(
-        f"{topic}/scene",
-        start,
-        _static_scene(hand, arm, actor, arrays, episode.meta, start),
-        latched=True,
-    )
-    yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
-    for link, (points, colours) in zip(hand.links, surface_points(hand), strict=True):
-        # Rerun draws point clouds but no scenes; a topic holds one frame's cloud.
-        cloud = _cloud(f"{actor}/{link.name}", points, colours, start)
-        yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
-    for i in range(len(arrays["object_position"])):
-        now = start + i * step
-        yield _protobuf(f"{topic}/tf", now, _transforms(hand, arm, actor, arrays, i, slot, now))
-        yield _protobuf(f"{topic}/contacts", now, _contacts(actor, arrays, i, now, step))
-        yield channels.entry(
-            f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"])
-        )
-
-
-def duration(episode: Message) -> int:
-    """Length of an episode in ns."""
-    return round(1e9 * episode.meta["control_dt"]) * len(episode.arrays["object_position"])
-
-
-def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> Entry:
-    """Returns an entry of one of Foxglove's messages."""
-    kind: Any = type(message)
-    return Entry(protobuf_channel(topic, kind, latched=latched), time, message.SerializeToString())
-
-
-def _transforms(
-    hand: Hand,
-    arm: MovedArm | None,
-    actor: str,
-    arrays: Mapping[str, np.ndarray],
-    i: int,
-    slot: int,
-    now: int,
-) -> FrameTransforms:
-    """Frames of the actor, its links and its object at step i."""
     message = FrameTransforms()
-    poses = [("world", actor, np.array([SPACING * slot, 0.0, 0.0]), _NO_TURN)]
-    for k, link in enumerate(hand.links):
-        poses.append(
-            (
-                actor,
-                f"{actor}/{link.name}",
-                arrays["link_position"][i, k],
-                arrays["link_quaternion"][i, k],
-            )
-        )
-    poses.append(
-        (actor, f"{actor}/object", arrays["object_position"][i], arrays["object_quaternion"][i])
-    )
-    if arm:
-        links = zip(arm.link_names, arm.link_position[i], arm.link_quaternion[i], strict=True)
-        poses += [
-            (actor, f"{actor}/arm/{name}", position, quaternion)
-            for name, position, quaternion in links
-        ]
-    for parent, child, position, quaternion in poses:
-        transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+    for frame in _frames(episode, actor, step, slot):
+        transform = message.transforms.add(parent_frame_id=frame.parent, child_frame_id=frame.name)
         transform.timestamp.FromNanoseconds(now)
-        _set_vector(transform.translation, position)
-        _set_quaternion(transform.rotation, quaternion)
+        set_vector(transform.translation, frame.position)
+        set_quaternion(transform.rotation, frame.quaternion)
     return message
 
 
-def _static_scene(
-    hand: Hand,
-    arm: MovedArm | None,
-    actor: str,
-    arrays: Mapping[str, np.ndarray],
-    meta: Mapping[str, Any],
-    now: int,
-) -> SceneUpdate:
-    """Hand, arm, object and constraints; first removes those of the previous episode."""
+def _frames(episode: Episode, actor: str, step: int, slot: int) -> list[_Frame]:
+    """Frames at a control step: the actor's, those of the hand, the object's, those of the arm."""
+    frames = [_Frame("world", actor, np.array([SPACING_M * slot, 0.0, 0.0]), _NO_TURN)]
+    for k, name in enumerate(episode.link_names):
+        position = episode.link_position[step, k]
+        quaternion = episode.link_quaternion[step, k]
+        frames.append(_Frame(actor, link_frame(actor, name), position, quaternion))
+    position = episode.object_position[step]
+    quaternion = episode.object_quaternion[step]
+    frames.append(_Frame(actor, _object_frame(actor), position, quaternion))
+    arm = episode.arm
+    if arm:
+        for k, name in enumerate(arm.link_names):
+            position = arm.link_position[step, k]
+            quaternion = arm.link_quaternion[step, k]
+            frames.append(_Frame(actor, _arm_frame(actor, name), position, quaternion))
+    return frames
+
+
+def static_scene(episode: Episode, actor: str, now: int) -> SceneUpdate:
+    """Hand, arm, object and constraints; first removes those of the previous episode.
+
+    Args:
+      episode: the episode.
+      actor: name of the actor, the prefix of frames.
+      now: time of the first step, ns.
+    """
     update = SceneUpdate()
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
-    for link, parts in zip(hand.links, surface_parts(hand), strict=True):
-        entity = _entity(update, f"hand/{link.name}", f"{actor}/{link.name}", now)
-        for part in parts:
-            _add_triangles(entity, part.points, part.faces, (*part.colour, 1.0))
-        if any(part.colour == FLESH for part in parts):
-            _add_capsules(entity, link, (*FLESH, 1.0))
-    if arm:
-        for m, mesh in enumerate(arm.meshes):
-            entity = _entity(update, f"arm/{m}", f"{actor}/arm/{arm.link_names[mesh.link]}", now)
-            _add_triangles(entity, mesh.vertices, mesh.faces, (*mesh.colour, 1.0))
-    frame = f"{actor}/object"
-    entity = _entity(update, "object", frame, now)
-    body = _add_triangles(entity, arrays["visual_vertices"], arrays["visual_faces"], _OBJECT)
-    if "colour_values" in arrays:
-        own = Colours(arrays["colour_points"], arrays["colour_values"])
-        for colour in (colours_at(arrays["visual_vertices"], own) / 255).tolist():
-            _set_colour(body.colors.add(), (*colour, 1.0))
-    text = _entity(update, "label", frame, now).texts.add(
-        billboard=True, font_size=0.015, text=_label(meta)
-    )
-    _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])
-    _set_colour(text.color, (0.15, 0.17, 0.2, 1.0))
-    _add_constraints(update, hand, frame, arrays, now)
+    hand = episode.known_hand()
+    _add_hand(update, hand, actor, now)
+    _add_arm(update, episode, actor, now)
+    _add_object(update, episode, actor, now)
+    _add_constraints(update, episode, hand, actor, now)
     return update
 
 
-def _label(meta: Mapping[str, Any]) -> str:
-    """Text above the object."""
-    return (
-        f"{meta['object']}, version {meta['version']}, "
-        f"{'success' if meta['success'] else 'no success'}"
+def _add_hand(update: SceneUpdate, hand: Hand, actor: str, now: int) -> None:
+    """Adds the surface of the hand, and the capsules below a skin."""
+    for link, parts in zip(hand.links, surface_parts(hand), strict=True):
+        entity = new_entity(update, f"hand/{link.name}", link_frame(actor, link.name), now)
+        for part in parts:
+            add_triangles(entity, part.points, part.faces, (*part.colour, 1.0))
+        if any(part.colour == FLESH for part in parts):
+            add_capsules(entity, link, (*FLESH, 1.0))
+
+
+def _add_arm(update: SceneUpdate, episode: Episode, actor: str, now: int) -> None:
+    """Adds the meshes of the arm, if there is one."""
+    arm = episode.arm
+    if arm is None:
+        return
+    for number, mesh in enumerate(arm.meshes):
+        frame = _arm_frame(actor, arm.link_names[mesh.link])
+        entity = new_entity(update, f"arm/{number}", frame, now)
+        add_triangles(entity, mesh.vertices, mesh.faces, (*mesh.colour, 1.0))
+
+
+def _add_object(update: SceneUpdate, episode: Episode, actor: str, now: int) -> None:
+    """Adds the object in its colours, and a text above it."""
+    frame = _object_frame(actor)
+    vertices = episode.object_vertices
+    entity = new_entity(update, "object", frame, now)
+    body = add_triangles(entity, vertices, episode.object_faces, _OBJECT)
+    if episode.colours:
+        for colour in (colours_at(vertices, episode.colours) / 255).tolist():
+            set_colour(body.colors.add(), (*colour, 1.0))
+    result = "success" if episode.success else "no success"
+    text = new_entity(update, "label", frame, now).texts.add(
+        billboard=True,
+        font_size=_LABEL_SIZE_M,
+        text=f"{episode.object}, version {episode.version}, {result}",
     )
+    set_vector(text.pose.position, [0.0, 0.0, vertices[:, 2].max() + _LABEL_HEIGHT_M])
+    set_colour(text.color, _TEXT)
 
 
 def _add_constraints(
-    update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int
+    update: SceneUpdate, episode: Episode, hand: Hand, actor: str, now: int
 ) -> None:
     """Adds markers of the active constraints; the avoid region is in the cloud of surface
     points.
     """
-    for name, marker in markers(arrays):
+    for name, marker in episode.markers():
         if isinstance(marker, Paint):
             continue
-        entity = _entity(update, f"constraint/{name}", frame, now)
+        entity = new_entity(update, f"constraint/{name}", _object_frame(actor), now)
         if isinstance(marker, Arrow):
-            start = marker.tip - _ARROW * marker.direction
-            _add_arrow(entity, start, marker.direction, _ARROW, 0.006, _HEADING)
+            start = marker.tip - _APPROACH_LENGTH_M * marker.direction
+            add_arrow(
+                entity, start, marker.direction, _APPROACH_LENGTH_M, _APPROACH_WIDTH_M, _HEADING
+            )
         elif isinstance(marker, Polyline):
             _add_beads(entity, marker.points)
         else:
@@ -360,19 +219,19 @@ def _add_constraints(
 
 def _add_beads(entity: SceneEntity, points: np.ndarray) -> None:
     """Adds balls (n, 3) on a line."""
-    line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
+    line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=_LINE_WIDTH_M)
     line.pose.orientation.w = 1.0
-    _set_colour(line.color, _WAYPOINT)
+    set_colour(line.color, _WAYPOINT)
     for point in points:
-        _set_vector(line.points.add(), point)
-        _add_sphere(entity, point, 0.004, _WAYPOINT)
+        set_vector(line.points.add(), point)
+        add_ball(entity, point, _BEAD_RADIUS_M, _WAYPOINT)
 
 
 def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
     """Adds the axes of a wrist, and the surface of its hand if the finger angles are given."""
     wrist = Rotation.from_quat(ghost.quaternion, scalar_first=True)
     for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
-        _add_arrow(entity, ghost.position, axis, 0.05, 0.003, colour)
+        add_arrow(entity, ghost.position, axis, _AXIS_LENGTH_M, _AXIS_WIDTH_M, colour)
     if ghost.q is None:
         return
     position, quaternion = mujoco_link_poses(hand, ghost.q)
@@ -380,165 +239,37 @@ def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
         turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
         for part in parts:
             points = turn.apply(part.points) + wrist.apply(position[k]) + ghost.position
-            _add_triangles(entity, points.astype(np.float32), part.faces, _GHOST)
+            add_triangles(entity, points.astype(np.float32), part.faces, _GHOST)
 
 
-def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
+def surface_cloud(episode: Episode, actor: str, now: int) -> PointCloud:
     """The object's surface points: graspable region green, avoid region red."""
-    colours = np.where(arrays["surface_avoid"][:, None], AVOID, GRASPABLE)
-    return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
+    colours = np.where(episode.surface_avoid[:, None], AVOID, GRASPABLE)
+    return point_cloud(_object_frame(actor), episode.surface_points, colours, now)
 
 
-def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> PointCloud:
-    """Points (N, 3) of a frame with colours (N, 3) from 0 to 1."""
-    packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
-    packed["position"] = points
-    # Foxglove's packed colours are red, green, blue, alpha in memory, one byte field each.
-    packed["colour"][:, :3], packed["colour"][:, 3] = np.multiply(colours, 255), 255
-    cloud = PointCloud(frame_id=frame, point_stride=packed.dtype.itemsize, data=packed.tobytes())
-    cloud.timestamp.FromNanoseconds(now)
-    cloud.pose.position.SetInParent()  # readers may miss an absent position
-    cloud.pose.orientation.w = 1.0
-    kinds = [("x", 0), ("y", 4), ("z", 8), ("red", 12), ("green", 13), ("blue", 14), ("alpha", 15)]
-    for name, offset in kinds:
-        kind = PackedElementField.FLOAT32 if offset < 12 else PackedElementField.UINT8
-        cloud.fields.add(name=name, offset=offset, type=kind)
-    return cloud
+def contacts(episode: Episode, actor: str, step: int, now: int, lifetime: int) -> SceneUpdate:
+    """Table and contact forces of a control step.
 
-
-def _contacts(
-    actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int
-) -> SceneUpdate:
-    """Table and contact forces of one step, with a short lifetime."""
-    update = SceneUpdate()
-    if arrays["table"][i]:
-        entity = _entity(update, "table", actor, now, lifetime=2 * step)
-        cube = entity.cubes.add()
-        _set_vector(cube.pose.position, [0.0, 0.0, -0.01])
-        cube.pose.orientation.w = 1.0
-        _set_vector(cube.size, [0.6, 0.6, 0.02])
-        _set_colour(cube.color, _TABLE)
-    entity = _entity(update, "forces", actor, now, lifetime=2 * step)
-    for k, force in enumerate(arrays["contact_force"][i]):
-        strength = float(np.linalg.norm(force))
-        if strength > _FORCE_LEAST:
-            length = min(_FORCE_LENGTH * strength, _FORCE_MAX)
-            _add_arrow(
-                entity, arrays["link_position"][i, k], force / strength, length, 0.004, _FORCE
-            )
-    return update
-
-
-def _signals(
-    hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: float
-) -> dict[str, Any]:
-    """Numbers of one step: seconds, rewards, forces, joints, the object's height."""
-    terms = {
-        name.removeprefix("reward/"): float(a[i])
-        for name, a in arrays.items()
-        if name.startswith("reward/")
-    }
-    joints = [joint.name for joint in hand.joints]
-    force = np.linalg.norm(arrays["contact_force"][i], axis=-1)
-    return {
-        "seconds": i * control_dt,
-        "reward": {**terms, "total": sum(terms.values())},
-        "force": {link.name: float(f) for link, f in zip(hand.links, force, strict=True)},
-        "links_in_contact": int((force > _FORCE_LEAST).sum()),
-        "q": dict(zip(joints, map(float, arrays["q"][i]), strict=True)),
-        "q_target": dict(zip(joints, map(float, arrays["q_target"][i]), strict=True)),
-        "wrist": dict(zip(WRIST_JOINTS, map(float, arrays["u"][i]), strict=True)),
-        "wrist_target": dict(zip(WRIST_JOINTS, map(float, arrays["u_target"][i]), strict=True)),
-        "object_height": float(arrays["object_position"][i, 2]),
-        "table": bool(arrays["table"][i]),
-    }
-
-
-def _entity(
-    update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0
-) -> SceneEntity:
-    """Adds an entity that moves with its frame; without a lifetime it stays until it is replaced or
-    removed.
+    Args:
+      episode: the episode.
+      actor: name of the actor, the prefix of frames.
+      step: the control step.
+      now: time of the step, ns.
+      lifetime: time for which they are shown, ns.
     """
-    entity = update.entities.add(id=name, frame_id=frame, frame_locked=True)
-    entity.timestamp.FromNanoseconds(now)
-    entity.lifetime.FromNanoseconds(lifetime)
-    return entity
-
-
-def _add_triangles(
-    entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Rgba
-) -> TriangleListPrimitive:
-    """Adds a mesh (V, 3), (E, 3) in the entity's frame."""
-    mesh = entity.triangles.add()
-    mesh.pose.orientation.w = 1.0
-    for point in points:
-        _set_vector(mesh.points.add(), point)
-    mesh.indices.extend(faces.ravel().tolist())
-    _set_colour(mesh.color, colour)
-    return mesh
-
-
-def _add_capsules(entity: SceneEntity, link: Link, colour: Rgba) -> None:
-    """Adds a link's capsules, which fill gaps in its skin at bent joints."""
-    for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
-        length = float(np.linalg.norm(end - start))
-        if length > 0:
-            cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
-            _set_vector(cylinder.pose.position, (start + end) / 2)
-            _set_quaternion(
-                cylinder.pose.orientation, _turn_onto([0.0, 0.0, 1.0], (end - start) / length)
-            )
-            _set_vector(cylinder.size, [2 * capsule.radius, 2 * capsule.radius, length])
-            _set_colour(cylinder.color, colour)
-            _add_sphere(entity, end, capsule.radius, colour)
-        _add_sphere(entity, start, capsule.radius, colour)
-
-
-def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Rgba) -> None:
-    """Adds a ball."""
-    sphere = entity.spheres.add()
-    _set_vector(sphere.pose.position, center)
-    sphere.pose.orientation.w = 1.0
-    _set_vector(sphere.size, [2 * radius] * 3)
-    _set_colour(sphere.color, colour)
-
-
-def _add_arrow(
-    entity: SceneEntity,
-    start: np.ndarray,
-    direction: np.ndarray,
-    length: float,
-    width: float,
-    colour: Rgba,
-) -> None:
-    """Adds an arrow of some length and width (m) along a unit direction."""
-    arrow = entity.arrows.add(
-        shaft_length=0.7 * length,
-        shaft_diameter=width,
-        head_length=0.3 * length,
-        head_diameter=2 * width,
-    )
-    _set_vector(arrow.pose.position, start)
-    _set_quaternion(arrow.pose.orientation, _turn_onto([1.0, 0.0, 0.0], direction))
-    _set_colour(arrow.color, colour)
-
-
-def _turn_onto(axis: list[float], direction: np.ndarray) -> np.ndarray:
-    """Quaternion (w, x, y, z) that rotates a unit axis to a unit direction (3,)."""
-    return Rotation.align_vectors([direction], [axis])[0].as_quat(scalar_first=True)
-
-
-def _set_vector(target: Any, value: Any) -> None:
-    """Sets x, y and z."""
-    target.x, target.y, target.z = map(float, value)
-
-
-def _set_quaternion(target: Any, value: Any) -> None:
-    """Sets w, x, y and z."""
-    target.w, target.x, target.y, target.z = map(float, value)
-
-
-def _set_colour(target: Any, value: Rgba) -> None:
-    """Sets red, green, blue and alpha."""
-    target.r, target.g, target.b, target.a = value
+    update = SceneUpdate()
+    if episode.table[step]:
+        cube = new_entity(update, "table", actor, now, lifetime=lifetime).cubes.add()
+        set_vector(cube.pose.position, _TABLE_CENTRE_M)
+        cube.pose.orientation.w = 1.0
+        set_vector(cube.size, _TABLE_SIZE_M)
+        set_colour(cube.color, _TABLE)
+    entity = new_entity(update, "forces", actor, now, lifetime=lifetime)
+    for k, force in enumerate(episode.link_force[step]):
+        strength = float(np.linalg.norm(force))
+        if strength > LEAST_FORCE_N:
+            start = episode.link_position[step, k]
+            length = min(_FORCE_LENGTH_M * strength, _LONGEST_FORCE_M)
+            add_arrow(entity, start, force / strength, length, _FORCE_WIDTH_M, _FORCE)
+    return update

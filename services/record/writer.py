@@ -28,6 +28,8 @@ OPAQUE = "x-safetensors"
 """Encoding of messages in the format of `common.wire.codec`."""
 ROLLOUT_SCHEMA = "congrasp.Rollout"
 """Name of the schema of rollouts."""
+EPISODE_SCHEMA = "congrasp.Episode"
+"""Name of the schema of episodes."""
 
 _MAX_FIELDS = 512
 """Limit of a topic's fields."""

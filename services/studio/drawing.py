@@ -12,7 +12,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import INWARD
-from congrasp.services.record.palette import finer, painted
+from congrasp.services.appearance.subdivision import finer
+from congrasp.services.appearance.surface_colours import painted
 
 LARGEST = 1e6
 """Bound on each number of a position (m) or direction from a page; its square is finite in single

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.attempts import Attempts, Outcome, Phases
 from congrasp.actors.initial import RequestedEpisodes
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -25,7 +26,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.transport.base import Transport
-from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.pictures import cause
 from congrasp.services.grasp.approaches import repeated, surface_of
 from congrasp.services.grasp.costs import costs
@@ -105,11 +105,11 @@ class PolicyGrasping:
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
-    ) -> Message:
+    ) -> Episode:
         """Returns the episode of the drawn grasp, or of a variation that clearly holds or meets the
         constraints better.
 
-        `note` in its metadata names a variation, or explains why none held.
+        `note` in `about` names a variation, or explains why none held.
 
         Raises:
           CongraspError: the policy lacks a constraint, or no reach leads to the grasp.
@@ -124,7 +124,7 @@ class PolicyGrasping:
 
     def _grasp(
         self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress
-    ) -> Message:
+    ) -> Episode:
         """Does the work of `grasp`; the caller holds the lock."""
         self._attempts.phases = phases
         activity = "newest weights"
@@ -163,7 +163,7 @@ class PolicyGrasping:
             attempts=ATTEMPTS,
             drop_height=self.task.drop_height,
         )
-        return Message(episode.arrays, {**episode.meta, "note": note})
+        return dataclasses.replace(episode, about={**episode.about, "note": note})
 
     def _attempt(
         self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
@@ -251,7 +251,7 @@ def _note(outcome: Outcome, index: int, distances: np.ndarray) -> str:
 
 
 def why_nothing_held(
-    episode: Message,
+    episode: Episode,
     request: GraspRequest,
     explanation: list[str],
     held: Held,

@@ -16,12 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import initial_hand
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import rest_tilts
-from congrasp.common.objects.spec import Colours
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, get_constraint, known
 from congrasp.common.task.constraints.markers import Ghost, Marker
@@ -29,20 +29,17 @@ from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.episode_motion import motion_of_episode
+from congrasp.services.appearance.surface_colours import painted
 from congrasp.services.export.formats import FORMATS, export_motions
-from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.approaches import surface_of
-from congrasp.services.record.episode import active_blocks, active_constraints, markers
-from congrasp.services.record.palette import painted
-from congrasp.services.record.scene import save_episode
+from congrasp.services.record.episode_file import save_episode
 from congrasp.services.studio.drawing import vector
 from congrasp.services.studio.server import Download
 from congrasp.services.studio.state import Studio, tool_of
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.film import Film, save_episode_video
 from congrasp.services.viz.hand_shapes import link_frames, skin_colours
-from congrasp.services.viz.render import grasp_steps, render_episode_frames
+from congrasp.services.viz.render import render_episode_frames
 from congrasp.services.viz.sheets import png_of
 
 TOUCH = 0.05
@@ -52,19 +49,6 @@ _CONSTRAINT_WEIGHTS = itertools.chain.from_iterable(c.weights for c in CONSTRAIN
 MEANINGS = {term.name: term.meaning for term in GRASP}
 MEANINGS |= {weight.name: weight.meaning for weight in _CONSTRAINT_WEIGHTS}
 """Descriptions of the reward terms by name."""
-_PLAYED = (
-    "link_position",
-    "link_quaternion",
-    "object_position",
-    "object_quaternion",
-    "contact_force",
-    "table",
-    "visual_vertices",
-    "visual_faces",
-    "surface_points",
-    "surface_avoid",
-)
-"""Arrays of an episode that the player needs unchanged."""
 _ABOVE = np.cos(np.radians(45.0))
 MOST = 30
 """Number of motions kept; the oldest is dropped first."""
@@ -213,35 +197,39 @@ class Lane(NamedTuple):
     """(T,) errors by their units, `share` without unit; the number of links by `links`."""
 
 
-def lanes(episode: Message) -> dict[str, Lane]:
+def lanes(episode: Episode) -> dict[str, Lane]:
     """The lanes of an episode by name: contact, then the active constraints whose errors are
     recorded.
     """
-    arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
-    links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
+    recorded = episode.require_recorded()
+    _, end = episode.grasp_span
+    table = np.arange(episode.steps) < end
+    links = (np.linalg.norm(episode.link_force, axis=-1) > TOUCH).sum(-1)
     contact = Lane(
         links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)}
     )
     lane_of = {"contact": contact}
-    active = active_constraints(arrays)
-    blocks = active_blocks(arrays)
     for constraint in CONSTRAINTS:
-        if constraint.name not in active:
+        if constraint.name not in episode.constraints:
             continue
-        errors = [spec for spec in constraint.errors if not spec.block or blocks.get(spec.block)]
-        if all(f"error/{spec.name}" in arrays for spec in errors):
-            lane_of[constraint.name] = _lane(errors, arrays, table)
+        errors = []
+        for spec in constraint.errors:
+            if not spec.block or episode.active.get(spec.block):
+                errors.append(spec)
+        if all(spec.name in recorded.errors for spec in errors):
+            lane_of[constraint.name] = _lane(errors, recorded.errors, table)
     return lane_of
 
 
-def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
-    """The lane of one constraint from its recorded errors (T,)."""
+def _lane(
+    errors: Sequence[ErrorSpec], recorded: Mapping[str, np.ndarray], table: np.ndarray
+) -> Lane:
+    """The lane of one constraint from its recorded errors (T,) by name."""
     within: list[np.ndarray] = []
     parts: list[str] = []
     errors_by_unit: dict[str, np.ndarray] = {}
     for spec in errors:
-        values = arrays[f"error/{spec.name}"]
+        values = recorded[spec.name]
         within.append(values <= spec.tolerance)
         factor, unit = _UNITS[spec.unit]
         parts.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
@@ -250,14 +238,28 @@ def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: 
     return Lane(np.all(within, 0), counts, "; ".join(parts), errors_by_unit)
 
 
-def for_page(episode: Message) -> Message:
+def for_page(episode: Episode) -> Message:
     """The episode for the page's player: poses, forces, rewards, object, lanes, and markers
     `KIND/CONSTRAINT/FIELD`.
     """
-    arrays: dict[str, Any] = {name: episode.arrays[name] for name in _PLAYED}
-    arrays |= _colours(episode)
-    rewards = {name: value for name, value in episode.arrays.items() if name.startswith("reward/")}
-    arrays |= rewards
+    recorded = episode.require_recorded()
+    arrays: dict[str, Any] = {
+        "link_position": episode.link_position,
+        "link_quaternion": episode.link_quaternion,
+        "object_position": episode.object_position,
+        "object_quaternion": episode.object_quaternion,
+        "contact_force": episode.link_force,
+        "table": episode.table,
+        "visual_vertices": episode.object_vertices,
+        "visual_faces": episode.object_faces,
+        "surface_points": episode.surface_points,
+        "surface_avoid": episode.surface_avoid,
+        **_coloured_mesh(episode),
+    }
+    terms: dict[str, str] = {}
+    for term, values in recorded.rewards.items():
+        arrays[f"reward/{term}"] = values
+        terms[term] = MEANINGS.get(term, "")
     legends: dict[str, str] = {}
     for name, lane in lanes(episode).items():
         legends[name] = lane.legend
@@ -266,33 +268,38 @@ def for_page(episode: Message) -> Message:
         for unit, value in lane.errors.items():
             arrays[f"lane/{name}/{unit}"] = np.asarray(value, np.float32)
     arrays |= _marker_arrays(episode)
-    terms: dict[str, str] = {}
-    for key in rewards:
-        term = key.removeprefix("reward/")
-        terms[term] = MEANINGS.get(term, "")
-    return Message(arrays, {**episode.meta, "lanes": legends, "terms": terms})
+    meta = {
+        **episode.about,
+        "hand": recorded.hand_reference,
+        "object": episode.object,
+        "control_dt": episode.control_dt,
+        "success": episode.success,
+        "metrics": episode.metrics,
+        "lanes": legends,
+        "terms": terms,
+    }
+    return Message(arrays, meta)
 
 
-def _colours(episode: Message) -> dict[str, np.ndarray]:
+def _coloured_mesh(episode: Episode) -> dict[str, np.ndarray]:
     """The object's mesh with colours, if it has some."""
-    if "colour_values" not in episode.arrays:
+    if episode.colours is None:
         return {}
-    colours = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
     vertices, faces, vertex_colours = painted(
-        episode.arrays["visual_vertices"], episode.arrays["visual_faces"], colours
+        episode.object_vertices, episode.object_faces, episode.colours
     )
     return {"visual_vertices": vertices, "visual_faces": faces, "visual_colours": vertex_colours}
 
 
-def _marker_arrays(episode: Message) -> dict[str, np.ndarray]:
+def _marker_arrays(episode: Episode) -> dict[str, np.ndarray]:
     """Fields of the markers of an episode by `KIND/CONSTRAINT/FIELD`."""
-    hand = known_hand(episode.meta["hand"])
+    hand = episode.known_hand()
     arrays: dict[str, np.ndarray] = {}
-    for name, marker in markers(episode.arrays):
+    for name, marker in episode.markers():
         for kind, marker_fields in _shapes(hand, [marker]):
             fields = marker_fields
             if kind == "paint":
-                fields = {"avoid": episode.arrays["surface_avoid"]}
+                fields = {"avoid": episode.surface_avoid}
             for field, value in fields.items():
                 arrays[f"{kind}/{name}/{field}"] = np.asarray(value, np.float32)
     return arrays
@@ -303,10 +310,10 @@ class Motions:
 
     def __init__(self) -> None:
         """Begins without motions."""
-        self._episodes: dict[str, Message] = {}
+        self._episodes: dict[str, Episode] = {}
         self._number = 0
 
-    def keep(self, episode: Message) -> str:
+    def keep(self, episode: Episode) -> str:
         """Keeps a motion; returns its number."""
         self._number += 1
         self._episodes[str(self._number)] = episode
@@ -314,7 +321,7 @@ class Motions:
             del self._episodes[next(iter(self._episodes))]
         return str(self._number)
 
-    def get(self, key: str) -> Message:
+    def get(self, key: str) -> Episode:
         """A motion by its number; a CongraspError if there is none."""
         if key not in self._episodes:
             raise CongraspError(
@@ -331,41 +338,39 @@ class Motions:
         return [_described(key, episode) for key, episode in reversed(self._episodes.items())]
 
 
-def _asked(episode: Message) -> str:
+def _asked(episode: Episode) -> str:
     """Request of a motion in words: its constraints, and the direction of the approach, world
     frame.
     """
-    arrays = episode.arrays
-    turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
-    down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])
+    turn = Rotation.from_quat(episode.object_quaternion[0], scalar_first=True)
+    down = -float(turn.apply(np.asarray(episode.goal["heading_direction"], float))[2])
     if down > _ABOVE:
         approach = "from above"
     elif down < -_ABOVE:
         approach = "from below"
     else:
         approach = "from the side"
-    titles = [get_constraint(name).title for name in active_constraints(arrays)[1:]]
+    titles = [get_constraint(name).title for name in episode.constraints[1:]]
     return ", ".join([*titles, approach])
 
 
-def _described(key: str, episode: Message) -> dict[str, Any]:
+def _described(key: str, episode: Episode) -> dict[str, Any]:
     """List entry of a motion."""
-    meta = episode.meta
-    metrics = meta.get("metrics", {})
+    metrics = episode.metrics
     return {
         "id": key,
-        "object": meta["object"],
+        "object": episode.object,
         "asked": _asked(episode),
-        "success": bool(meta["success"]),
-        "held": bool(metrics.get("held", 0.0) > 0),
-        "note": meta.get("note", ""),
-        "version": meta.get("version"),
-        "steps": len(episode.arrays["table"]),
-        "metrics": {name: float(value) for name, value in metrics.items() if np.isfinite(value)},
+        "success": episode.success,
+        "held": metrics.get("held", 0.0) > 0,
+        "note": episode.about.get("note", ""),
+        "version": episode.version,
+        "steps": episode.steps,
+        "metrics": {name: value for name, value in metrics.items() if np.isfinite(value)},
     }
 
 
-def data_file(episode: Message, key: str, kind: str) -> Download:
+def data_file(episode: Episode, key: str, kind: str) -> Download:
     """A motion as a file of one of `DATA`; formats that are folders become zip archives.
 
     Raises:
@@ -379,11 +384,11 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
         path = pathlib.Path(folder) / f"motion{FORMATS.get(kind, f'.{kind}')}"
         try:
             if kind == "npz":
-                save_motion(path, motion_of_episode(episode))
+                save_motion(path, episode.normalised())
             elif kind == "mcap":
                 save_episode(path, "studio", episode)
             else:
-                export_motions([motion_of_episode(episode)], kind, path)
+                export_motions([episode.normalised()], kind, path)
         except ModuleNotFoundError as error:
             raise CongraspError(
                 f"This needs the package '{error.name}'.", "Run: pip install 'congrasp[export]'"
@@ -396,7 +401,7 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
 
 
 def drawing(
-    episode: Message,
+    episode: Episode,
     key: str,
     kind: str,
     view: Mapping[str, Any],
@@ -423,7 +428,7 @@ def drawing(
         )
     camera = _camera(view)
     if kind == "png":
-        if not isinstance(frame, int) or not 0 <= frame < len(episode.arrays["table"]):
+        if not isinstance(frame, int) or not 0 <= frame < episode.steps:
             raise CongraspError(f"The motion has no frame {ascii(frame)[:20]}.")
         (image,) = render_episode_frames(episode, [frame], _PICTURE_PIXELS, camera)
         return Download(_name(episode, key, f"-{frame}.png"), png_of(image))
@@ -447,7 +452,7 @@ def _camera(view: Mapping[str, Any]) -> Camera:
     return Camera(position, target, angle)
 
 
-def _name(episode: Message, key: str, suffix: str) -> str:
+def _name(episode: Episode, key: str, suffix: str) -> str:
     """Name of a motion's file."""
     number = "".join(c if c.isalnum() else "-" for c in key)[-40:]
-    return f"{episode.meta['object']}-{number}{suffix}"
+    return f"{episode.object}-{number}{suffix}"

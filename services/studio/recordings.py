@@ -5,6 +5,7 @@ import pathlib
 import threading
 from typing import Any, NamedTuple
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.record.chunks import DamagedChunkError
@@ -14,7 +15,7 @@ from congrasp.services.record.reader import (
     log_files,
     read_records,
 )
-from congrasp.services.record.scene import EPISODE_SCHEMA
+from congrasp.services.record.writer import EPISODE_SCHEMA
 
 MOST = 60
 """Maximum number of episodes of one search: those nearest to the time."""
@@ -50,7 +51,7 @@ class Recordings:
             raise CongraspError(f"{path} is no recording (*.mcap).", remedy)
         self.path = path
         self._lock = threading.Lock()
-        self._episodes: dict[str, Message] = {}
+        self._messages: dict[str, Message] = {}
 
     def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
         """Episodes that were recorded around a time, in the order of their times.
@@ -77,23 +78,24 @@ class Recordings:
                 break
         nearest = sorted(recorded, key=lambda item: abs(item.time - 1e9 * time))[:MOST]
         nearest.sort(key=lambda item: item.time)
-        episodes = {f"{item.time}{item.topic}": decode(item.data) for item in nearest}
+        messages = {f"{item.time}{item.topic}": decode(item.data) for item in nearest}
         with self._lock:
-            self._episodes = episodes
-        return distance_s, [_row(key, message) for key, message in episodes.items()]
+            self._messages = messages
+        return distance_s, [_row(key, message) for key, message in messages.items()]
 
-    def episode(self, key: str) -> Message:
+    def episode(self, key: str) -> Episode:
         """An episode of the last search.
 
         Raises:
-          CongraspError: the last search did not find it.
+          CongraspError: the last search did not find it, or it is not valid.
         """
         with self._lock:
-            if key not in self._episodes:
-                raise CongraspError(
-                    "This episode is not among those found last.", "Click the curve again."
-                )
-            return self._episodes[key]
+            message = self._messages.get(key)
+        if message is None:
+            raise CongraspError(
+                "This episode is not among those found last.", "Click the curve again."
+            )
+        return Episode.from_message(message)
 
 
 def _row(key: str, message: Message) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from congrasp.actors.attempts import PLAIN, Phases
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.objects.spec import GraspObject
@@ -176,7 +177,7 @@ class Session:
             rest = int(index)
         return self._thumbnails.picture(obj, rest)
 
-    def motion(self, key: str) -> Message:
+    def motion(self, key: str) -> Episode:
         """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for
         a recorded one.
         """

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.transport.base import Transport
@@ -95,7 +96,7 @@ class Actor:
     """State of one actor, from its messages."""
 
     seen: float
-    episode: Message | None = None
+    episode: Episode | None = None
     """Its newest episode."""
     episodes: int = 0
     recent: collections.deque[bool] = dataclasses.field(
@@ -143,7 +144,7 @@ class TrainingWindow:
                     self._event(float(message.meta.get("time", now)), level, text)
                 elif kind == "episode":
                     self._episode(name, message, now)
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, CongraspError, KeyError, TypeError, ValueError):
             self.damaged += 1
 
     def take_status(self, status: Mapping[str, Any] | None, now: float) -> None:
@@ -207,7 +208,7 @@ class TrainingWindow:
             flat = {**meta, "values": flatten(meta["values"])}
             self._metrics(role, name, flat, record.time / 1e9)
 
-    def episode(self, actor: str) -> Message:
+    def episode(self, actor: str) -> Episode:
         """The newest episode of an actor.
 
         Raises:
@@ -330,13 +331,12 @@ class TrainingWindow:
 
     def _episode(self, name: str, message: Message, now: float) -> None:
         """Stores an actor's newest episode."""
-        if "link_position" not in message.arrays or "success" not in message.meta:
-            raise ValueError("not an episode")
+        episode = Episode.from_message(message)
         actor = self._actors.setdefault(name, Actor(now))
         actor.seen = now
-        actor.episode = message
+        actor.episode = episode
         actor.episodes += 1
-        actor.recent.append(bool(message.meta["success"]))
+        actor.recent.append(episode.success)
 
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
         """List entry of an actor."""
@@ -347,8 +347,8 @@ class TrainingWindow:
         if actor.recent:
             row["success"] = sum(actor.recent) / len(actor.recent)
         if actor.episode is not None:
-            row["object"] = actor.episode.meta.get("object")
-            row["last"] = bool(actor.episode.meta["success"])
+            row["object"] = actor.episode.object
+            row["last"] = actor.episode.success
         return row
 
 

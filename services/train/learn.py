@@ -31,7 +31,7 @@ from congrasp.services.ops.lifetime import GRACE
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.status import ask
-from congrasp.services.record.recorder import recorded
+from congrasp.services.record.run_recording import recorded
 from congrasp.services.train.accelerators import engine_of
 
 _HEAD_START_S = 0.5

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial import ConvexHull
 
-from congrasp.common.wire.codec import Message
+from congrasp.common.episode.episode import Episode
 from congrasp.services.viz.camera import FIELD_OF_VIEW, Camera, fit, tangents
 from congrasp.services.viz.views import View, extent, object_points
 
@@ -23,7 +23,7 @@ _WINDOW = 3.0
 
 
 def following_cameras(
-    episode: Message, steps: Sequence[int], aspect: float, view: View, *, overlays: bool = False
+    episode: Episode, steps: Sequence[int], aspect: float, view: View, *, overlays: bool = False
 ) -> list[Camera]:
     """A camera for each of the steps, evenly spaced control steps of an episode.
 
@@ -34,7 +34,7 @@ def following_cameras(
       view: direction from the scene to the camera.
       overlays: the trajectories of constraints stay in view, too.
     """
-    seconds_per_frame = _spacing(steps) * float(episode.meta["control_dt"])
+    seconds_per_frame = _spacing(steps) * episode.control_dt
     weights = _smoothing_weights(seconds_per_frame)
     hulls = [_hull(extent(episode, step, overlays=overlays)) for step in steps]
     fitted = [fit(points, view.direction, aspect) for points in hulls]
@@ -85,7 +85,7 @@ def _distance(points: np.ndarray, target: np.ndarray, axes: np.ndarray, aspect: 
     return float((sideways - z).max())
 
 
-def _distance_of_object(episode: Message, step: int, axes: np.ndarray, aspect: float) -> float:
+def _distance_of_object(episode: Episode, step: int, axes: np.ndarray, aspect: float) -> float:
     """Distance at which the object has its share of the picture's width, m."""
     across = axes[0] @ object_points(episode, step).T
     width_at_one = 2 * np.tan(np.radians(FIELD_OF_VIEW) / 2) * aspect

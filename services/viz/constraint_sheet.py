@@ -10,7 +10,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.sampling.headings import INWARD
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.palette import HEADING, WAYPOINT, region_colours
+from congrasp.services.appearance.palette import HEADING, WAYPOINT
+from congrasp.services.appearance.surface_colours import region_colours
 from congrasp.services.viz.hand_shapes import posed_hand
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import Shape, arrow, beads, object_shape, table_shape

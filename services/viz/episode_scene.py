@@ -3,14 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands import known_hand
+from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Marker, Paint, Polyline
-from congrasp.common.wire.codec import Message
-from congrasp.services.record.episode import markers
-from congrasp.services.record.palette import HEADING, WAYPOINT, region_colours
+from congrasp.services.appearance.palette import HEADING, WAYPOINT
+from congrasp.services.appearance.surface_colours import region_colours
 from congrasp.services.viz.hand_shapes import Look, posed_hand, skin_shape
 from congrasp.services.viz.shapes import Shape, arrow, beads, object_shape, table_shape
 
@@ -37,7 +35,7 @@ _ARROW_GAP_M = 0.004
 """Distance of an arrow's tip from the surface."""
 
 
-def episode_shapes(episode: Message, step: int, *, overlays: bool = True) -> list[Shape]:
+def episode_shapes(episode: Episode, step: int, *, overlays: bool = True) -> list[Shape]:
     """Shapes of a control step.
 
     Args:
@@ -49,7 +47,7 @@ def episode_shapes(episode: Message, step: int, *, overlays: bool = True) -> lis
     Returns:
       The hand, the object, the table, and then the markers.
     """
-    hand = known_hand(episode.meta["hand"])
+    hand = episode.known_hand()
     shapes = [
         _hand(hand, episode, step, tinted=overlays),
         object_at(episode, step, painted=overlays),
@@ -60,72 +58,60 @@ def episode_shapes(episode: Message, step: int, *, overlays: bool = True) -> lis
     return shapes
 
 
-def _hand(hand: Hand, episode: Message, step: int, *, tinted: bool) -> Shape:
+def _hand(hand: Hand, episode: Episode, step: int, *, tinted: bool) -> Shape:
     """The hand at a step; if `tinted`, links in contact have a colour by their force."""
-    arrays = episode.arrays
     look = Look()
     if tinted:
-        force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
+        force = np.linalg.norm(episode.link_force[step], axis=-1)
         strength = np.minimum(force / _FULL_CONTACT_N, 1.0)
         share = _LIGHTEST_TOUCH + (_STRONGEST_TOUCH - _LIGHTEST_TOUCH) * strength
         look = Look(TOUCHING, np.where(force > TOUCH, share, 0.0))
-    position = arrays["link_position"][step]
-    quaternion = arrays["link_quaternion"][step]
+    position = episode.link_position[step]
+    quaternion = episode.link_quaternion[step]
     return skin_shape(skin_of(hand), position, quaternion, look)
 
 
-def object_at(episode: Message, step: int, *, painted: bool = True) -> Shape:
+def object_at(episode: Episode, step: int, *, painted: bool = True) -> Shape:
     """The object at a step in its original colours.
 
     If `painted`, and if the graspable region is a constraint, it has the colours of its regions.
     """
-    arrays = episode.arrays
-    paint = _own_colours(episode)
+    paint = episode.colours
     if painted and _has_regions(episode):
-        paint = region_colours(arrays["surface_points"], np.asarray(arrays["surface_avoid"], bool))
-    mesh = (arrays["visual_vertices"], arrays["visual_faces"])
-    position = arrays["object_position"][step]
-    return object_shape(mesh, position, arrays["object_quaternion"][step], paint)
+        paint = region_colours(episode.surface_points, episode.surface_avoid)
+    mesh = (episode.object_vertices, episode.object_faces)
+    position = episode.object_position[step]
+    return object_shape(mesh, position, episode.object_quaternion[step], paint)
 
 
-def _own_colours(episode: Message) -> Colours | None:
-    """Colours of the object's file; None without any."""
-    arrays = episode.arrays
-    if "colour_values" not in arrays:
-        return None
-    return Colours(arrays["colour_points"], arrays["colour_values"])
-
-
-def _has_regions(episode: Message) -> bool:
+def _has_regions(episode: Episode) -> bool:
     """True if an active constraint divides the object's surface, with a region to avoid."""
-    if not np.any(episode.arrays["surface_avoid"]):
+    if not episode.surface_avoid.any():
         return False
-    return any(isinstance(marker, Paint) for _, marker in markers(episode.arrays))
+    return any(isinstance(marker, Paint) for _, marker in episode.markers())
 
 
-def _table(episode: Message, step: int) -> Shape:
+def _table(episode: Episode, step: int) -> Shape:
     """The table; a removed one sinks by a fixed depth."""
-    arrays = episode.arrays
-    below = arrays["object_position"][0]
-    if arrays["table"][step]:
+    below = episode.object_position[0]
+    if episode.table[step]:
         return table_shape(below)
-    removal = int(np.argmin(arrays["table"]))
-    seconds = (step - removal + 1) * float(episode.meta["control_dt"])
+    removal = int(np.argmin(episode.table))
+    seconds = (step - removal + 1) * episode.control_dt
     share = min(seconds / _LOWERING_S, 1.0)
     return table_shape(below, -_LOWERED_M * share)
 
 
-def _markers(hand: Hand, episode: Message, step: int) -> list[Shape]:
+def _markers(hand: Hand, episode: Episode, step: int) -> list[Shape]:
     """Markers of the active constraints, which are given in the object's frame.
 
     The graspable region has none: the object itself is painted.
     """
-    arrays = episode.arrays
-    origin = np.asarray(arrays["object_position"][step], float)
-    turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
+    origin = np.asarray(episode.object_position[step], float)
+    turn = Rotation.from_quat(episode.object_quaternion[step], scalar_first=True)
     shapes: list[Shape] = []
-    for _, marker in markers(arrays):
-        shapes += _marker_shapes(hand, marker, origin, turn, arrays["surface_points"])
+    for _, marker in episode.markers():
+        shapes += _marker_shapes(hand, marker, origin, turn, episode.surface_points)
     return shapes
 
 

@@ -8,17 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.opening import temporary_file
 from congrasp.common.io.spelling import check_spelling
-from congrasp.common.wire.codec import Message
-from congrasp.services.record.palette import INK
+from congrasp.services.appearance.palette import INK
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.camera_path import following_cameras
 from congrasp.services.viz.render import (
     Around,
     draw_frames,
-    grasp_steps,
     nothing_around,
     phase_label,
 )
@@ -83,15 +82,15 @@ def _sides(text: str) -> tuple[int, int] | None:
     return width, height
 
 
-def film_steps(episode: Message, fps: float) -> list[int]:
+def film_steps(episode: Episode, fps: float) -> list[int]:
     """Control steps of the frames of a film in real time, from the first step to the last."""
-    steps_per_frame = 1 / (fps * float(episode.meta["control_dt"]))
-    count = int(np.ceil(len(episode.arrays["table"]) / steps_per_frame))
+    steps_per_frame = 1 / (fps * episode.control_dt)
+    count = int(np.ceil(episode.steps / steps_per_frame))
     return [int(i * steps_per_frame) for i in range(count)]
 
 
 def film_frames(
-    episode: Message,
+    episode: Episode,
     film: Film,
     camera: Camera | None = None,
     around: Around = nothing_around,
@@ -107,16 +106,16 @@ def film_frames(
     steps = film_steps(episode, film.fps)
     cameras = [camera] * len(steps) if camera else _cameras(episode, film, steps)
     frames = draw_frames(episode, steps, film.size, cameras, overlays=film.overlays, around=around)
-    dt = float(episode.meta["control_dt"])
+    dt = episode.control_dt
     for step, frame in zip(steps, frames, strict=True):
         yield _captioned(frame, f"{dt * step:.2f} s, real time   {phase_label(episode, step)}")
 
 
-def _cameras(episode: Message, film: Film, steps: Sequence[int]) -> list[Camera]:
+def _cameras(episode: Episode, film: Film, steps: Sequence[int]) -> list[Camera]:
     """A camera for each frame."""
     view = film.view
     if view is None:
-        end_of_grasp = min(grasp_steps(episode)[1], steps[-1])
+        end_of_grasp = min(episode.grasp_span[1], steps[-1])
         view = best_view(episode, [end_of_grasp, steps[-1]])
     return following_cameras(episode, steps, film.aspect, view, overlays=film.overlays)
 
@@ -141,7 +140,7 @@ def _font(pixels: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def save_episode_video(
     path: pathlib.Path,
-    episode: Message,
+    episode: Episode,
     film: Film = Film(),  # noqa: B008 - frozen
     camera: Camera | None = None,
     progress: Callable[[float], None] = lambda share: None,

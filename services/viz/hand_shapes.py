@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
-from congrasp.services.record.palette import MATERIALS as MATERIAL_COLOURS
-from congrasp.services.record.palette import SKIN, Colour
+from congrasp.services.appearance.palette import MATERIALS as MATERIAL_COLOURS
+from congrasp.services.appearance.palette import SKIN, Colour
 from congrasp.services.viz.shapes import Shape, between
 
 _SKIN_SHINE = 0.12

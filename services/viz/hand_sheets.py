@@ -18,7 +18,7 @@ from congrasp.common.hands.motors import (
 )
 from congrasp.common.hands.skin import Skin
 from congrasp.common.hands.spec import Hand, link_origin
-from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.appearance.palette import HEADING, OBJECT, WAYPOINT
 from congrasp.services.viz.camera import fit
 from congrasp.services.viz.hand_shapes import Look, posed_hand, upright
 from congrasp.services.viz.raster import render_fitted, render_scene

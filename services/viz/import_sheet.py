@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import Colours, GraspObject
+from congrasp.services.appearance.palette import OBJECT, PIECES, Colour
+from congrasp.services.appearance.surface_colours import region_colours
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.assets.objects.sizes import length, size_in_words
 from congrasp.services.assets.objects.sources import Source
-from congrasp.services.record.palette import OBJECT, PIECES, Colour, region_colours
 from congrasp.services.viz.hand_shapes import posed_hand, upright
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import Shape, object_shape, shape_points, table_shape

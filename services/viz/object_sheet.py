@@ -14,7 +14,8 @@ from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import Headings
 from congrasp.common.task.sampling.reach import within_reach
-from congrasp.services.record.palette import HEADING, PIECES, region_colours
+from congrasp.services.appearance.palette import HEADING, PIECES
+from congrasp.services.appearance.surface_colours import region_colours
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import Shape, arrow, object_shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet

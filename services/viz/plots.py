@@ -11,7 +11,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
-from congrasp.services.record.palette import INK
+from congrasp.services.appearance.palette import INK
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.viz.metric_titles import titled
 

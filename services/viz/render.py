@@ -5,10 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from congrasp.common.hands import known_hand
+from congrasp.common.episode.episode import Episode
 from congrasp.common.runtime.parallel import cores
-from congrasp.common.wire.codec import Message
-from congrasp.services.record.episode import active_blocks, grasp_span, phases_of
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.episode_scene import episode_shapes
 from congrasp.services.viz.raster import render_scene
@@ -32,7 +30,7 @@ def nothing_around(step: int) -> Sequence[Shape]:
 
 
 def grasp_picture(
-    episode: Message, step: int, size: tuple[int, int] = (1280, 720), view: View | None = None
+    episode: Episode, step: int, size: tuple[int, int] = (1280, 720), view: View | None = None
 ) -> np.ndarray:
     """Two pictures of one step without overlays, from `view` and, on the right, from its side.
 
@@ -55,7 +53,7 @@ def grasp_picture(
     return np.concatenate([left, right], axis=1)
 
 
-def _step_picture(episode: Message, step: int, size: tuple[int, int], view: View) -> np.ndarray:
+def _step_picture(episode: Episode, step: int, size: tuple[int, int], view: View) -> np.ndarray:
     """(height, width, 3) uint8, one step without overlays from one view."""
     width, height = size
     camera = camera_of(episode, [step], width / height, view)
@@ -63,7 +61,7 @@ def _step_picture(episode: Message, step: int, size: tuple[int, int], view: View
 
 
 def render_episode_frames(
-    episode: Message,
+    episode: Episode,
     steps: Iterable[int],
     size: tuple[int, int] = (640, 480),
     camera: Camera | None = None,
@@ -73,7 +71,7 @@ def render_episode_frames(
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
     Args:
-      episode: an episode message (`services.record.reader.read_episodes` yields them from MCAP).
+      episode: an episode (`services.record.reader.read_episodes` yields them from MCAP).
       steps: control steps, from 0.
       size: width and height in pixels.
       camera: the camera; by default one for the best view.
@@ -87,7 +85,7 @@ def render_episode_frames(
 
 
 def draw_frames(
-    episode: Message,
+    episode: Episode,
     steps: Sequence[int],
     size: tuple[int, int],
     cameras: Sequence[Camera],
@@ -116,7 +114,7 @@ def draw_frames(
 
 
 def episode_sheet(
-    episode: Message,
+    episode: Episode,
     *,
     frames: int = 8,
     size: tuple[int, int] = (440, 330),
@@ -135,8 +133,8 @@ def episode_sheet(
     Returns:
       (H, W, 3) uint8.
     """
-    steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
-    dt = float(episode.meta["control_dt"])
+    steps = steps or key_steps(episode.table, frames)
+    dt = episode.control_dt
     labels = [f"{dt * step:.2f} s   {phase_label(episode, step)}".rstrip() for step in steps]
     images = list(render_episode_frames(episode, steps, size, camera))
     columns = min(_SHEET_COLUMNS, len(steps))
@@ -144,7 +142,7 @@ def episode_sheet(
 
 
 def episode_strip(
-    episode: Message,
+    episode: Episode,
     frames: int,
     size: tuple[int, int],
     first: str,
@@ -162,32 +160,26 @@ def episode_strip(
       last: text after the time of the last one.
       last_step: step of the last picture; by default that of the episode.
     """
-    table = np.asarray(episode.arrays["table"], bool)
+    table = episode.table
     if last_step is not None:
         table = table[: last_step + 1]
     steps = key_steps(table, frames)
-    seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
+    seconds = [f"{episode.control_dt * step:.2f} s" for step in steps]
     images = list(render_episode_frames(episode, steps, size))
     return images, [first, *seconds[1:-1], f"{seconds[-1]}{last}"]
 
 
-def grasp_steps(episode: Message) -> tuple[int, int]:
-    """First step of the grasp, and the first one after it: of the lift, or without the table."""
-    dt = float(episode.meta["control_dt"])
-    return grasp_span(episode.meta, dt, np.asarray(episode.arrays["table"], bool))
-
-
-def phase_label(episode: Message, step: int) -> str:
+def phase_label(episode: Episode, step: int) -> str:
     """Label of a step: its table is removed, or its phase if the episode has an approach or a lift.
 
     Empty for other episodes.
     """
-    if not episode.arrays["table"][step]:
+    if not episode.table[step]:
         return "table removed"
-    phases = phases_of(episode.meta)
+    phases = episode.phases
     if not {"approach", "lift"} & phases.keys():
         return ""
-    time = float(episode.meta["control_dt"]) * step + 1e-6
+    time = episode.control_dt * step + 1e-6
     past = [(start, name) for name, start in phases.items() if start <= time]
     if not past:
         return ""
@@ -209,21 +201,19 @@ def key_steps(table: np.ndarray, frames: int) -> list[int]:
     return sorted(set(steps))
 
 
-def episode_title(episode: Message) -> str:
+def episode_title(episode: Episode) -> str:
     """Hand, object, constraints and result in one line."""
-    meta = episode.meta
     constraints = ["heading"]
-    for name, is_active in active_blocks(episode.arrays).items():
+    for name, is_active in episode.active.items():
         if is_active:
             constraints.append(name.replace("_", " "))
     parts = [
-        f"{known_hand(meta['hand']).name} hand, {meta['object']}",
+        f"{episode.hand} hand, {episode.object}",
         " + ".join(constraints),
-        "success" if meta["success"] else "no success",
+        "success" if episode.success else "no success",
     ]
-    metrics = meta.get("metrics", {})
     for name in _TITLE_METRICS:
-        if name in metrics:
-            parts.append(f"{name.replace('_', ' ')} {metrics[name]:.3g}")
-    parts.append(f"policy version {meta['version']}")
+        if name in episode.metrics:
+            parts.append(f"{name.replace('_', ' ')} {episode.metrics[name]:.3g}")
+    parts.append(f"policy version {episode.version}")
     return "   |   ".join(parts)

@@ -9,9 +9,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.arm import MovedArm
 from congrasp.common.objects.spec import Colours
-from congrasp.services.record.episode import MovedArm
-from congrasp.services.record.palette import OBJECT, TABLE, Colour
+from congrasp.services.appearance.palette import OBJECT, TABLE, Colour
 
 Kind = Literal["sphere", "capsule", "table", "mesh"]
 

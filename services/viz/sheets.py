@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.files import write_atomically
-from congrasp.services.record.palette import INK
+from congrasp.services.appearance.palette import INK
 
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common.objects.spec import Colours
-from congrasp.services.record.palette import colours_at
+from congrasp.services.appearance.surface_colours import colours_at
 from congrasp.services.viz.kernels import linear
 
 _FINEST_TEXEL_M = 0.0004

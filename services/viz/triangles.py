@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.objects.spec import Colours
-from congrasp.services.record.palette import bisected
+from congrasp.services.appearance.subdivision import bisected
 from congrasp.services.viz.kernels import NOTHING, linear
 from congrasp.services.viz.shapes import Shape
 from congrasp.services.viz.texture import NO_TEXTURE, Texture, joined_textures, texture_of

@@ -7,13 +7,11 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.io.arrays import numbers_in
 from congrasp.common.task.constraints.markers import Polyline
-from congrasp.common.wire.codec import Message
-from congrasp.services.record.episode import markers
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.episode_scene import TOUCH, object_at
 from congrasp.services.viz.hand_shapes import capsule_shapes
@@ -81,7 +79,7 @@ def view_of(text: str) -> View | None:
     )
 
 
-def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
+def views(episode: Episode, steps: Sequence[int]) -> tuple[View, View]:
     """The best view of some steps, and the best one from its side.
 
     The middle and the last one of the steps are compared.
@@ -104,13 +102,13 @@ def _angle(first: View, second: View) -> float:
     return abs((first.azimuth - second.azimuth + 180) % 360 - 180)
 
 
-def best_view(episode: Message, steps: Sequence[int]) -> View:
+def best_view(episode: Episode, steps: Sequence[int]) -> View:
     """The view that shows most of fingers, contacts and object in some steps."""
     return views(episode, steps)[0]
 
 
 def camera_of(
-    episode: Message,
+    episode: Episode,
     steps: Sequence[int],
     aspect: float = 4 / 3,
     view: View | None = None,
@@ -128,13 +126,12 @@ def camera_of(
 class _PicturedStep:
     """A step with the hand as capsules, for the comparison of views."""
 
-    def __init__(self, episode: Message, step: int):
+    def __init__(self, episode: Episode, step: int):
         """Places hand and object."""
-        arrays = episode.arrays
-        hand = known_hand(episode.meta["hand"])
-        position = arrays["link_position"][step]
-        quaternion = arrays["link_quaternion"][step]
-        force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
+        hand = episode.known_hand()
+        position = episode.link_position[step]
+        quaternion = episode.link_quaternion[step]
+        force = np.linalg.norm(episode.link_force[step], axis=-1)
         capsules = capsule_shapes(hand, position, quaternion)
         self._object = object_at(episode, step, painted=False)
         self._shapes = [*capsules, self._object]
@@ -145,7 +142,7 @@ class _PicturedStep:
         wrist = Rotation.from_quat(quaternion[0], scalar_first=True)
         back = -hand.keypoints[len(hand.links) :].mean(0)
         self._forearm = wrist.apply(back / np.linalg.norm(back))
-        x, y, z = np.ptp(arrays["visual_vertices"], axis=0)
+        x, y, z = np.ptp(episode.object_vertices, axis=0)
         sides = np.array([y * z, z * x, x * y])
         self._box_faces = sides / np.linalg.norm(sides)
         self._object_turn = Rotation.from_quat(self._object.quaternion, scalar_first=True)
@@ -196,37 +193,34 @@ def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
     return np.bincount(seen[seen >= 0], minlength=len(shapes))
 
 
-def extent(episode: Message, step: int, *, overlays: bool = False) -> np.ndarray:
+def extent(episode: Episode, step: int, *, overlays: bool = False) -> np.ndarray:
     """(N, 3) points that a picture of a step must contain, m, world frame.
 
     These are the skin without sleeve, the object's box and, with `overlays`, trajectories. An
     object that has fallen far is left out.
     """
     around = hand_points(episode, step)
-    arrays = episode.arrays
-    fall = arrays["object_position"][0, 2] - arrays["object_position"][step, 2]
+    fall = episode.object_position[0, 2] - episode.object_position[step, 2]
     if fall > _LARGEST_FALL_M:
         return around
     return np.concatenate([around, object_points(episode, step, overlays=overlays)])
 
 
-def hand_points(episode: Message, step: int) -> np.ndarray:
+def hand_points(episode: Episode, step: int) -> np.ndarray:
     """(N, 3) points of the skin without its sleeve, m, world frame."""
-    arrays = episode.arrays
-    skin = skin_of(known_hand(episode.meta["hand"]))
-    turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True)
-    points = skin.posed(arrays["link_position"][step], turns.as_matrix())[0]
+    skin = skin_of(episode.known_hand())
+    turns = Rotation.from_quat(episode.link_quaternion[step], scalar_first=True)
+    points = skin.posed(episode.link_position[step], turns.as_matrix())[0]
     return points[skin.material != MATERIALS.index("sleeve")]
 
 
-def object_points(episode: Message, step: int, *, overlays: bool = False) -> np.ndarray:
+def object_points(episode: Episode, step: int, *, overlays: bool = False) -> np.ndarray:
     """(N, 3) corners of the object's box, and with `overlays` its trajectories, m, world frame."""
-    arrays = episode.arrays
-    low = arrays["visual_vertices"].min(0)
-    high = arrays["visual_vertices"].max(0)
+    low = episode.object_vertices.min(0)
+    high = episode.object_vertices.max(0)
     is_high = np.indices((2, 2, 2)).reshape(3, -1).T
     points = [np.where(is_high, high, low)]
     if overlays:
-        points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
-    turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
-    return turn.apply(np.concatenate(points)) + arrays["object_position"][step]
+        points += [marker.points for _, marker in episode.markers() if isinstance(marker, Polyline)]
+    turn = Rotation.from_quat(episode.object_quaternion[step], scalar_first=True)
+    return turn.apply(np.concatenate(points)) + episode.object_position[step]

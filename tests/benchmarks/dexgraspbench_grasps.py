@@ -12,6 +12,7 @@ from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.scene import compile_scene
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
@@ -22,9 +23,7 @@ from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.objects.decompose import decompose
 from congrasp.services.assets.objects.hulls import simplify
-from congrasp.services.export.motion import GraspMotion
 from congrasp.services.export.motions import pick_motion
-from congrasp.services.record.episode import grasp_span
 from tests.benchmarks.dexgraspbench_hands import Match, benchmarked, match_hand
 
 CLEARANCE = 0.006
@@ -130,7 +129,7 @@ def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
     return benchmark_grasp(free, motion)
 
 
-def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
+def benchmark_grasp(name: str, motion: Episode) -> Grasp:
     """The grasp at the end of the approach: before the table is removed, or the object lifted.
 
     Raises:
@@ -138,7 +137,7 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
     """
     match, hand = match_hand(motion), get_hand(motion.hand)
     obj = convex_object(motion)
-    last = max(grasp_span(motion.about, motion.control_dt, motion.table)[1] - 1, 0)
+    last = max(motion.grasp_span[1] - 1, 0)
     clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
     grasp = _state(motion, last)
     squeeze = grasp._replace(q=squeezed(hand, motion, last, match.hand.kp))
@@ -156,7 +155,7 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
     )
 
 
-def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
+def squeezed(hand: Hand, motion: Episode, t: int, kp: float) -> np.ndarray:
     """(F,) rad, targets with which servos of `kp` (N.m/rad) apply the policy's torques in frame
     `t`.
 
@@ -176,7 +175,7 @@ def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
     return q
 
 
-def convex_object(motion: GraspMotion) -> GraspObject:
+def convex_object(motion: Episode) -> GraspObject:
     """Returns the object in the motion's object frame, made of convex pieces, since a motion only
     has its mesh.
 
@@ -215,13 +214,13 @@ def _rotation(quaternion: np.ndarray) -> Rotation:
     return Rotation.from_quat(quaternion.astype(float), scalar_first=True)
 
 
-def _state(motion: GraspMotion, t: int) -> State:
+def _state(motion: Episode, t: int) -> State:
     """The hand in a frame."""
     position, q = motion.wrist_position[t].astype(float), motion.joint_position[t].astype(float)
     return State(position, _rotation(motion.wrist_quaternion[t]), q)
 
 
-def _carried(motion: GraspMotion, t: int, last: int) -> State:
+def _carried(motion: Episode, t: int, last: int) -> State:
     """The hand of frame `t` relative to the object of frame `last`."""
     state = _state(motion, t)
     turn = _rotation(motion.object_quaternion[last]) * _rotation(motion.object_quaternion[t]).inv()
@@ -229,7 +228,7 @@ def _carried(motion: GraspMotion, t: int, last: int) -> State:
     return State(place, turn * state.rotation, state.q)
 
 
-def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) -> tuple[int, float]:
+def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tuple[int, float]:
     """The last frame up to `last` in which hand and object are `CLEARANCE` apart, else that of the
     largest distance.
 

@@ -17,9 +17,9 @@ import dacite
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand, Joint, Solid, Vector, vector
-from congrasp.services.export.motion import GraspMotion
 
 Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""
@@ -143,7 +143,7 @@ class Match(NamedTuple):
         return found
 
 
-def match_hand(motion: GraspMotion) -> Match:
+def match_hand(motion: Episode) -> Match:
     """Returns the benchmark's hand for a motion's hand, independent of the names of its joints.
 
     Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to
@@ -200,7 +200,7 @@ def benchmarked(hand: Hand, match: Match) -> Hand:
     return dataclasses.replace(hand, links=links, tendons=tendons)
 
 
-def _chains(motion: GraspMotion) -> list[np.ndarray]:
+def _chains(motion: Episode) -> list[np.ndarray]:
     """Joint indices of each finger, from the palm on; empty if the hand is not a palm with
     chains.
     """
@@ -219,7 +219,7 @@ def _chains(motion: GraspMotion) -> list[np.ndarray]:
 
 
 def _laid_over(
-    name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion
+    name: str, hand: BenchmarkHand, order: np.ndarray, motion: Episode
 ) -> tuple[float, Match | None]:
     """Error in mm of the farthest joint for this assignment of joints, and the match."""
     theirs, anchors, axes = (

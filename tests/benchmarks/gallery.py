@@ -10,10 +10,10 @@ import numpy as np
 from PIL import Image
 
 from congrasp.actors.attempts import Phases
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
-from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
@@ -208,14 +208,14 @@ def command_of(shown: Shown) -> str:
     return " ".join([*words, f"--approach {_PHASES.approach:g} --lift {_PHASES.lift:g}"])
 
 
-def save_portrait(path: pathlib.Path, episode: Message) -> None:
+def save_portrait(path: pathlib.Path, episode: Episode) -> None:
     """Writes the last step of a motion as JPEG."""
-    last = len(episode.arrays["table"]) - 1
+    last = episode.steps - 1
     (picture,) = render_episode_frames(episode, [last], _SIZE, overlays=False)
     Image.fromarray(picture).save(path, quality=_QUALITY)
 
 
-def save_film(path: pathlib.Path, episode: Message) -> None:
+def save_film(path: pathlib.Path, episode: Episode) -> None:
     """Writes a motion as an animated GIF, in real time, to the end of its hold."""
     frames = list(film_frames(episode, Film(_FILM_SIZE, _FILM_FPS)))
     several = np.hstack(frames[:: max(1, len(frames) // 8)])

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import find_peaks
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
-from congrasp.services.export.motion import GraspMotion
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.files import MOTION
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
@@ -51,7 +51,7 @@ class Profile(NamedTuple):
         return float(self.speed[round(self.handover / self.dt) :].max())
 
 
-def profile(motion: GraspMotion) -> Profile:
+def profile(motion: Episode) -> Profile:
     """The profile of a motion, which has a reach."""
     phases, dt = motion.about["phases"], motion.control_dt
     if "approach" not in phases:

@@ -14,6 +14,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.hand_arrays import hand_arrays
+from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import keypoints, link_transforms
@@ -21,9 +24,6 @@ from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses
 from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import trials
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion import GraspMotion, hand_arrays
-from congrasp.services.export.motion_file import save_motion
 from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
 from tests.benchmarks.dexgraspbench_grasps import (
     STATES,
@@ -143,9 +143,9 @@ def benchmark_model(fingers, palm, *, root=True):
     return xml + "</body></body></worldbody></mujoco>"
 
 
-def motion_of(hand, *, seed=0) -> GraspMotion:
+def motion_of(hand, *, seed=0) -> Episode:
     """A wild motion of a hand beside a small ball: any wrist, any fingers, the object moves."""
-    still = dataclasses.replace(motion_of_episode(episode(T)), hand=hand.name, **hand_arrays(hand))
+    still = dataclasses.replace(episode(T).normalised(), hand=hand.name, **hand_arrays(hand))
     motion = posed(still, lambda q: mujoco_link_poses(hand, q), seed)
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
     ball = trimesh.creation.icosphere(2, 0.02)
@@ -165,7 +165,7 @@ def motion_of(hand, *, seed=0) -> GraspMotion:
 
 
 @pytest.fixture(scope="module")
-def motion() -> GraspMotion:
+def motion() -> Episode:
     return motion_of(HAND)
 
 

@@ -274,7 +274,7 @@ def file():
 
 def marker():
     """What pictures, recordings and the studio's player draw of it."""
-    from congrasp.services.record.episode import markers
+    from congrasp.common.episode.constraints import active_blocks, goal_arrays, markers
 
     heading = {
         "position": np.zeros(3),
@@ -283,7 +283,7 @@ def marker():
     }
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
     arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
-    drawn = dict(markers(arrays))
+    drawn = dict(markers(goal_arrays(arrays), active_blocks(arrays)))
     assert list(drawn) == ["heading", "level"] and drawn["level"].points[1, 2] == 0.01
 
 

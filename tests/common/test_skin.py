@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.hand_arrays import hand_arrays
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text, read_hand
 from congrasp.common.hands.flesh import surface_net
@@ -22,8 +23,6 @@ from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion import hand_arrays
 from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.viz.hand_shapes import posed_hand
 from tests.episodes import episode
@@ -196,7 +195,7 @@ def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
     ) == {"link"}
     drawn = posed_hand(own, own.q_open, np.zeros(3), Rotation.identity())
     np.testing.assert_array_equal(drawn.faces, skin.faces)
-    motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
+    motion = dataclasses.replace(episode().normalised(), hand=own.name, **hand_arrays(own))
     assert skin_of_motion(motion) is skin
     # A motion of what that hand was before keeps the surface that its own arrays tell.
     moved = dataclasses.replace(motion, joint_anchor=motion.joint_anchor + 0.01)
@@ -220,7 +219,7 @@ def test_skin_of_faces_back_to_back_has_unit_normals(own):
 def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(
     own, damaged, tmp_path
 ):
-    motion = dataclasses.replace(motion_of_episode(episode()), hand=own.name, **hand_arrays(own))
+    motion = dataclasses.replace(episode().normalised(), hand=own.name, **hand_arrays(own))
     expected = skin_of_motion(dataclasses.replace(motion, hand="unknown"))
     (tmp_path / damaged).write_bytes(b"{")
     get_hand.cache_clear()

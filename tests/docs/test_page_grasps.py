@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.rotations import rotate
 from congrasp.services.cli.main import load
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.files import MOTION, RESULT
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

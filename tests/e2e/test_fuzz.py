@@ -24,6 +24,7 @@ import pytest
 import trimesh
 
 from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
@@ -43,17 +44,16 @@ from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.task_ranges import Ranges
 from congrasp.services.assets.objects.mesh_files import read_mesh
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp.bvh import read_bvh
 from congrasp.services.grasp.wrist_paths import read_wrist_path
+from congrasp.services.record.converter import Converter
 from congrasp.services.record.reader import read_episodes, read_metrics
-from congrasp.services.record.recorder import Converter, Recorder
+from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
 from congrasp.services.serve.server import PolicyServer
 from congrasp.services.train.command import untrained
-from tests.episodes import episode
+from tests.episodes import episode, episode_message
 from tests.rollouts import bundle, learner_hub, rollout
 from tests.services.test_hostile_files import BVH, constraint_set
 
@@ -223,7 +223,7 @@ def requests():
             meta={"time": 1.0, "level": "info", "text": "x"}
         ),
         KEYS.log("version", "actor", "NAME"): Message(meta={"version": 1, "run_id": "e"}),
-        KEYS.log("episode", "actor", "NAME"): episode(3),
+        KEYS.log("episode", "actor", "NAME"): episode_message(3),
         KEYS.log("rollout", "actor", "NAME"): Message(named, {"actor": "a", "version": 1}),
         KEYS.log("odd", "actor", "NAME"): Message(),
         KEYS.announcement: Message(
@@ -362,7 +362,7 @@ def _files(folder):
     task = TaskConfig(surface_points=4, trajectory_points=2)
     bundles.save(untrained(RunConfig(task=task, network=network)), folder / "policy")
     (folder / "hand").write_text(hand_text(get_hand("human")))
-    save_motion(folder / "motion", motion_of_episode(episode()))
+    save_motion(folder / "motion", episode().normalised())
     (folder / "config").write_text(to_json(RunConfig()))
     (folder / "x.bvh").write_text(BVH)
     (folder / "x.csv").write_text("x,y,z,w,x,y,z\n" + "0,0,0,1,0,0,0\n" * 3)

@@ -115,7 +115,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
     assert any((run.run_dir / "tensorboard").iterdir())
     metrics = read_metrics(run.run_dir)
     assert any(name.endswith("episode/return") for name in metrics)
-    assert next(read_episodes(run.run_dir)).meta["hand"] == "human"
+    assert next(read_episodes(run.run_dir)).hand == "human"
     sampled = next(read_rollouts(run.run_dir))
     assert sampled.arrays["observation"].shape == (
         STEPS,

@@ -37,7 +37,7 @@ def constraints(gallery: pathlib.Path, out: pathlib.Path) -> int:
     for constraint, name in _ROWS.items():
         (recording,) = (gallery / name).glob(f"*/{RECORDING}")
         episode = pick_episode(recording, -1, success=False)
-        first = f"{constraint}: 0.00 s, {episode.meta['object']}"
+        first = f"{constraint}: 0.00 s, {episode.object}"
         pictures, captions = episode_strip(episode, _COLUMNS, _SIZE, first, ", held")
         images += pictures
         labels += captions

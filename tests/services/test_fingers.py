@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from congrasp.actors.attempts import Phases
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
@@ -17,7 +18,6 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp.files import RESULT
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.parse import read_request
@@ -135,13 +135,14 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     assert goal["force_limit"] == 3.0
     assert "Only the named fingers may touch the object." in found.active
     assert "No link may press harder than the force limit." in found.active
-    arrays = found.episode.arrays
-    steps = len(arrays["table"])
+    made = found.episode
+    errors = made.require_recorded().errors
+    steps = made.steps
     other = np.isin(HAND.link_fingers, (2, 3, 4))
-    links = np.linalg.norm(arrays["contact_force"], axis=-1)
-    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, ((links > 0) & other).any(-1))
-    np.testing.assert_array_equal(arrays["error/force_ratio"] > 0, (links > 3.0).any(-1))
-    assert arrays["active/fingers"] and not arrays["active/pose_finger"]
+    links = np.linalg.norm(made.link_force, axis=-1)
+    np.testing.assert_array_equal(errors["fingers_ratio"] > 0, ((links > 0) & other).any(-1))
+    np.testing.assert_array_equal(errors["force_ratio"] > 0, (links > 3.0).any(-1))
+    assert made.active["fingers"] and not made.active["pose_finger"]
     assert lanes(found.episode)["fingers"].met.shape == (steps,)
     assert "lane/fingers/share" in for_page(found.episode).arrays
 

@@ -11,6 +11,7 @@ import tempfile
 import numpy as np
 import pytest
 
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import hand_from_text, read_hand
 from congrasp.common.io.inputs import distinct_names, file_name, read_file, read_json, safe_name
@@ -20,8 +21,6 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message, decode, encode
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.grasp import bvh, wrist_paths
 from congrasp.services.record.reader import (
     metrics_of,
@@ -30,9 +29,14 @@ from congrasp.services.record.reader import (
     read_metrics,
     read_records,
 )
-from congrasp.services.record.scene import EPISODE_SCHEMA
-from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel
-from tests.episodes import episode
+from congrasp.services.record.writer import (
+    EPISODE_SCHEMA,
+    Entry,
+    JsonChannels,
+    LogWriter,
+    opaque_channel,
+)
+from tests.episodes import episode, episode_message
 from tests.limits import limited
 
 CLAW = pathlib.Path(__file__).parents[1] / "hands" / "claw.json"
@@ -305,7 +309,6 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda m: {"object": "../../x"}, "cannot name the object"),
         (lambda m: {"control_dt": 0.0}, "control_dt"),
         (
             lambda m: {"joint_position": m.joint_position * NAN},
@@ -322,20 +325,34 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
         (lambda m: {"object_vertices": m.object_vertices[:0]}, "object_vertices is empty"),
         (lambda m: {"object_faces": m.object_faces + 1000}, "names vertices that do not exist"),
         (
-            lambda m: {"wrist_quaternion": 0 * m.wrist_quaternion},
+            lambda m: {"link_quaternion": 0 * m.link_quaternion},
             r"a\.npz's wrist_quaternion has .* not normalised",
         ),
         (
-            lambda m: {"wrist_quaternion": m.wrist_quaternion[:, :3]},
+            lambda m: {"link_quaternion": m.link_quaternion[:, :, :3]},
             r"has shape \(12, 3\), but \(T, 4\) requires",
         ),
     ],
 )
 def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
-    motion = motion_of_episode(episode())
+    motion = episode().normalised()
     save_motion(tmp_path / "a.npz", dataclasses.replace(motion, **change(motion)))
     with pytest.raises(CongraspError, match=why):
         load_motion(tmp_path / "a.npz")
+
+
+def test_motion_whose_object_is_a_path_is_neither_written_nor_read(tmp_path):
+    motion = episode().normalised()
+    path = tmp_path / "a.npz"
+    with pytest.raises(CongraspError, match="cannot name the object"):
+        save_motion(path, dataclasses.replace(motion, object="../../x"))
+    save_motion(path, motion)
+    with np.load(path) as file:
+        arrays = dict(file)
+    meta = {**json.loads(str(arrays.pop("meta"))), "object": "../../x"}
+    np.savez(path, **arrays, meta=np.array(json.dumps(meta)))
+    with pytest.raises(CongraspError, match="cannot name the object"):
+        load_motion(path)
 
 
 def constraint_set():
@@ -477,7 +494,7 @@ def test_recordings_of_others_are_one_line(tmp_path):
             lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'"
         )
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
-    whole = episode()
+    whole = episode_message()
     for number, (change, why) in enumerate(
         (
             ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
@@ -493,4 +510,4 @@ def test_recordings_of_others_are_one_line(tmp_path):
     path = _recording(tmp_path / "lost", Entry(raw, 1, encode(Message(lost, whole.meta))))
     refused(read_episodes, path, "lacks the array 'visual_faces'")
     path = _recording(tmp_path / "fine", Entry(raw, 1, encode(whole)))
-    np.testing.assert_array_equal(next(read_episodes(path)).arrays["q"], whole.arrays["q"])
+    np.testing.assert_array_equal(next(read_episodes(path)).joint_position, whole.arrays["q"])

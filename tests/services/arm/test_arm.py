@@ -15,6 +15,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands import get_hand
 from congrasp.services.arm import ArmOptions
@@ -26,7 +27,6 @@ from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.joint_trajectory import robot_joints
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.export.motions import pick_motion
 from congrasp.services.grasp.arm_files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
 from tests.services.conftest import quick_imports

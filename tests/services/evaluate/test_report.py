@@ -14,7 +14,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import SensingConfig, TaskConfig
@@ -223,19 +222,17 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
         return np.frombuffer(base64.b64decode(data[name]), kind).reshape(-1, *shape)
 
     frames = array("frames", "<f4", data["count"], 3, 4)
-    assert len(frames) == len(
-        range(0, len(recorded.arrays["table"]), round(data["seconds"] / 0.01))
-    )
+    assert len(frames) == len(range(0, recorded.steps, round(data["seconds"] / 0.01)))
     step, which = round(data["seconds"] / 0.01), 1
     bones, weights = array("bones", "u1", 4), array("weights", "u1", 4) / 255
     points = np.column_stack([array("position", "<f4", 3), np.ones(len(bones))])
     moved = np.einsum("vk,vkij,vj->vi", weights, frames[which][bones], points)
-    arrays, hand = recorded.arrays, known_hand(recorded.meta["hand"])
-    skin = skin_shape(skin_of(hand), arrays["link_position"][step], arrays["link_quaternion"][step])
+    hand = recorded.known_hand()
+    skin = skin_shape(skin_of(hand), recorded.link_position[step], recorded.link_quaternion[step])
     np.testing.assert_allclose(moved[: len(skin.vertices)], skin.vertices, atol=2e-3)
     solid = moved[bones[:, 0] == data["count"] - 2]
-    turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
-    corners = turn.apply(arrays["visual_vertices"]) + arrays["object_position"][step]
+    turn = Rotation.from_quat(recorded.object_quaternion[step], scalar_first=True)
+    corners = turn.apply(recorded.object_vertices) + recorded.object_position[step]
     np.testing.assert_allclose(
         [solid.min(0), solid.max(0)], [corners.min(0), corners.max(0)], atol=1e-5
     )

@@ -16,6 +16,9 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.hand_arrays import hand_arrays
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -24,15 +27,12 @@ from congrasp.services.arm.description import load_arm
 from congrasp.services.arm.moved_arm import moved_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount
 from congrasp.services.export import formats, frames, urdf
-from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.film import camera_for, pictures
 from congrasp.services.export.joint_trajectory import robot_joints
-from congrasp.services.export.motion import GraspMotion, hand_arrays
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.motions import at_rate
-from congrasp.services.record.scene import check_episode, episode_entries
+from congrasp.services.record.episode_entries import scene_entries
 from congrasp.services.record.writer import JsonChannels
-from tests.episodes import episode
+from tests.episodes import episode, episode_message
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, forward_kinematics
 
 T = 5
@@ -56,7 +56,7 @@ that the hand has.
 
 
 @pytest.fixture(scope="module")
-def motion(tmp_path_factory: pytest.TempPathFactory) -> GraspMotion:
+def motion(tmp_path_factory: pytest.TempPathFactory) -> Episode:
     """Any joints of arm and hand, on a base that stands askew; the wrist is where the arm takes
     it.
     """
@@ -77,7 +77,7 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> GraspMotion:
         turn = base.rotation * Rotation.from_quat(data.xquat[bodies], scalar_first=True)
         turns.append(turn.as_quat(scalar_first=True))
     alone = dataclasses.replace(
-        motion_of_episode(episode(T)),
+        episode(T).normalised(),
         hand=hand.name,
         **hand_arrays(hand),
         joint_position=fingers,
@@ -86,14 +86,12 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> GraspMotion:
         goal={},
         link_position=np.array(position),
         link_quaternion=np.array(turns),
-        wrist_position=np.array(position)[:, 0],
-        wrist_quaternion=np.array(turns)[:, 0],
     )
     taken = [*alone.link_names.tolist(), *frames.NOT_LINKS]
     return dataclasses.replace(alone, arm=moved_arm(robot, q, base, mount, taken))
 
 
-def test_links_have_the_names_parents_and_colours_of_the_file(motion: GraspMotion) -> None:
+def test_links_have_the_names_parents_and_colours_of_the_file(motion: Episode) -> None:
     arm = motion.arm
     assert arm is not None and arm.name == "odd"
     assert arm.link_names.tolist() == ["odd_base", "sledge", "arm_palm", "body_3"]
@@ -126,7 +124,7 @@ WRITTEN = ("glb", "usd", "lerobot")
     [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in formats.FORMATS],
 )
 def test_every_reader_finds_the_arm_where_it_was(
-    motion: GraspMotion, kind: str, tmp_path: pathlib.Path
+    motion: Episode, kind: str, tmp_path: pathlib.Path
 ) -> None:
     path = tmp_path / f"motion{formats.FORMATS[kind]}"
     formats.export_motions([motion], kind, path)
@@ -134,7 +132,7 @@ def test_every_reader_finds_the_arm_where_it_was(
     assert "arm_palm" in track.poses and error_mm(motion, track) < 0.01
 
 
-def test_the_described_robot_is_mujocos(motion: GraspMotion) -> None:
+def test_the_described_robot_is_mujocos(motion: Episode) -> None:
     """Joints alone take every link, the palm too, to where the motion has it."""
     arm = motion.arm
     assert arm is not None
@@ -149,7 +147,7 @@ def test_the_described_robot_is_mujocos(motion: GraspMotion) -> None:
     np.testing.assert_allclose(poses["body_3"][:, :3, 3], arm.link_position[:, 3], atol=1e-7)
 
 
-def test_a_motions_file_keeps_its_arm(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_motions_file_keeps_its_arm(motion: Episode, tmp_path: pathlib.Path) -> None:
     save_motion(tmp_path / "motion.npz", motion)
     again = load_motion(tmp_path / "motion.npz").arm
     assert again is not None and motion.arm is not None and again.name == "odd"
@@ -172,7 +170,7 @@ def test_a_motions_file_keeps_its_arm(motion: GraspMotion, tmp_path: pathlib.Pat
 
 
 def test_a_dataset_has_the_arms_joints_before_the_hands(
-    motion: GraspMotion, tmp_path: pathlib.Path
+    motion: Episode, tmp_path: pathlib.Path
 ) -> None:
     arm = motion.arm
     assert arm is not None
@@ -180,9 +178,7 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(
     other = dataclasses.replace(
         motion,
         arm=farther,
-        **{  # the whole robot elsewhere
-            name: getattr(motion, name) + 0.1 for name in ("link_position", "wrist_position")
-        },
+        link_position=motion.link_position + 0.1,  # the whole robot elsewhere
     )
     path = tmp_path / "data"
     formats.export_motions([motion, other], "lerobot", path)
@@ -217,7 +213,7 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(
         )
 
 
-def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_other_readers_find_meshes_and_colours(motion: Episode, tmp_path: pathlib.Path) -> None:
     arm = motion.arm
     assert arm is not None
     for kind in ("glb", "usd"):
@@ -243,19 +239,18 @@ def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pa
     np.testing.assert_allclose(shown, linear, atol=1e-6)
 
 
-def test_the_camera_sees_the_arm(motion: GraspMotion) -> None:
+def test_the_camera_sees_the_arm(motion: Episode) -> None:
     alone = dataclasses.replace(motion, arm=None)
     camera = camera_for([alone])
     shown, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
     assert (np.abs(shown - blank).sum(-1) > 60).mean() > 0.02
 
 
-def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotion) -> None:
-    arm, alone = motion.arm, episode(T)
+def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: Episode) -> None:
+    arm = motion.arm
     assert arm is not None
-    whole = decode(encode(arm.recorded(alone)))
-    check_episode(whole)
-    recorded = motion_of_episode(whole)
+    whole = decode(encode(arm.add_to(episode_message(T))))
+    recorded = Episode.from_message(whole)
     again = recorded.arm
     assert "rail" in urdf.robot_urdf(recorded)
     assert (
@@ -265,7 +260,7 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotio
     )
     for name, values in arm.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values)
-    entries = [*episode_entries("a0", whole, 0, 0, JsonChannels())]
+    entries = [*scene_entries("a0", recorded, 0, 0, JsonChannels())]
     (scene,) = [
         SceneUpdate.FromString(entry.data)
         for entry in entries
@@ -288,4 +283,4 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotio
     with pytest.raises(
         CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"
     ):
-        check_episode(short)
+        Episode.from_message(short)

@@ -9,10 +9,10 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.layout import export_layout
+from congrasp.services.record.converter import Converter
 from congrasp.services.record.reader import read_records
-from congrasp.services.record.recorder import Converter
 from congrasp.services.record.writer import LogWriter, flatten
-from tests.episodes import episode
+from tests.episodes import episode_message
 
 
 def record(folder: pathlib.Path, *messages: tuple[str, Message]) -> pathlib.Path:
@@ -39,8 +39,8 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
     }
     record(
         tmp_path / "logs",
-        ("episode/actor/actor-0", episode()),
-        ("episode/actor/b", episode()),
+        ("episode/actor/actor-0", episode_message()),
+        ("episode/actor/b", episode_message()),
         ("metrics/learner/0", Message({}, {"time": 0.0, "update": 1, "values": values})),
         ("metrics/actor/actor-0", Message({}, {"time": 0.0, "values": {"version": 1.0}})),
         ("event/learner/0", Message({}, {"time": 0.0, "level": "info", "text": "hello"})),

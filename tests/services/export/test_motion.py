@@ -16,6 +16,9 @@ from mcap_ros2.decoder import DecoderFactory
 from pxr import Usd, UsdGeom, UsdSkel
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.episode.episode import Episode
+from congrasp.common.episode.hand_arrays import hand_arrays
+from congrasp.common.episode.motion_file import load_motion, save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
@@ -24,16 +27,13 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.rotations import continuous
 from congrasp.services.cli.main import main
 from congrasp.services.export import formats, frames
-from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.export.film import camera_for, pictures
-from congrasp.services.export.motion import GraspMotion, hand_arrays
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.motions import at_rate, pick_motion
 from congrasp.services.export.surfaces import COLOURS, skin_of_motion
 from congrasp.services.export.texture_coordinates import unwrapped
-from congrasp.services.record.recorder import Converter
+from congrasp.services.record.converter import Converter
 from congrasp.services.record.writer import Entry, LogWriter
-from tests.episodes import episode
+from tests.episodes import episode, episode_message
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, read_glb
 from tests.printed import errors
 
@@ -45,8 +45,8 @@ ANGLES = ("ros2", "lerobot")
 
 
 def posed(
-    motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int
-) -> GraspMotion:
+    motion: Episode, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int
+) -> Episode:
     """A wild motion of the same hand: any wrist, any fingers within their limits, any object
     pose.
     """
@@ -62,8 +62,6 @@ def posed(
         time=motion.control_dt * np.arange(count),
         joint_position=q,
         joint_target=q + 0.01,
-        wrist_position=place,
-        wrist_quaternion=wrist.as_quat(scalar_first=True),
         link_position=position,
         link_quaternion=np.stack(turns),
         object_position=rng.normal(scale=0.2, size=(count, 3)),
@@ -72,20 +70,20 @@ def posed(
 
 
 @pytest.fixture(scope="module")
-def human() -> GraspMotion:
+def human() -> Episode:
     hand = get_hand("human")
-    return posed(motion_of_episode(episode(T)), lambda q: mujoco_link_poses(hand, q), 0)
+    return posed(episode(T).normalised(), lambda q: mujoco_link_poses(hand, q), 0)
 
 
 @pytest.fixture(scope="module")
-def robot(human: GraspMotion) -> GraspMotion:
+def robot(human: Episode) -> Episode:
     hand = get_hand("sharpa")
     arrays = dataclasses.replace(human, hand=hand.name, **hand_arrays(hand))
     return posed(arrays, lambda q: mujoco_link_poses(hand, q), 1)
 
 
 @pytest.fixture(scope="module")
-def odd_hand(human: GraspMotion) -> GraspMotion:
+def odd_hand(human: Episode) -> Episode:
     """A hand with what URDF has no single joint for: two joints of one link at two places, a link
     without joints, and names that other formats do not take."""
     axes = Rotation.random(3, rng=np.random.default_rng(3)).as_matrix()[:, 0]
@@ -128,7 +126,7 @@ def odd_hand(human: GraspMotion) -> GraspMotion:
     return posed(hand, link, 5)
 
 
-def export(motions: Sequence[GraspMotion], kind: str, folder: pathlib.Path) -> pathlib.Path:
+def export(motions: Sequence[Episode], kind: str, folder: pathlib.Path) -> pathlib.Path:
     path = folder / f"motion{formats.FORMATS[kind]}"
     formats.export_motions(motions, kind, path)
     return path
@@ -168,7 +166,7 @@ def test_links_are_where_the_joint_angles_take_them(odd_hand, kind, tmp_path):
         assert error_mm(odd_hand, READERS[kind](path)[0]) > 1
 
 
-def beginning(motion: GraspMotion, count: int) -> GraspMotion:
+def beginning(motion: Episode, count: int) -> Episode:
     """The first frames of a motion."""
     moving = (
         "link_pos",
@@ -185,16 +183,14 @@ def beginning(motion: GraspMotion, count: int) -> GraspMotion:
 
 
 @pytest.mark.parametrize("kind", formats.FORMATS)
-def test_a_single_frame_is_a_motion(
-    odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path
-) -> None:
+def test_a_single_frame_is_a_motion(odd_hand: Episode, kind: str, tmp_path: pathlib.Path) -> None:
     motion = beginning(odd_hand, 1)
     (track,) = READERS[kind](export([motion], kind, tmp_path))
     assert error_mm(motion, track) < 0.01
 
 
 def test_a_controller_can_take_the_trajectory_of_a_bag(
-    robot: GraspMotion, tmp_path: pathlib.Path
+    robot: Episode, tmp_path: pathlib.Path
 ) -> None:
     """It begins after time zero, and is at rest at both ends."""
     path = export([robot], "ros2", tmp_path)
@@ -211,9 +207,7 @@ def test_a_controller_can_take_the_trajectory_of_a_bag(
     np.testing.assert_allclose(since, 1.0 + robot.time, atol=1e-9)
 
 
-def test_a_usd_has_the_rate_that_is_asked_for(
-    odd_hand: GraspMotion, tmp_path: pathlib.Path
-) -> None:
+def test_a_usd_has_the_rate_that_is_asked_for(odd_hand: Episode, tmp_path: pathlib.Path) -> None:
     slower = at_rate(odd_hand, 24.0)
     assert len(slower.time) == int((T - 1) * 24 / 100) + 1
     formats.export_motions([slower], "usd", tmp_path / "m.usda")
@@ -229,7 +223,7 @@ def test_a_usd_has_the_rate_that_is_asked_for(
 
 
 def test_quaternions_that_are_no_rotations_are_refused(
-    human: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, tmp_path: pathlib.Path
 ) -> None:
     wrong = dataclasses.replace(human, object_quaternion=np.zeros_like(human.object_quaternion))
     with pytest.raises(
@@ -251,7 +245,7 @@ def test_a_file_that_fails_midway_leaves_nothing_behind(human, tmp_path, monkeyp
 
 
 def test_a_glb_is_y_up_for_others_and_names_its_units(
-    human: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, tmp_path: pathlib.Path
 ) -> None:
     path = export([human], "glb", tmp_path)
     content = path.read_bytes()
@@ -275,7 +269,7 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(
     assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0] * 4
 
 
-def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_trimesh_finds_the_first_frame_of_a_glb(human: Episode, tmp_path: pathlib.Path) -> None:
     path = export([human], "glb", tmp_path)
     scene = trimesh.load_scene(path, process=False)
     for i, name in enumerate(human.link_names):
@@ -295,7 +289,7 @@ def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pa
     np.testing.assert_allclose(shape.visual.uv, flat.uv, atol=1e-6)
 
 
-def expected_surface(motion: GraspMotion, t: int) -> np.ndarray:
+def expected_surface(motion: Episode, t: int) -> np.ndarray:
     """(V, 3) where the hand's surface is at a frame."""
     turns = Rotation.from_quat(motion.link_quaternion[t], scalar_first=True)
     return skin_of(get_hand(motion.hand)).posed(motion.link_position[t], turns.as_matrix())[0]
@@ -357,7 +351,7 @@ def test_pixars_library_moves_the_skin_of_a_usd(which, request, tmp_path):
 
 
 def test_glb_and_usd_have_the_colours_of_the_object(
-    human: GraspMotion, odd_hand: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, odd_hand: Episode, tmp_path: pathlib.Path
 ) -> None:
     corners = odd_hand.object_vertices
     red = np.where(corners[:, 2:] > corners[:, 2].mean(), (255, 0, 0), (0, 0, 255)).astype(np.uint8)
@@ -390,7 +384,7 @@ def test_glb_and_usd_have_the_colours_of_the_object(
 
 
 def test_colours_of_a_hand_are_linear_in_glb_and_usd(
-    human: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, tmp_path: pathlib.Path
 ) -> None:
     flesh = np.array(COLOURS["flesh"]) ** 2.2
     file = pygltflib.GLTF2().load(str(export([human], "glb", tmp_path)))
@@ -404,7 +398,7 @@ def test_colours_of_a_hand_are_linear_in_glb_and_usd(
     assert (np.abs(shown - flesh).max(1) < 1e-5).any()
 
 
-def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_bvh_has_the_skeleton_of_the_skin(human: Episode, tmp_path: pathlib.Path) -> None:
     path = export([human], "bvh", tmp_path)
     lines = [line.split() for line in path.read_text().splitlines()]
     offsets = {
@@ -426,9 +420,7 @@ def test_neighbouring_quaternions_do_not_jump() -> None:
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 
-def test_pixars_library_finds_the_shapes_in_a_usd(
-    human: GraspMotion, tmp_path: pathlib.Path
-) -> None:
+def test_pixars_library_finds_the_shapes_in_a_usd(human: Episode, tmp_path: pathlib.Path) -> None:
     path = export([human], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
     assert (
@@ -451,7 +443,7 @@ def test_pixars_library_finds_the_shapes_in_a_usd(
     )
 
 
-def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_dataset_of_several_motions(human: Episode, tmp_path: pathlib.Path) -> None:
     hand = get_hand("human")
     other = dataclasses.replace(
         posed(human, lambda q: mujoco_link_poses(hand, q), 9),
@@ -492,7 +484,7 @@ def test_a_dataset_of_several_motions(human: GraspMotion, tmp_path: pathlib.Path
 
 
 def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
-    human: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, tmp_path: pathlib.Path
 ) -> None:
     count, near = (
         2,
@@ -551,7 +543,7 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
 
 
 def test_lerobots_own_reader_gives_the_frame_of_each_row(
-    human: GraspMotion, tmp_path: pathlib.Path
+    human: Episode, tmp_path: pathlib.Path
 ) -> None:
     reader = pytest.importorskip(
         "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
@@ -577,11 +569,13 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    entries: list[Entry] = Converter()("congrasp/run/log/episode/actor/a0", episode(T), 10**15)
+    entries: list[Entry] = Converter()(
+        "congrasp/run/log/episode/actor/a0", episode_message(T), 10**15
+    )
     with_log = LogWriter(tmp_path / "logs", "log")
     with_log.write(*entries)
     with_log.close()
-    save_motion(tmp_path / "mug.npz", motion_of_episode(episode(T)))
+    save_motion(tmp_path / "mug.npz", episode(T).normalised())
     assert run("logs", "--to", "bvh") == 0
     assert run("mug.npz") == 0
     assert "cylinder-0.glb: 7 frames" in capsys.readouterr().out
@@ -616,7 +610,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         assert words in said
 
 
-def test_a_motions_file_has_no_other_number(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+def test_a_motions_file_has_no_other_number(human: Episode, tmp_path: pathlib.Path) -> None:
     path = tmp_path / "grasp.npz"
     save_motion(path, human)
     assert pick_motion(path, 0).object == pick_motion(path).object == human.object

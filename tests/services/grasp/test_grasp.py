@@ -17,6 +17,7 @@ from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import mirror
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -28,8 +29,6 @@ from congrasp.common.rotations import rotate
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.files import (
     MOTION,
@@ -124,7 +123,7 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
     found = grasper.grasp(
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
     )
-    arrays = {name: np.asarray(value) for name, value in found.episode.arrays.items()}
+    arrays = found.episode.to_message().arrays
     assert found.motion.hand == "human_left" and found.success
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
     np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
@@ -239,20 +238,31 @@ def fake_grasps(monkeypatch, quick_import):
 
     def motion(self, attempted, progress):
         obj = attempted
-        made = episode(success=obj.name != "loose")
-        made.meta.update(object=obj.name, phases={"grasp": 0.0, "hold": 0.04})
-        made.meta["metrics"] |= dict.fromkeys(
-            ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"),
-            0.01,
+        found = episode(success=obj.name != "loose")
+        errors = (
+            "heading_rad",
+            "heading_m",
+            "pose_rad",
+            "pose_m",
+            "trajectory_rad",
+            "trajectory_m",
         )
-        made.meta["metrics"] |= {
+        metrics = {
+            **found.metrics,
+            **dict.fromkeys(errors, 0.01),
             "affordance_ratio": 0.0,
             "moved_at_removal": 0.0,
             "force_link_max": 3.0,
+            "held": float(found.success),
+            "push_survival": float(obj.name == "a"),
         }
-        made.meta["metrics"]["held"] = float(made.meta["success"])
-        made.meta["metrics"]["push_survival"] = float(made.meta["object"] == "a")
-        return Grasp(made, motion_of_episode(made), 4, 3, 0, ("The heading guides the wrist.",))
+        made = dataclasses.replace(
+            found,
+            object=obj.name,
+            metrics=metrics,
+            about={**found.about, "phases": {"grasp": 0.0, "hold": 0.04}},
+        )
+        return Grasp(made, 4, 3, 0, ("The heading guides the wrist.",))
 
     def attempt(self, obj, request, progress):
         calls.append(obj.name)
@@ -292,7 +302,7 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["objects"], summary["succeeded"]) == (3, 2)
     assert load_motion(out / "a" / MOTION).object == "a"
-    assert next(read_episodes(out / "a" / RECORDING)).meta["object"] == "a"
+    assert next(read_episodes(out / "a" / RECORDING)).object == "a"
     assert sorted(path.name for path in (out / "a").iterdir()) == [RECORDING, MOTION, RESULT]
 
     (folder / "bad.obj").unlink()

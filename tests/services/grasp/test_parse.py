@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.export.episode_motion import motion_of_episode
-from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
 from tests.services.conftest import quick_imports
@@ -137,7 +136,7 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
 
 
 def test_references_come_from_motions_json_and_csv(block, tmp_path):
-    motion = motion_of_episode(episode())
+    motion = episode().normalised()
     save_motion(tmp_path / "grasp.npz", motion)
     given = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
     pose = given.constraints["pose"]

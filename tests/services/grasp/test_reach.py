@@ -15,7 +15,6 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.objects import procedural
 from congrasp.common.rotations import rotate
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.export.episode_motion import motion_of_episode
 from congrasp.services.grasp.files import steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose
 from congrasp.services.grasp.reach import (
@@ -28,7 +27,6 @@ from congrasp.services.grasp.reach import (
     with_reach,
 )
 from congrasp.services.grasp.reference_files import grasp_part
-from congrasp.services.viz.render import grasp_steps
 from tests.episodes import CONTROL_DT, episode
 
 DT = 0.01
@@ -136,36 +134,36 @@ def test_an_unreachable_grasp_is_an_error(ball) -> None:
 
 def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     made = episode()
-    made.meta["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
+    made.about["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
     hand = get_hand("human")
-    first = Rotation.from_quat(made.arrays["link_quaternion"][0, 0], scalar_first=True)
+    first = Rotation.from_quat(made.wrist_quaternion[0], scalar_first=True)
     turns = Rotation.concatenate(
         [first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)]
     )
-    place = made.arrays["link_position"][0, 0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
+    place = made.wrist_position[0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
     longer = with_reach(made, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
-    assert longer.meta["phases"] == {
+    assert longer.phases == {
         "approach": 0.0,
         "grasp": pytest.approx(0.03),
         "hold": pytest.approx(0.11),
     }
-    motion = motion_of_episode(longer)
+    motion = longer.normalised()
     assert len(motion.time) == 15 and motion.table[:11].all() and not motion.table[11:].any()
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
-    np.testing.assert_allclose(motion.link_position[3:], made.arrays["link_position"])
+    np.testing.assert_allclose(motion.link_position[3:], made.link_position)
     assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[
         :3
     ].any()
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
-    u = longer.arrays["u"]
+    u = longer.require_recorded().wrist_joints
     for t in range(3):
         own = first * Rotation.from_euler("XYZ", u[t, 3:])
         assert (own.inv() * turns[t]).magnitude() < 1e-5
         np.testing.assert_allclose(
-            first.apply(u[t, :3]) + made.arrays["link_position"][0, 0], place[t], atol=1e-6
+            first.apply(u[t, :3]) + made.wrist_position[0], place[t], atol=1e-6
         )
     # Used as a reference, such a motion is cut to its grasp.
-    assert grasp_part(motion) == (3, 10) and grasp_steps(longer) == (3, 11)
+    assert grasp_part(motion) == (3, 10) and longer.grasp_span == (3, 11)
     lifted = dataclasses.replace(
         motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}}
     )
@@ -179,8 +177,8 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     ):
         first, end = grasp_part(dataclasses.replace(motion, about={"phases": odd}))
         assert 0 <= first <= end < len(motion.time)
-        longer.meta["phases"] = odd
-        assert 0 <= grasp_steps(longer)[0] <= grasp_steps(longer)[1] <= len(motion.time)
+        begin, end = dataclasses.replace(longer, about={"phases": odd}).grasp_span
+        assert 0 <= begin <= end <= len(motion.time)
     drawn = steps_to_draw(100, 150, 400)
     assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
 

@@ -16,9 +16,10 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
+from congrasp.services.record.budget import LogBudget
+from congrasp.services.record.converter import Converter
 from congrasp.services.record.live import LiveServer
-from congrasp.services.record.recorder import Converter, LogBudget
-from tests.episodes import episode
+from tests.episodes import episode_message
 from tests.waits import Clock
 
 KEYS = Keys("r")
@@ -117,7 +118,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     """Nothing but a CongraspError of one short line, no file is opened (a pipe would wait for
     ever), nothing hangs.
     """
-    convert, whole = Converter(), episode()
+    convert, whole = Converter(), episode_message()
     messages = {
         "metrics": metrics(loss=1.0),
         "event": Message({}, {"time": 1.0, "level": "info", "text": "x"}),
@@ -149,7 +150,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     ],
 )
 def test_episodes_that_are_none_are_refused(change, why):
-    whole = episode()
+    whole = episode_message()
     with pytest.raises(CongraspError, match=why):
         Converter()(
             KEYS.log("episode", "actor", "a"),
@@ -159,7 +160,7 @@ def test_episodes_that_are_none_are_refused(change, why):
 
 
 def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
-    convert, whole = Converter(), episode()
+    convert, whole = Converter(), episode_message()
     long = Message(whole.arrays, {**whole.meta, "control_dt": 1.0})  # 12 s
     for _ in range(6):
         assert convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
@@ -173,8 +174,8 @@ def test_a_live_view_bounds_what_waits(monkeypatch):
     convert = Converter()
     with LiveServer(0) as server:
         # To be sent in a hundred years
-        entries = convert(KEYS.log("episode", "actor", "1.b"), episode(), 2**62)
+        entries = convert(KEYS.log("episode", "actor", "1.b"), episode_message(), 2**62)
         for _ in range(200):
             for entry in entries:
                 server.write(entry)
-        assert server._held <= 1 << 20 and sum(server.left_out.values()) > 0
+        assert server.queued_bytes <= 1 << 20 and sum(server.left_out.values()) > 0

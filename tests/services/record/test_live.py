@@ -20,7 +20,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.live import LiveServer
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import JsonChannels
-from tests.episodes import CONTROL_DT, episode
+from tests.episodes import CONTROL_DT, episode_message
 
 MESSAGE_DATA = 1  # operation code of a binary frame with a message
 
@@ -98,7 +98,7 @@ def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.
             len(seen.frames["/episode/a0/tf"]) < 6
         ):  # an episode of 1.5 s may be over before the viewer subscribes
             seen.frames["/episode/a0/tf"].clear()
-            transport.publish(keys.log("episode", "actor", "a0"), episode(150))
+            transport.publish(keys.log("episode", "actor", "a0"), episode_message(150))
             seen.listen(3.0)
         seen.wait_for("/episode/a0/scene", 1)
     assert recorder.error == "" and recorder.files[0].suffix == ".mcap"
@@ -116,7 +116,7 @@ def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathl
     with LiveServer(0) as server, Recorder(transport, "r", None, sinks=[server]):
         channel = JsonChannels()
         server.write(channel.entry("/late", time.time_ns() + 3600 * 10**9, {"a": 1}))
-        transport.publish(keys.log("episode", "actor", "a0"), episode(3))
+        transport.publish(keys.log("episode", "actor", "a0"), episode_message(3))
         with viewer(server) as first:
             one = Viewer(first)
             one.wait_for("/episode/a0/scene", 1)
@@ -223,7 +223,7 @@ def test_viewer_of_another_address_is_admitted_when_full() -> None:
 
 def test_viewer_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits for it is limited, and another viewer misses nothing."""
-    monkeypatch.setattr("congrasp.services.record.live._UNREAD_SECONDS", 1.0)
+    monkeypatch.setattr("congrasp.services.record.live_gate._UNREAD_S", 1.0)
     entries = 48
     text = "x" * (1 << 20)
     channels = JsonChannels()

@@ -12,10 +12,10 @@ from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.record import recorder
+from congrasp.services.record import metric_writers
 from congrasp.services.record.reader import read_metrics
-from congrasp.services.record.recorder import recorded
-from tests.episodes import episode
+from congrasp.services.record.run_recording import recorded
+from tests.episodes import episode_message
 
 
 def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
@@ -34,7 +34,7 @@ def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequen
         transport.publish(
             keys.log("metrics", "actor", "a"), Message({}, {"time": 0.0, "values": {"pace": 1.0}})
         )
-        transport.publish(keys.log("episode", "actor", "a"), episode(3))
+        transport.publish(keys.log("episode", "actor", "a"), episode_message(3))
     assert running.error == ""
 
 
@@ -92,7 +92,7 @@ def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, mon
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(recorder._TensorBoard, "write", refuse)
+    monkeypatch.setattr(metric_writers.TensorBoard, "write", refuse)
     publish(tmp_path, ["tensorboard"], range(4))
     assert len(read_metrics(tmp_path / "logs")["learner/0/kl"][0]) == 4
     assert capsys.readouterr().err.count("tensorboard receives no more metrics") == 1

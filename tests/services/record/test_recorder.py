@@ -29,7 +29,7 @@ from congrasp.services.record.reader import (
 )
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import Entry, LogWriter
-from tests.episodes import episode
+from tests.episodes import episode_message
 from tests.recordings import is_complete
 from tests.services.record.test_files import doctor
 from tests.waits import eventually
@@ -68,7 +68,7 @@ def test_everything_a_run_publishes_is_in_the_file(
             Message({}, {"version": 7, "hash": "ab", "list": [1]}),
         )
         transport.publish(KEYS.log("rollout", "actor", "a0"), rollout)
-        sent = Message(episode().arrays, {**episode().meta, "metrics": absent})
+        sent = Message(episode_message().arrays, {**episode_message().meta, "metrics": absent})
         transport.publish(KEYS.log("episode", "actor", "a0"), sent)
         transport.publish(KEYS.rollout("a"), rollout)  # no log
     assert (recorder.messages, recorder.damaged, recorder.dropped, recorder.error) == (8, 0, 0, "")
@@ -93,8 +93,8 @@ def test_everything_a_run_publishes_is_in_the_file(
     assert json.loads(topics["/version/learner/0"][0]) == {"version": 7, "hash": "ab"}
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0, 1, 2])
     (kept,) = read_episodes(tmp_path)
-    np.testing.assert_array_equal(kept.arrays["link_position"], episode().arrays["link_position"])
-    assert kept.meta["metrics"] == {"return": 1.0}
+    np.testing.assert_array_equal(kept.link_position, episode_message().arrays["link_position"])
+    assert kept.metrics == {"return": 1.0}
     (read,) = read_rollouts(tmp_path)
     assert dict(read.meta) == dict(rollout.meta) and set(read.arrays) == set(rollout.arrays)
     for name, array in rollout.arrays.items():
@@ -105,7 +105,9 @@ def test_damaged_messages_are_left_out_and_counted(
     transport: MemoryTransport, tmp_path: pathlib.Path
 ) -> None:
     said: list[str] = []
-    broken = Message({**episode().arrays, "link_position": np.zeros(3)}, episode().meta)
+    broken = Message(
+        {**episode_message().arrays, "link_position": np.zeros(3)}, episode_message().meta
+    )
     with Recorder(transport, "r", tmp_path, warn=said.append) as recorder:
         transport.publish(METRICS, Message({}, {}))
         transport.publish(METRICS, Message({}, {"values": {"kl": "high"}}))
@@ -219,7 +221,7 @@ def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path):
         recorder_process(endpoint, tmp_path / "out") as process,
     ):
         publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
-        transport.publish(KEYS.log("episode", "actor", "a0"), episode())
+        transport.publish(KEYS.log("episode", "actor", "a0"), episode_message())
         eventually(lambda: bool(list(read_episodes(tmp_path / "out"))))
         process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=10)

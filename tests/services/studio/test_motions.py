@@ -1,5 +1,6 @@
 """Motions as the page shows and saves them: lanes, pictures, videos, and why nothing held."""
 
+import dataclasses
 import io
 import subprocess
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import get_constraint
@@ -24,12 +26,13 @@ TOLERANCES = {
 }
 
 
-def with_error(made: Message, **values: float | np.ndarray) -> Message:
+def with_error(made: Episode, **values: float | np.ndarray) -> Message:
     """The episode with other errors in all steps."""
-    own = {
-        f"error/{name}": np.broadcast_to(np.float32(value), STEPS) for name, value in values.items()
-    }
-    return Message({**made.arrays, **own}, made.meta)
+    recorded = made.require_recorded()
+    errors = dict(recorded.errors)
+    for name, value in values.items():
+        errors[name] = np.broadcast_to(np.float32(value), STEPS)
+    return dataclasses.replace(made, recorded=dataclasses.replace(recorded, errors=errors))
 
 
 def test_every_active_constraint_has_a_lane_and_no_other() -> None:
@@ -40,7 +43,10 @@ def test_every_active_constraint_has_a_lane_and_no_other() -> None:
         "pose",
         "trajectory",
     }
-    assert set(lanes(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)))) == {"contact", "heading"}
+    assert set(lanes(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)))) == {
+        "contact",
+        "heading",
+    }
 
 
 def test_the_fake_grasp_meets_its_constraints() -> None:
@@ -63,10 +69,8 @@ def test_the_fake_grasp_meets_its_constraints() -> None:
 
 def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
     made = episode(STEPS, removal=REMOVAL)
-    stays = {**made.arrays, "table": np.ones(STEPS, bool)}
-    lifted = lanes(
-        Message(stays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}})
-    )
+    about = {**made.about, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}
+    lifted = lanes(dataclasses.replace(made, table=np.ones(STEPS, bool), about=about))
     assert lifted["contact"].counts.tolist() == [False] * 20 + [True] * (STEPS - 20)
     assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
 
@@ -86,7 +90,7 @@ def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> N
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
     made = episode(STEPS, removal=REMOVAL)
     assert lanes(made)["affordance"].met.all()
-    touching = np.linalg.norm(made.arrays["contact_force"], axis=-1).max(-1) > 0.05
+    touching = np.linalg.norm(made.link_force, axis=-1).max(-1) > 0.05
     lane = lanes(with_error(made, affordance_ratio=np.where(touching, 0.2, 0.0)))["affordance"]
     np.testing.assert_array_equal(lane.met, ~touching)
     assert lane.errors["share"][-1] == pytest.approx(0.2)
@@ -100,7 +104,9 @@ def test_only_the_fingers_of_a_pose_count_under_a_wrist_path() -> None:
 
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
-    lane = lanes(Message({**made.arrays, "active/fingers": np.bool_(True)}, made.meta))["fingers"]
+    message = made.to_message()
+    arrays = {**message.arrays, "active/fingers": np.bool_(True)}
+    lane = lanes(Episode.from_message(Message(arrays, message.meta)))["fingers"]
     assert (
         not lane.met.any()
         and lane.legend == "share of touching links of other fingers: 0 % at most"
@@ -125,10 +131,11 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
 
 def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> None:
     made = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
-    found = lanes(older(made))
+    recorded = Episode.from_message(older(made.to_message()))
+    found = lanes(recorded)
     assert set(found) == {"contact"}
     np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
-    page, now = for_page(older(made)), for_page(made)
+    page, now = for_page(recorded), for_page(made)
     kinds = ("arrow/", "polyline/", "ghost/", "paint/")
     drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
     assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
@@ -226,8 +233,8 @@ FLAGS = np.ones(4, bool)
 )
 def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without, says) -> None:
     made = episode(12, removal=8, success=False)
-    metrics = {**made.meta["metrics"], "held": 0.0, "diverged": 0.0, "moved_at_removal": 0.2}
-    failed = type(made)(made.arrays, {**made.meta, "metrics": metrics})
+    metrics = {**made.metrics, "held": 0.0, "diverged": 0.0, "moved_at_removal": 0.2}
+    failed = dataclasses.replace(made, metrics=metrics)
     request = GraspRequest(
         {"heading": {}, **{name: {} for name in asked}}, FLAGS if "affordance" in asked else None
     )

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
-from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
@@ -427,7 +427,7 @@ def test_a_grasp_from_request_to_files(
     motion = load_motion(tmp_path / "m.npz")
     np.testing.assert_array_equal(motion.link_position, played.arrays["link_position"])
     (episode,) = read_episodes(tmp_path / "m.mcap")
-    np.testing.assert_array_equal(episode.arrays["link_position"], played.arrays["link_position"])
+    np.testing.assert_array_equal(episode.link_position, played.arrays["link_position"])
     assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
 
 

@@ -44,7 +44,7 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
         0.0,
     )
     assert row["object"] == "thing-4" and row["alive"]
-    assert window.episode("a004").meta["object"] == "thing-4"
+    assert window.episode("a004").object == "thing-4"
     assert view["constraints"]["pose"] == 0.5 and view["counters"]["granted"] == 3
     with pytest.raises(CongraspError, match="a999"):
         window.episode("a999")
@@ -65,7 +65,7 @@ def test_an_actors_newer_episode_replaces_the_older_one() -> None:
     window = fake.window(actors=2)
     newer = fake.actor_episode(77)
     window.take(KEYS.log("episode", "actor", "a001"), newer, time.time())
-    assert window.episode("a001") is newer
+    assert window.episode("a001").object == newer.meta["object"]
     assert [row["episodes"] for row in window.view()["actors"]] == [1, 2]
 
 
@@ -166,7 +166,7 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(
     reach, rows = recordings.around(when, 5.0)
     assert reach == 5.0
     assert [row["actor"] for row in rows] == ["a002", "a003"]
-    assert recordings.episode(rows[1]["id"]).meta["object"] == "thing-3"
+    assert recordings.episode(rows[1]["id"]).object == "thing-3"
     # The same of a file whose writer was killed: it has no index.
     file = next(tmp_path.glob("*.mcap"))
     cut = tmp_path / f"{file.name}.part"
@@ -234,7 +234,7 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     window = TrainingWindow("fake", Recordings(tmp_path))
     window.load()
     assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
-    assert window.episode("a004").meta["object"] == "thing-4"
+    assert window.episode("a004").object == "thing-4"
     curve = window._curves["episode/success"]
     assert curve.values[DIP] == 0.1 and curve.times[DIP] == BEGIN + 10 * DIP
     # A run that is over is shown whole: its last state, and no learner is missed.

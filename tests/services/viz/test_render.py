@@ -16,8 +16,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import encode
+from congrasp.services.appearance.palette import FLESH
 from congrasp.services.cli.main import load
-from congrasp.services.record.palette import FLESH
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
 from congrasp.services.viz.camera import Camera, fit
@@ -51,7 +51,7 @@ from congrasp.services.viz.views import (
     views,
 )
 from tests.children import python
-from tests.episodes import CONTROL_DT, episode
+from tests.episodes import CONTROL_DT, episode, episode_message
 
 WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
@@ -254,7 +254,7 @@ def test_a_following_camera_keeps_hand_and_object_in_view() -> None:
 def test_a_following_camera_shows_the_object_a_third_wide_if_the_hand_fits() -> None:
     """The cylinder is 6 cm wide: the hand needs more room, so that it is smaller than a third."""
     long = episode(80)
-    long.arrays["visual_vertices"] = long.arrays["visual_vertices"] * [8.0, 8.0, 1.0]
+    long = dataclasses.replace(long, object_vertices=long.object_vertices * [8.0, 8.0, 1.0])
     camera = following_cameras(long, range(0, 80, 4), 16 / 9, View(30.0, 20.0))[0]
     across = projected(camera, object_points(long, 0))[:, 0] / (16 / 9)
     assert np.ptp(across) / 2 == pytest.approx(1 / 3, rel=0.15)
@@ -280,7 +280,7 @@ def test_links_in_contact_and_the_avoid_region_are_coloured() -> None:
         thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01
     )
     assert body.paint is not None
-    minus = episode().arrays["surface_avoid"]
+    minus = episode().surface_avoid
     np.testing.assert_array_equal(
         body.paint.values, np.where(minus[:, None], (204, 41, 41), (51, 166, 82))
     )
@@ -311,10 +311,7 @@ def test_the_reference_pose_is_transparent() -> None:
 def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
     camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
-        assert (
-            np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max()
-            < 1
-        )
+        assert np.abs(projected(camera, episode().link_position[step].astype(float))).max() < 1
     near, far = (camera_of(episode(), [11], overlays=overlays) for overlays in (False, True))
     # Its path
     assert np.linalg.norm(far.position - far.target) > 1.1 * np.linalg.norm(
@@ -322,9 +319,11 @@ def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
     )
     frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
     fallen = episode()
-    fallen.arrays["object_position"][-1, 2] -= 5.0
+    fallen.object_position[-1, 2] -= 5.0
     np.testing.assert_allclose(
-        camera_of(fallen, [0, 11]).target[2], camera_of(episode(), [0, 11]).target[2], atol=0.1
+        camera_of(fallen, [0, 11]).target[2],
+        camera_of(episode(), [0, 11]).target[2],
+        atol=0.1,
     )
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
     picture = grasp_picture(episode(), 11, (96, 54))
@@ -335,8 +334,9 @@ def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
 def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> None:
     best, aside = views(episode(), [11])
     assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
-    hand, arrays = get_hand("human"), episode().arrays
-    capsules = capsule_shapes(hand, arrays["link_position"][11], arrays["link_quaternion"][11])
+    made = episode()
+    hand = get_hand("human")
+    capsules = capsule_shapes(hand, made.link_position[11], made.link_quaternion[11])
     shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
     tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # in contact
 
@@ -403,13 +403,13 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
     writer = LogWriter(tmp_path / "run", "log")
     channel = opaque_channel("/episode/a0/raw", "congrasp.Episode")
     for steps, success in ((4, True), (5, False), (6, False)):
-        writer.write(Entry(channel, steps, encode(episode(steps, removal=3, success=success))))
+        writer.write(
+            Entry(channel, steps, encode(episode_message(steps, removal=3, success=success)))
+        )
     writer.close()
-    lengths = [
-        len(pick_episode(tmp_path / "run", i).arrays["table"]) for i in (0, 1, 2, -1, -2, -3)
-    ]
+    lengths = [pick_episode(tmp_path / "run", i).steps for i in (0, 1, 2, -1, -2, -3)]
     assert lengths == [4, 5, 6, 6, 5, 4]
-    assert len(pick_episode(tmp_path / "run", -1, success=True).arrays["table"]) == 4
+    assert pick_episode(tmp_path / "run", -1, success=True).steps == 4
     for index, success in ((3, False), (-4, False), (1, True)):
         with pytest.raises(
             CongraspError, match=r"holds \d .*none with index .*Choose from -\d to "
@@ -438,7 +438,10 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (6, 6 * 2 * CONTROL_DT)
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
-    bare, marked = episode_shapes(episode(), 11, overlays=False), episode_shapes(episode(), 11)
+    bare, marked = (
+        episode_shapes(episode(), 11, overlays=False),
+        episode_shapes(episode(), 11),
+    )
     assert len(bare) == 3 and len(marked) > 3
 
 

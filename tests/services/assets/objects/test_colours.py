@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from PIL import Image
 
-from congrasp.actors.episode import _geometry
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
@@ -104,13 +103,15 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
     ):
         np.testing.assert_array_equal(ours, theirs)
 
-    shown = episode()
-    shown.arrays.update(_geometry(obj))
+    shown = dataclasses.replace(
+        episode(),
+        object_vertices=obj.visual_vertices,
+        object_faces=obj.visual_faces,
+        colours=obj.colours,
+    )
     picture = render_scene(
         [object_at(shown, 0, painted=False)],
-        Camera(
-            shown.arrays["object_position"][0] + [0, -0.5, 0.0], shown.arrays["object_position"][0]
-        ),
+        Camera(shown.object_position[0] + [0, -0.5, 0.0], shown.object_position[0]),
         (60, 60),
     )
     left, right = picture[30, 25].astype(int), picture[30, 35].astype(int)

@@ -1,0 +1,116 @@
+"""The surface of a hand as rigid parts of its links, which a recording sends once."""
+
+import contextlib
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands.flesh import skeleton_of
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
+from congrasp.common.hands.spec import Hand
+from congrasp.services.appearance.palette import MATERIALS as COLOURS
+from congrasp.services.appearance.palette import Colour
+
+_OVERLAP = 0.4
+"""Weight of a link on a vertex from which the triangle belongs to the link."""
+_MOST_FACES = 12_000
+"""Triangles of a hand; meshes of links may have more."""
+_LEAST_FACES = 4
+"""Triangles of a part."""
+_GRID_M = 2.0**-14
+"""Resolution of coordinates: few digits compress well."""
+_POINTS = 2048
+"""Points on a hand."""
+
+
+class Part(NamedTuple):
+    """A rigid part of a link in one colour, in the link's frame, m."""
+
+    colour: Colour
+    points: np.ndarray
+    """(V, 3), within 0.05 mm."""
+    faces: np.ndarray
+    """(E, 3) int, with outward normals."""
+
+
+@functools.lru_cache(maxsize=16)
+def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
+    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is
+    sent once.
+
+    A human hand's skin deforms, but its points at every step would make a recording many times as
+    large. A triangle of skin therefore belongs to every link with a noticeable weight on it, so
+    that the parts of two links overlap at a bent joint.
+    """
+    skin = _skin(hand)
+    weights = skin.weights[skin.faces]
+    strongest = np.eye(len(hand.links), dtype=bool)[weights.sum(1).argmax(-1)]
+    members = strongest | (weights.max(1) >= _OVERLAP)
+    share = min(1.0, _MOST_FACES / len(skin.faces))
+    material_of_face = skin.material[skin.faces[:, 0]]
+    parts_of_links = []
+    for is_member, origin in zip(members.T, skin.origins, strict=True):
+        parts = []
+        for number, name in enumerate(MATERIALS):
+            faces = skin.faces[is_member & (material_of_face == number)]
+            if len(faces):
+                points, light_faces = _light(skin.points[faces] - origin, share)
+                parts.append(Part(COLOURS[name], points, light_faces))
+        parts_of_links.append(tuple(parts))
+    return tuple(parts_of_links)
+
+
+@functools.lru_cache(maxsize=16)
+def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Points (n, 3) on the parts of each link, in its frame, and their colours (n, 3), for viewers
+    without meshes.
+    """
+    parts_of_links = surface_parts(hand)
+    area = 0.0
+    for parts in parts_of_links:
+        for part in parts:
+            area += _mesh(part).area
+    return tuple(_sampled(parts, area) for parts in parts_of_links)
+
+
+def _sampled(parts: tuple[Part, ...], area: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) on parts of a hand with an area, m^2, and their colours (n, 3)."""
+    points = [np.zeros((0, 3))]
+    colours = [np.zeros((0, 3))]
+    for part in parts:
+        mesh = _mesh(part)
+        count = round(_POINTS * mesh.area / area)
+        points.append(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+        colours.append(np.tile(part.colour, (count, 1)))
+    return np.concatenate(points), np.concatenate(colours)
+
+
+def _skin(hand: Hand) -> Skin:
+    """Surface of the hand; made of its capsules if custom meshes cannot be read."""
+    with contextlib.suppress(CongraspError):
+        return skin_of(hand)
+    return skin_on(skeleton_of(hand))
+
+
+def _light(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate
+    points.
+    """
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), faces)
+    if share < 1.0:
+        count = max(_LEAST_FACES, int(share * len(mesh.faces)))
+        mesh = mesh.simplify_quadric_decimation(face_count=count)
+    points, index = np.unique(np.round(mesh.vertices / _GRID_M), axis=0, return_inverse=True)
+    light_faces = index.reshape(-1)[mesh.faces]
+    a, b, c = light_faces.T
+    has_area = (a != b) & (b != c) & (c != a)
+    return points * _GRID_M, light_faces[has_area]
+
+
+def _mesh(part: Part) -> trimesh.Trimesh:
+    """Returns a part as a trimesh mesh."""
+    return trimesh.Trimesh(part.points, part.faces, process=False)
