@@ -5,11 +5,7 @@
   on the right and bound on the left) needs the tuple and passes.
 * A comprehension inside a comprehension, and a comprehension with more than one `for`.
 
-Files that are not opened yet are listed in `.ci/packed_files.txt`. The list may only get shorter: a
-listed file without a packed statement is an error, too.
-
-    python3 .ci/plain_code.py            # check
-    python3 .ci/plain_code.py --update   # remove the files that are plain now from the list
+    python3 .ci/plain_code.py
 """
 
 import ast
@@ -19,7 +15,6 @@ from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).parent.parent
 PACKAGES = ("common", "actors", "learner", "services")
-PACKED_FILES = pathlib.Path(__file__).with_name("packed_files.txt")
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
@@ -59,27 +54,13 @@ def packed_statements(path: pathlib.Path) -> Iterator[tuple[int, str]]:
 
 
 def main() -> int:
-    """Prints the packed statements; returns 1 if there are any outside the listed files."""
-    listed = set(PACKED_FILES.read_text().split())
-    packed: set[str] = set()
+    """Prints the packed statements; returns 1 if there are any."""
     failed = False
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            name = str(path.relative_to(ROOT))
-            statements = list(packed_statements(path))
-            if statements:
-                packed.add(name)
-            if name in listed:
-                continue
-            for line, description in statements:
+            for line, description in packed_statements(path):
                 failed = True
-                print(f"{name}:{line}: {description}")
-    if "--update" in sys.argv:
-        PACKED_FILES.write_text("".join(f"{name}\n" for name in sorted(listed & packed)))
-        return 0
-    for name in sorted(listed - packed):
-        failed = True
-        print(f"{name} is plain now: remove it from {PACKED_FILES.name} (or pass --update)")
+                print(f"{path.relative_to(ROOT)}:{line}: {description}")
     return int(failed)
 
 
