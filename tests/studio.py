@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import pathlib
 import time
 from collections.abc import Callable
@@ -21,6 +22,8 @@ from congrasp.services.record.episode_entries import raw_entry, scene_entries
 from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.studio.catalogue import Catalogue
 from congrasp.services.studio.grasping import Progress
+from congrasp.services.studio.recordings import Recordings
+from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode, episode_message
@@ -178,3 +181,23 @@ class FakeImporter:
 def session(grasping: FakePolicy | None = None, **more: Any) -> Session:
     made = grasping or FakePolicy()
     return Session({"of the run": lambda: made}, objects(), FakeImporter(), **more)
+
+
+class Site:
+    """A studio with its server, session and fake policy."""
+
+    def __init__(self, folder: pathlib.Path):
+        when = BEGIN + 10 * DIP
+        record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
+        self.grasping = FakePolicy()
+        self.window: TrainingWindow = window(100)
+        self.window.recordings = Recordings(folder)
+        self.session: Session = session(self.grasping, window=self.window)
+        self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
+
+    @property
+    def studio(self) -> dict[str, Any]:
+        return self.session.state()["studio"]
+
+    def do(self, action: str, **values: Any) -> None:
+        self.session.routes.posts["/api/do"]({}, json.dumps({"action": action, **values}).encode())

@@ -1,5 +1,6 @@
 // The studio's panel: the request, the resolved constraints, and the motions.
 
+import { replaceChildren } from "./focus.js";
 import { outcomeOf } from "./player.js";
 import { ask, download, post, upload } from "./wire.js";
 
@@ -200,11 +201,12 @@ export class StudioPanel {
     const shown = JSON.stringify(rows);
     if (shown === this.rows) return;
     this.rows = shown;
-    $("constraints").replaceChildren(...rows.map(({ name, title, tool, flags }) => {
+    replaceChildren($("constraints"), ...rows.map(({ name, title, tool, flags }) => {
       const part = Object.assign(document.createElement("div"), { className: "constraint" });
       const box = (text, checked, change) => {
         const input = Object.assign(document.createElement("input"), { type: "checkbox", checked });
         input.addEventListener("change", () => change(input));
+        input.dataset.focus = `${name}: ${text}`;
         const label = document.createElement("label");
         label.append(input, ` ${text}`);
         part.append(label);
@@ -215,7 +217,8 @@ export class StudioPanel {
       asked.disabled = tool === "arrow";
       if (tool && tool !== "paint") {
         const button = Object.assign(document.createElement("button"), { textContent: "Suggest" });
-        button.dataset.suggest = name;
+        button.dataset.suggest = button.dataset.focus = name;
+        button.setAttribute("aria-label", `Suggest ${title}`);
         button.addEventListener("click", () => this.act("suggest", { constraint: name }));
         part.append(button);
       }
@@ -265,11 +268,13 @@ export class StudioPanel {
 
   #motions(motions) {
     $("kept").hidden = !motions.length;
-    $("motions").replaceChildren(...motions.map((motion) => {
+    replaceChildren($("motions"), ...motions.map((motion) => {
       const item = document.createElement("li");
       item.dataset.motion = motion.id;
       const button = (text, title, act, className) => {
         const made = Object.assign(document.createElement("button"), { textContent: text, title, className });
+        made.dataset.focus = `${motion.id} ${text}`;
+        if (text !== name) made.setAttribute("aria-label", `${text === "×" ? "Delete" : text} motion ${motion.id}`);
         made.addEventListener("click", act);
         item.append(made);
       };

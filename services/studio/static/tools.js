@@ -1,5 +1,6 @@
-// Tools of the mouse in the scene: look around, place the arrow, paint, draw a path.
+// Tools of mouse, touch and keyboard in the scene: look around, place the arrow, paint, draw a path.
 
+import { CROSSHAIR, SceneKeys } from "./keyboard.js";
 import { ARROW } from "./scene.js";
 import { Plane, Ray, Vector3 } from "./vendor/three.module.min.js";
 
@@ -8,12 +9,13 @@ const INWARD = 0.02; // m from the surface to the heading's target
 const STEP = 0.004; // m between two points of a drawn path
 
 const HINTS = {
-  look: "Drag to turn, right button to move, wheel to zoom. The arrow's ends can be dragged.",
+  look: "Drag or arrow keys turn, right button or Ctrl with arrow keys move, wheel or + and − zoom. The arrow's ends can be dragged.",
   arrow: "Click the place to grasp. Drag the arrow's tip over the object, or its tail to turn it.",
   avoid: "Brush over what the hand must not touch.",
   graspable: "Brush over what the hand may grasp.",
   path: "Draw the wrist's path with one stroke, from far away to the object.",
 };
+const KEYS = " Keys: arrows move a crosshair, Enter presses and releases it.";
 
 export class Tools {
   // `app` has: canvas, camera, state (or null while a motion plays), body, redraw(), act(action, values).
@@ -27,10 +29,10 @@ export class Tools {
     this.over = null; // {point, normal} of the object's surface under a brush
     this.fingers = new Map(); // positions on the canvas by pointer
     const { canvas } = app;
-    canvas.addEventListener("pointerdown", (event) => this.#down(event));
-    canvas.addEventListener("pointermove", (event) => this.#move(event));
-    canvas.addEventListener("pointerup", (event) => this.#up(event));
-    canvas.addEventListener("pointercancel", (event) => this.#up(event));
+    canvas.addEventListener("pointerdown", (event) => this.down(event));
+    canvas.addEventListener("pointermove", (event) => this.move(event));
+    canvas.addEventListener("pointerup", (event) => this.up(event));
+    canvas.addEventListener("pointercancel", (event) => this.up(event));
     canvas.addEventListener("pointerleave", () => this.#hover(null));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
@@ -45,14 +47,16 @@ export class Tools {
       radius.nextElementSibling.textContent = `${radius.value} mm`;
       this.#hover(this.over);
     });
+    this.keys = new SceneKeys(app, this, document.getElementById("crosshair"));
     this.choose("look");
   }
 
   choose(tool) {
+    this.keys.hide();
     this.tool = tool;
     for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
     document.getElementById("brush").hidden = tool !== "avoid" && tool !== "graspable";
-    document.getElementById("hint").textContent = HINTS[tool];
+    document.getElementById("hint").textContent = tool === "look" ? HINTS.look : HINTS[tool] + KEYS;
     this.app.canvas.style.cursor = tool === "look" ? "grab" : "crosshair";
     if (!this.painting) this.#hover(null);
   }
@@ -124,10 +128,10 @@ export class Tools {
     return "";
   }
 
-  #down(event) {
+  down(event) {
     const { app } = this;
     app.canvas.focus({ preventScroll: true });
-    app.canvas.setPointerCapture(event.pointerId);
+    if (event.pointerId !== CROSSHAIR) app.canvas.setPointerCapture(event.pointerId);
     this.last = [event.clientX, event.clientY];
     this.fingers.set(event.pointerId, this.last);
     if (this.fingers.size > 1) {
@@ -156,7 +160,7 @@ export class Tools {
     } else this.doing = "orbit";
   }
 
-  #move(event) {
+  move(event) {
     const { app } = this;
     if (this.painting && event.pointerType === "mouse") this.#hover(this.doing === "orbit" || this.doing === "pan" ? null : this.#hit(event));
     if (!event.buttons) {
@@ -197,13 +201,28 @@ export class Tools {
     app.redraw();
   }
 
+  // Drops the stroke that a pointer has begun.
+  cancel() {
+    this.#drop();
+    this.doing = "";
+    this.fingers.clear();
+  }
+
+  // Place of the arrow's tip on the canvas in pixels from its top left.
+  tip() {
+    const { app } = this;
+    const { clientWidth, clientHeight } = app.canvas;
+    const place = app.camera.locate(app.body.localToWorld(this.ends(this.shown()).tip.clone())) ?? [0.5, 0.5];
+    return [place[0] * clientWidth, place[1] * clientHeight];
+  }
+
   // A second finger cancels what the first one began.
   #drop() {
     this.stroke = this.arrow = null;
     if (this.doing === "paint") this.app.repaint();
   }
 
-  #up(event) {
+  up(event) {
     const { app } = this;
     this.fingers.delete(event.pointerId);
     if (this.doing === "paint") app.act("paint", { points: this.stroke.map((point) => point.toArray()), radius: this.radius, avoid: this.tool === "avoid" });

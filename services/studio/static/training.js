@@ -1,12 +1,13 @@
 // The training window: state, curves and actors of a run, and its episodes around a time.
 
+import { replaceChildren } from "./focus.js";
 import { colour as styled, onTheme } from "./theme.js";
 import { ask } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
 const EVERY = 1000; // ms
 const ALL = "*";
-const COLOURS = ["#2f6fdb", "#e08a2c", "#1f9d88", "#0e8fb3", "#7a4cc2", "#5b8c2a"];
+const COLOURS = ["--curve-1", "--curve-2", "--curve-3", "--curve-4", "--curve-5", "--curve-6"];
 
 const ENDED = ["finished", "recorded"]; // phases without further data
 const PHASES = { training: "training", finished: "finished", recorded: "recorded", disconnected: "disconnected" };
@@ -144,11 +145,16 @@ export class TrainingPanel {
     const wanted = $("filter").value.trim().toLowerCase();
     const shown = actors.filter((actor) => actor.id.toLowerCase().includes(wanted));
     const head = row(["actor", "version", "lag", "rollouts", "steps/s", "episodes", "success", "object"], "th");
-    $("actors").replaceChildren(head, ...shown.map((actor) => {
+    replaceChildren($("actors"), head, ...shown.map((actor) => {
       const success = actor.success === undefined ? "" : `${Math.round(100 * actor.success)} %`;
-      const line = row([actor.id, short(actor.version), short(actor.lag), short(actor.rollouts), short(actor.steps_per_second), String(actor.episodes), success, actor.object ?? ""]);
+      const watch = Object.assign(document.createElement("button"), { textContent: actor.id, className: "plain" });
+      watch.dataset.focus = actor.id;
+      watch.setAttribute("aria-pressed", String(actor.id === this.watched));
+      watch.setAttribute("aria-label", `Watch ${actor.id}`);
+      const line = row(["", short(actor.version), short(actor.lag), short(actor.rollouts), short(actor.steps_per_second), String(actor.episodes), success, actor.object ?? ""]);
+      line.firstChild.append(watch);
       line.dataset.actor = actor.id;
-      line.setAttribute("aria-selected", String(actor.id === this.watched));
+      line.toggleAttribute("data-watched", actor.id === this.watched);
       if (!actor.alive) line.className = "quiet";
       return line;
     }));
@@ -183,14 +189,17 @@ export class TrainingPanel {
   #figure(name) {
     const figure = document.createElement("figure");
     figure.dataset.curve = name;
-    figure.innerHTML = "<figcaption><span></span><button title='hide'>×</button></figcaption><span class='quiet'></span><canvas></canvas>";
+    figure.innerHTML = "<figcaption><span></span><button title='hide'>×</button></figcaption><span class='quiet'></span><canvas tabindex='0' role='slider'></canvas>";
     figure.querySelector("span").textContent = this.view.names[name].title;
     figure.querySelector("span").title = name;
     figure.querySelector("button").addEventListener("click", () => {
       this.chosen = Object.keys(this.view.curves).filter((other) => other !== name);
       this.look();
     });
+    figure.querySelector("button").setAttribute("aria-label", `Hide ${this.view.names[name].title}`);
     const canvas = figure.querySelector("canvas");
+    canvas.setAttribute("aria-label", this.view.names[name].title);
+    canvas.addEventListener("keydown", (event) => this.#curveKey(figure, event));
     canvas.addEventListener("mousemove", (event) => this.#point(figure, event));
     canvas.addEventListener("mouseleave", () => {
       figure.near = null;
@@ -201,6 +210,21 @@ export class TrainingPanel {
       if (figure.near !== null) this.#episodesAround(name, figure.near);
     });
     return figure;
+  }
+
+  // Arrow keys, Home and End choose a point of the curve; Enter lists the episodes around it.
+  #curveKey(figure, event) {
+    const name = figure.dataset.curve;
+    const last = this.view.curves[name].steps.length - 1;
+    const near = Math.min(figure.near ?? last, last);
+    const places = { ArrowLeft: near - 1, ArrowRight: near + 1, ArrowDown: near - 1, ArrowUp: near + 1, Home: 0, End: last };
+    if (event.key === "Enter" && last >= 0) this.#episodesAround(name, near);
+    else if (event.key in places) {
+      figure.near = Math.min(last, Math.max(0, places[event.key]));
+      this.#draw(figure, this.view.curves[name]);
+    } else return;
+    event.preventDefault();
+    event.stopPropagation();
   }
 
   // The point of the curve that is nearest to the mouse.
@@ -244,7 +268,7 @@ export class TrainingPanel {
     g.textAlign = "right";
     g.fillText(short(steps[steps.length - 1]), width - 2, height - 2);
     g.textAlign = "left";
-    g.strokeStyle = colour;
+    g.strokeStyle = styled(colour);
     g.lineWidth = 1.5;
     g.beginPath();
     values.forEach((_, i) => g.lineTo(x(i), y(i)));
@@ -253,7 +277,11 @@ export class TrainingPanel {
     const shown = near !== null && near < values.length ? near : values.length - 1;
     const value = `${short(values[shown])} ${this.view.names[figure.dataset.curve].unit}`;
     figure.querySelector(".quiet").textContent = near === null ? value : `update ${short(steps[shown])}: ${value}`;
-    g.fillStyle = colour;
+    canvas.setAttribute("aria-valuemin", steps[0]);
+    canvas.setAttribute("aria-valuemax", steps[steps.length - 1]);
+    canvas.setAttribute("aria-valuenow", steps[shown]);
+    canvas.setAttribute("aria-valuetext", `update ${short(steps[shown])}: ${value}`);
+    g.fillStyle = styled(colour);
     g.beginPath();
     g.arc(x(shown), y(shown), 3, 0, 7);
     g.fill();

@@ -13,6 +13,8 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from tests.browser import SIZE, chromium
+from tests.studio import Site
+from tests.waits import eventually
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "test-results"
@@ -57,6 +59,29 @@ def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -
         context.tracing.stop(path=RESULTS / f"{name}.zip")
     context.close()
     assert messages == getattr(opened, "expected", [])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    made = Site(tmp_path_factory.mktemp("recordings"))
+    yield made
+    made.server.close()
+    made.session.close()
+
+
+@pytest.fixture
+def opened(page: Any, site: Site) -> Any:
+    """The page with a fresh mug."""
+    if site.studio["object"]["name"] != "mug_1":
+        site.do("object", name="mug")
+        eventually(lambda: site.studio["object"]["name"] == "mug_1")
+    for constraint in ("affordance", "pose", "trajectory"):
+        site.do("ask", constraint=constraint, on=False)
+    site.do("fill", avoid=False)
+    site.do("set_rest_pose", rest=0)
+    page.goto(site.server.url)
+    page.wait_for_selector("body[data-first-picture]")
+    return page
 
 
 @pytest.hookimpl(wrapper=True)

@@ -3,7 +3,6 @@
 import json
 import pathlib
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,60 +13,14 @@ from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
-from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
 from tests.browser import drag, on_object, orange, picture
-from tests.studio import BEGIN, DIP
+from tests.studio import DIP, Site
 from tests.waits import eventually
 
 pytestmark = pytest.mark.timeout(240)
 REFERENCE = pathlib.Path(__file__).with_name("first_picture.png")
-
-
-class Site:
-    """A studio with its server, session and fake policy."""
-
-    def __init__(self, folder: pathlib.Path):
-        when = BEGIN + 10 * DIP
-        fake.record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
-        self.grasping = fake.FakePolicy()
-        self.window: TrainingWindow = fake.window(100)
-        self.window.recordings = Recordings(folder)
-        self.session: Session = fake.session(self.grasping, window=self.window)
-        self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
-
-    @property
-    def studio(self) -> dict[str, Any]:
-        return self.session.state()["studio"]
-
-    def do(self, action: str, **values: Any) -> None:
-        self.session.routes.posts["/api/do"]({}, json.dumps({"action": action, **values}).encode())
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    made = Site(tmp_path_factory.mktemp("recordings"))
-    yield made
-    made.server.close()
-    made.session.close()
-
-
-@pytest.fixture
-def opened(page: Any, site: Site) -> Any:
-    """The page with a fresh mug."""
-    if site.studio["object"]["name"] != "mug_1":
-        site.do("object", name="mug")
-        eventually(lambda: site.studio["object"]["name"] == "mug_1")
-    for constraint in ("affordance", "pose", "trajectory"):
-        site.do("ask", constraint=constraint, on=False)
-    site.do("fill", avoid=False)
-    site.do("set_rest_pose", rest=0)
-    page.goto(site.server.url)
-    page.wait_for_selector("body[data-first-picture]")
-    return page
 
 
 def red(image: np.ndarray) -> np.ndarray:
