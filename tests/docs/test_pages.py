@@ -6,14 +6,16 @@ import tomllib
 
 import pytest
 
+from congrasp.common.task.constraints import CONSTRAINTS
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     ROOT / "deploy" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-FREE = ("docs/notes/", "docs/reference/", "CHANGELOG.md")
-"""The lab notebook, reference pages and the list of changes may be long."""
+FREE = ("docs/notes/", "docs/reference/", "docs/glossary.md", "CHANGELOG.md")
+"""The lab notebook, reference pages, glossary and the list of changes may be long."""
 
 GENERATED = re.compile(r"<!-- results .*?<!-- end of results -->", re.S)
 CODE = re.compile(r"^```.*?^```", re.M | re.S)
@@ -126,3 +128,35 @@ def test_the_functions_that_the_architecture_lists_exist():
             )
             found += 1
     assert found >= 20
+
+
+def glossary():
+    """Text of each term."""
+    page = (ROOT / "docs" / "glossary.md").read_text()
+    return {
+        term.lower(): text.strip()
+        for term, text in re.findall(r"^### ([^\n]*)\n(.*?)(?=^### |\Z)", page, re.M | re.S)
+    }
+
+
+def test_glossary_has_the_terms_of_task_and_training():
+    terms = glossary()
+    assert list(terms) == sorted(terms)
+    assert {"actor", "bundle", "clean", "constraint set", "exam", "held", "learner"} <= terms.keys()
+    assert {"policy", "rollout", "staleness", "student", "success"} <= terms.keys()
+    for constraint in CONSTRAINTS:
+        assert constraint.title in terms
+
+
+@pytest.mark.parametrize(("term", "text"), glossary().items())
+def test_a_term_is_explained_in_few_sentences(term, text):
+    sentences = re.findall(r"[.:?](?:\s|$)", text)
+    assert text and len(sentences) <= 3, term
+
+
+def test_pages_link_to_the_glossary():
+    linked = set()
+    for page in PAGES:
+        linked.update(re.findall(r"\]\([^)\s]*glossary\.md#([\w-]+)\)", page.read_text()))
+    anchors = {slug(term) for term in glossary()}
+    assert linked and linked <= anchors

@@ -39,7 +39,13 @@ export class StudioPanel {
     this.gesture = Date.now(); // id of a drag of the roll's slider, which is one edit; it differs between pages
     $("roll").addEventListener("input", () => this.#roll($("roll").value, this.gesture));
     $("roll").addEventListener("change", () => (this.gesture = Date.now()));
-    $("roll-number").addEventListener("change", () => this.#roll($("roll-number").value));
+    const typed = $("roll-number");
+    typed.addEventListener("input", () => (this.typing = true)); // a newer state must not overwrite what is typed
+    typed.addEventListener("blur", () => (this.typing = false));
+    typed.addEventListener("change", () => {
+      this.typing = false;
+      this.#roll(typed.value);
+    });
     $("save").addEventListener("change", () => {
       this.#save($("save").value);
       $("save").value = "";
@@ -87,7 +93,7 @@ export class StudioPanel {
   #showRoll() {
     if (this.turning) return;
     $("roll").value = this.state.studio.roll_deg;
-    $("roll-number").value = this.state.studio.roll_deg;
+    if (!this.typing) $("roll-number").value = this.state.studio.roll_deg;
   }
 
   // Ctrl-Z undoes, Ctrl-Shift-Z and Ctrl-Y redo; text fields keep their own.
