@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.runtime.engines import ENGINES
 from congrasp.common.task.sensors import SENSORS
 from congrasp.common.transport.urls import SCHEMES
 from congrasp.services.cli import main
-from congrasp.services.export.motion_file import motion_of_episode, save_motion
 from tests import studio
 from tests.base_install import run_in_base_install, steady_server
 from tests.children import python
@@ -82,7 +82,7 @@ def is_run_here(block: Block) -> bool:
 
 
 def make_motion(folder: pathlib.Path) -> None:
-    save_motion(folder / "grasp.npz", motion_of_episode(episode(10, removal=6)))
+    save_motion(folder / "grasp.npz", episode(10, removal=6))
     studio.record(folder / "runs" / "mine", [(1_700_000_000.0, 1)])
 
 
@@ -112,7 +112,7 @@ from congrasp.common.transport.base import Transport
 import numpy as np
 from congrasp.common.policy import bundle
 from congrasp.common.policy.pretrained import policy_file
-from congrasp.services.export.policy import describe
+from congrasp.services.export.policy_description import describe
 fields = describe(bundle.load(policy_file(None, "human")))["observation"]
 observation = np.zeros((1, sum(field["size"] for field in fields)), np.float32)
 """,
@@ -187,7 +187,7 @@ def test_block_runs_where_its_module_is(block: Block, tmp_path: pathlib.Path) ->
     if importlib.util.find_spec(module) is None:
         pytest.skip(f"needs the module {module}")
     motion = tmp_path / "grasp.npz"
-    save_motion(motion, motion_of_episode(episode(10, removal=6)))
+    save_motion(motion, episode(10, removal=6))
     assert (
         main.run(
             ["export", "motion", str(motion), "--to", "glb", "--out", str(tmp_path / "mug.glb")]
