@@ -32,7 +32,7 @@ _COLOURS = 256  # of a film
 _PHASES = Phases(approach=0.7, lift=0.12)
 _HEAD = """# Gallery
 
-<!-- run by tests/docs/test_page_grasps.py -->
+<!-- not run: needs scans that do not ship; tests/docs/test_page_grasps.py repeats the grasps -->
 ```sh
 python -m tests.benchmarks gallery --scans object_sim    # these grasps, pictures and this page
 ```

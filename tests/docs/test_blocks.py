@@ -15,6 +15,7 @@ import os
 import pathlib
 import re
 import shlex
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,12 +122,13 @@ observation = np.zeros((1, sum(field["size"] for field in fields)), np.float32)
 
 
 @pytest.fixture
-def registries(monkeypatch: pytest.MonkeyPatch) -> None:
+def registries() -> Iterator[None]:
     """Registries to which blocks add rows have their own rows again after the test."""
-    for registry in (ENGINES, SENSORS, SCHEMES):
-        for key in ("newton", "tactile", "socket"):
-            if key not in registry:
-                monkeypatch.setitem(registry, key, None)
+    rows = [(registry, dict(registry)) for registry in (ENGINES, SENSORS, SCHEMES)]
+    yield
+    for registry, before in rows:
+        registry.clear()
+        registry.update(before)
 
 
 def run_commands(text: str) -> None:
@@ -188,12 +190,8 @@ def test_block_runs_where_its_module_is(block: Block, tmp_path: pathlib.Path) ->
         pytest.skip(f"needs the module {module}")
     motion = tmp_path / "grasp.npz"
     save_motion(motion, episode(10, removal=6))
-    assert (
-        main.run(
-            ["export", "motion", str(motion), "--to", "glb", "--out", str(tmp_path / "mug.glb")]
-        )
-        == 0
-    )
+    out = tmp_path / "mug.glb"
+    assert main.run(["export", "motion", str(motion), "--to", "glb", "--out", str(out)]) == 0
     script = tmp_path / "script.py"
     script.write_text(block.text)
     # The module may lie on a path of this process.
