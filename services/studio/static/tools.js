@@ -15,7 +15,7 @@ const HINTS = {
   graspable: "Brush over what the hand may grasp.",
   path: "Draw the wrist's path with one stroke, from far away to the object.",
 };
-const KEYS = " Keys: arrows move a crosshair, Enter presses and releases it.";
+const KEYS = " Or arrow keys with a crosshair, and Enter.";
 
 export class Tools {
   // `app` has: canvas, camera, state (or null while a motion plays), body, redraw(), act(action, values).
