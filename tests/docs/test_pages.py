@@ -135,7 +135,7 @@ def glossary():
     page = (ROOT / "docs" / "glossary.md").read_text()
     return {
         term.lower(): text.strip()
-        for term, text in re.findall(r"^### ([^\n]*)\n(.*?)(?=^### |\Z)", page, re.M | re.S)
+        for term, text in re.findall(r"^## ([^\n]*)\n(.*?)(?=^## |\Z)", page, re.M | re.S)
     }
 
 
