@@ -1,12 +1,15 @@
 """Dexterous grasps under constraints: the public Python interface.
 
+A motion for an object, which is a generated one ("mug:7") or a file ("mug.obj")::
+
     import congrasp
 
-    found = congrasp.grasp("mug:7", heading="above")                             # or "mug.obj": a
-    motion for an object congrasp.save_motion("mug.npz", found.motion)
+    grasp = congrasp.grasp("mug:7", heading="above")
+    congrasp.save_motion("mug.npz", grasp.motion)
 
-    with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or
-    congrasp.load_policy()
+Actions in a control loop, from a server or from `congrasp.load_policy()`::
+
+    with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:
         policy.reset(congrasp.GraspRequest(...))
         answer = policy.act(state)
 

@@ -272,13 +272,12 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
 
     Returns:
       The maxima `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes,
-      `hand_mesh_mm`, in mm.
-        `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over
-        the episode's steps. `finger_jerk`: root mean square over joints and steps, rad/s^3.
-        `link_force_peak` (N): that of the link with the highest force; `link_force`: the mean over
-        touching links (0 if none touches). `torque_share` and `torque_share_peak`: mean and peak
-        over motors and steps. `posture_rad`: mean deviation from natural postures over the steps
-        in which the hand touches the object (0 if it never does).
+      `hand_mesh_mm`, in mm. `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with
+      `_mean` and `_p95` over the episode's steps. `finger_jerk`: root mean square over joints and
+      steps, rad/s^3. `link_force_peak` (N): that of the link with the highest force; `link_force`:
+      the mean over touching links (0 if none touches). `torque_share` and `torque_share_peak`: mean
+      and peak over motors and steps. `posture_rad`: mean deviation from natural postures over the
+      steps in which the hand touches the object (0 if it never does).
     """
     wrist = np.asarray(samples.wrist_velocity, np.float32)
     fingers = np.asarray(samples.finger_velocity, np.float32)
