@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from congrasp.common.episode.episode import Episode
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
-from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.columns import RATE, tables_of
 from congrasp.services.evaluate.episodes import PROBED_EPISODES, Sample, joined
 from congrasp.services.evaluate.intervals import clustered, independent_episodes, wilson
@@ -18,6 +18,7 @@ from congrasp.services.evaluate.object_groups import object_groups
 from congrasp.services.evaluate.paper.figures import CENTER_GROUP, paper_row
 from congrasp.services.evaluate.pictures import cause
 from congrasp.services.evaluate.scores import TABLES, write_json
+from tests.episodes import episode
 from tests.rows import row as made_row
 from tests.rows import summarised
 
@@ -335,15 +336,19 @@ def test_clusters_that_end_alike_count_once():
 # --- causes of failures ---
 
 
-def episode(heights, **metrics) -> Message:
+def lost(heights, **metrics) -> Episode:
     """Two steps with the table, then one without for every further height."""
-    position = np.zeros((len(heights), 3))
+    count = len(heights)
+    position = np.zeros((count, 3), np.float32)
     position[:, 2] = heights
-    table = np.arange(len(heights)) < 2
     known = {"diverged": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
-    return Message(
-        {"object_position": position, "table": table},
-        {"metrics": known | metrics, "control_dt": 0.01},
+    return dataclasses.replace(
+        episode(count),
+        object_position=position,
+        table=np.arange(count) < 2,
+        metrics=known | metrics,
+        control_dt=0.01,
+        about={},
     )
 
 
@@ -358,12 +363,17 @@ def episode(heights, **metrics) -> Message:
     ],
 )
 def test_every_cause_has_its_label(metrics, said):
-    assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
+    assert cause(lost([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
 def test_what_slips_in_a_lift_is_measured_from_the_wrist():
-    made = episode([0.1] * 8)
-    wrist = np.array([0.2, 0.2, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3])[:, None, None] * [0.0, 0.0, 1.0]
-    arrays = {**made.arrays, "link_position": wrist, "table": np.ones(8, bool)}
-    lifted = Message(arrays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.02}})
+    made = lost([0.1] * 8)
+    links = np.zeros_like(made.link_position)
+    links[:, :, 2] = np.array([0.2, 0.2, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3])[:, None]
+    lifted = dataclasses.replace(
+        made,
+        link_position=links,
+        table=np.ones(8, bool),
+        about={"phases": {"grasp": 0.0, "lift": 0.02}},
+    )
     assert cause(lifted, 0.05) == "slipped 0.03 s after the lift began"
