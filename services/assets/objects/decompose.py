@@ -29,6 +29,10 @@ from congrasp.services.assets.objects.merging import DEPTH, GROWTH, merge
 
 CUT_DEPTH = 2 * DEPTH
 """Depth of a hollow in a piece from which it is cut, m, at first."""
+_WALL_COARSENESS = 1.5
+"""Depth for an open surface relative to a closed one's: it becomes a thin wall, which a finer cut
+would divide into hundreds of pieces.
+"""
 PROCESSOR_LIMIT = 300.0
 """Processor time of a decomposer, s, after which the import is an error; most take 1 to 15 s."""
 STARVED = 20.0
@@ -194,8 +198,7 @@ def _by_vhacd(vertices: np.ndarray, faces: np.ndarray, max_pieces: int) -> list[
 def _by_coacd(vertices: np.ndarray, faces: np.ndarray, cut: _Cut) -> list[np.ndarray]:
     """Vertices of the pieces of a mesh, cut by CoACD."""
     if not cut.volume:
-        # An open surface becomes a thin wall; a finer cut would divide it into hundreds of pieces.
-        return _body_by_coacd(vertices, faces, 1.5 * cut.depth, closed=False)
+        return _body_by_coacd(vertices, faces, _WALL_COARSENESS * cut.depth, closed=False)
     whole = manifold(vertices, faces)
     if whole is not None:
         vertices, faces = whole

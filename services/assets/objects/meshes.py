@@ -21,7 +21,8 @@ from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sources import Source
 
-_CACHE_VERSION = 15
+_CACHE_VERSION = 16
+"""A new one imports every object again: its pieces, mass or colours are made in another way."""
 _DRAWS_VERSION = 8
 """A new one changes the surface points of every object, and with them all measurements."""
 _PATIENCE_S = 600.0
