@@ -218,7 +218,7 @@ class Attempts:
 
     def renew(self, bundle: PolicyBundle) -> None:
         """Replaces the weights of the policy without recompilation."""
-        self._bundle.spec.require(bundle.spec, "that was to replace it")
+        self._bundle.spec.require(bundle.spec, "that should replace the current one")
         self._bundle = bundle
 
     def close(self) -> None:
@@ -236,7 +236,8 @@ class Attempts:
         physics = make_physics(self._physics, self._hand, self._task, [obj], threads=self._threads)
         if physics.compiled:
             raise CongraspError(
-                f"The '{physics.name}' engine is compiled for the shapes of certain objects.",
+                f"The engine '{physics.name}' is compiled for fixed objects, and cannot take new "
+                "ones.",
                 "Pass --physics native.",
             )
         return RolloutWorker(

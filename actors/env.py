@@ -112,7 +112,7 @@ class GraspEnv:
         return merged._replace(physics=physics, views=in_rows(scene.views, state.views))
 
     def _first_state(self, initial: InitialConditions) -> EnvState:
-        """State of episodes that begin, without their engine and their scene."""
+        """Initial state of episodes; `physics` and `views` are not set yet."""
         reset_state = initial.reset_state
         batch = reset_state.q.shape[0]
         zero = jnp.zeros(batch)

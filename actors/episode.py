@@ -95,7 +95,7 @@ def traced_episode(
             action=cut.action,
             rewards={name: cut.terms[:, i] for i, name in enumerate(terms(task))},
             errors={spec.name: cut.errors[:, i] for i, spec in enumerate(metrics.specs(task))},
-            pieces=_pieces(obj),
+            pieces=object_pieces(obj),
         ),
     )
 
@@ -110,12 +110,12 @@ def _frames(
     return rotations.compose_pose(wrist_position[:, None], turn, local_position, local_quaternion)
 
 
-def _pieces(obj: GraspObject) -> Pieces:
-    """Convex pieces of the object as arrays."""
+def object_pieces(obj: GraspObject) -> Pieces:
+    """Returns the convex pieces of the object as arrays, sizes as real numbers."""
     pieces = obj.pieces
     return Pieces(
         kind=np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32),
-        size=_plain([piece.size for piece in pieces]),
+        size=np.array([piece.size for piece in pieces], np.float64),
         pos=_plain([piece.pos for piece in pieces]),
         quat=_plain([piece.quat for piece in pieces]),
         part=np.array([piece.part for piece in pieces], np.int32),

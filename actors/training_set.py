@@ -78,9 +78,9 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
         unscaled, sets = load_for(folder, unscaled, objects.split)
         if not sets:
             raise CongraspError(
-                f"{objects.constraints} holds no constraint set ({objects.split}) of an object in "
-                f"{objects.folder}.",
-                "Pass folders that belong together.",
+                f"{objects.constraints} contains no constraint set ({objects.split}) of an object "
+                f"in {objects.folder}.",
+                "Pass the folders of the same import.",
             )
         if sets[0].meta["hand"] != hand.name:
             raise CongraspError(

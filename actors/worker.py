@@ -146,8 +146,9 @@ class RolloutWorker:
         return jax.tree.map(lambda array: _on_device(np.zeros(array.shape, array.dtype)), form)
 
     def _staggered_hold(self, hold: Array, key: Array) -> Array:
-        """Control steps (B,) without the table of first episodes; of a staggered worker they end
-        early at different times.
+        """Hold lengths (B,) of the first episodes, in control steps without the table.
+
+        A staggered worker shortens them at random, so that not all episodes end at the same time.
         """
         if not self._staggered:
             return hold
@@ -165,9 +166,7 @@ class RolloutWorker:
             self._place(self.programs.begin(conditions, None))
 
     def _place(self, state: EnvState) -> None:
-        """Starts the engine's environments, of an engine that is not compiled, at the beginning of
-        these episodes.
-        """
+        """Resets an engine outside of JAX programs to the start of these episodes."""
         earlier = self.state
         if earlier is None:
             self.physics.start(state.reset_state)

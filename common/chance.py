@@ -38,17 +38,19 @@ def uniforms(key: Array, numbers: Mapping[str, int], batch: int) -> dict[str, Ar
 
 
 def normal(uniform: Array) -> Array:
-    """Standard normal numbers of uniform ones in [0, 1), of the same shape."""
+    """Standard normal numbers, from uniform numbers in [0, 1) of the same shape."""
     return jax.scipy.special.ndtri(jnp.maximum(uniform, _LEAST))
 
 
 def index(uniform: Array, count: Array | int) -> Array:
-    """Indices below `count` (int), each as likely, of uniform numbers in [0, 1)."""
+    """Uniform integers in [0, count), from uniform numbers in [0, 1) of the same shape."""
     return jnp.minimum((uniform * count).astype(jnp.int32), jnp.asarray(count, jnp.int32) - 1)
 
 
 def weighted(uniform: Array, weights: Array) -> Array:
-    """Indices (B,) int of weights (N,), as likely as these, of uniform numbers (B,)."""
+    """Samples indices (B,) int with probabilities proportional to weights (N,), from uniform
+    numbers (B,) in [0, 1).
+    """
     total = jnp.cumsum(jnp.asarray(weights))
     chosen = jnp.searchsorted(total, total[-1] * uniform, side="right")
     # Rounding may reach the upper bound
@@ -56,8 +58,8 @@ def weighted(uniform: Array, weights: Array) -> Array:
 
 
 def among(uniform: Array, allowed: Array) -> Array:
-    """Indices (B,) int of true flags (B, N), each as likely, of uniform numbers (B,); 0 where no
-    flag is true.
+    """Samples a uniformly random index (B,) int of a true flag in each row of flags (B, N), from
+    uniform numbers (B,) in [0, 1); 0 for a row without a true flag.
     """
     rank = jnp.cumsum(allowed, -1)
     return jnp.argmax(rank > index(uniform, rank[:, -1])[:, None], -1)

@@ -33,41 +33,42 @@ class ObjectsConfig:
     """Objects of a run."""
 
     families: tuple[str, ...] = ()
-    """Families of the procedural generator, or groups of them (basic, household, all); empty:
-    basic.
+    """Families of the procedural generator, or groups of families (basic, household, all); basic if
+    empty.
     """
     count: int = 64
-    """Procedural objects in one actor's pool."""
+    """Number of procedural objects of each actor."""
     seed: int = 0
-    """First seed; actors shift it so that each has different objects. Evaluation uses seeds from
-    one million upward.
+    """Seed of the first procedural object. Each actor adds an offset, so that actors have different
+    objects. Evaluation uses seeds from one million upward.
     """
     folder: str = ""
-    """A folder of imported objects to use instead of procedural ones."""
+    """Folder of imported objects to use instead of procedural objects."""
     constraints: str = ""
-    """A folder of constraint sets for that folder's objects, such as captured ones ('congrasp
-    constraints import'): training draws headings, reference poses and trajectories from them.
-    Objects without a set are left out."""
+    """Folder of constraint sets for the objects of --objects.folder, such as captured ones
+    ('congrasp constraints import'). Training samples headings, reference poses and trajectories
+    from them. Objects without a set are left out."""
     split: Split = "training"
-    """Split of these sets: training, held-out, or all."""
+    """Part of the constraint sets: training, held-out, or all."""
     procedural: int = 0
-    """Procedural objects in addition to those of the folder."""
+    """Number of procedural objects in addition to those of the folder."""
     folder_share: float = 0.0
-    """Share of the episodes with an object of the folder, if there are procedural ones as well; 0:
-    all objects are equally likely."""
+    """Share of the episodes with an object of the folder, if there are also procedural objects.
+    With 0 all objects are equally likely."""
     renew_every: int = 0
-    """Rollouts after which an actor's procedural objects are replaced by those of the next seeds
-    and its episodes restart; 0 keeps them. Generating them takes as long as at the start."""
+    """Number of rollouts after which an actor replaces its procedural objects by those of the next
+    seeds and restarts its episodes; 0 keeps the objects. The replacement takes as long as the
+    generation at the start."""
     by_failure: bool = False
-    """Draws objects whose success is less certain than that of others up to twice as often, and
-    those whose success or failure is more certain down to half as often, by the actor's episodes
-    (the folder's share shifts with them)."""
+    """Samples objects by the success of the actor's episodes: objects with an uncertain outcome up
+    to twice as often, and objects that almost always succeed or almost always fail down to half as
+    often. This also changes the share of the folder's objects."""
 
     def __post_init__(self) -> None:
         """Raises a CongraspError for constraint sets without objects."""
         if self.constraints and not self.folder:
             raise CongraspError(
-                "Constraint sets need their objects.", "Pass --objects.folder FOLDER."
+                "Constraint sets need their objects.", "Pass the objects with --objects.folder."
             )
 
 
@@ -76,18 +77,19 @@ class NetworkConfig:
     """Sizes of the networks of the policy and the critic (they share no weights)."""
 
     hidden: tuple[int, ...] = (512, 256, 128)
-    """Units of the trunk's layers."""
+    """Numbers of units in the layers of the main network."""
     encoder: int = 64
-    """Units of each optional constraint's encoder."""
+    """Number of units in the encoder of each optional constraint."""
     points: tuple[int, ...] = (64, 128)
-    """Units of the layers through which each point of a camera's cloud passes before the maximum
+    """Numbers of units in the layers that encode each point of a camera's cloud, before the maximum
     over the points.
     """
     initial_std: float = 0.6
-    """Initial standard deviation of the action, in units of action."""
+    """Initial standard deviation of the action, in units of the action."""
     privileged_critic: bool = True
-    """Gives the critic what the policy does not observe: the episode's true parameters, such as the
-    object's mass, and the true state if the policy has sensors (`common.task.privileged`)."""
+    """Gives the critic inputs that the policy does not observe: the true parameters of the episode,
+    such as the object's mass, and the true state if the policy has sensors
+    (`common.task.privileged`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,19 +105,19 @@ class PPOConfig:
     importance_max: float = 4.0
     """Truncation of pi_proximal/pi_behaviour."""
     decoupled: bool = True
-    """Clips around the policy at the start of the update; otherwise around the behaviour policy, as
-    plain PPO does.
+    """Clips around the policy at the start of the update; if false, around the behaviour policy, as
+    in standard PPO.
     """
     gamma: float = 0.98
     """Discount."""
     gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
     bootstrap_truncated: bool = True
-    """Bootstraps from the critic if the time limit ends an episode with a held object; otherwise
-    from zero.
+    """Bootstraps from the critic if the time limit ends an episode while the object is held; if
+    false, from zero.
     """
     learning_rate: float = 5e-4
-    """Initial learning rate of Adam; a tenth of it with an initial policy."""
+    """Initial learning rate of Adam. A run with --initial starts with a tenth of it."""
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
     """Bounds of the adaptive learning rate."""
     kl_target: float = 0.012
@@ -123,15 +125,16 @@ class PPOConfig:
     half of it.
     """
     settling: float = 0.0
-    """Share of the run's updates, at its end, over which `kl_target` falls linearly to a tenth and
-    the action's standard deviation to `final_std`, so that the policy converges; 0 keeps both."""
+    """Share of the run's updates, at the end of the run, that let the policy converge: `kl_target`
+    falls linearly to a tenth, and the standard deviation of the action falls to `final_std`. 0
+    changes neither."""
     final_std: float = 0.1
-    """Standard deviation of the action at the end of `settling`, in units of action. With n updates
-    left, it is capped at std (final_std / std)^(1/n): a geometric decay. Smaller deviations are
-    kept; 0 sets no cap."""
+    """Standard deviation of the action at the end of `settling`, in units of the action. With n
+    updates left, it is capped at std (final_std / std)^(1/n), a geometric decay. A smaller standard
+    deviation is not changed; 0 sets no cap."""
     least_std: float = 0.0
-    """Smallest standard deviation of the action before `settling`, in units of action: each update
-    raises smaller ones to it. 0 sets no floor."""
+    """Smallest standard deviation of the action before `settling`, in units of the action. Each
+    update raises a smaller standard deviation to this value; 0 sets no minimum."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -157,7 +160,7 @@ class PPOConfig:
         return 1.0 - 1.0 / max(updates - version, 1)
 
     def least_std_at(self, version: int, updates: int) -> float:
-        """Returns the floor of the action's standard deviation in the update of this version; 0
+        """Returns the minimum of the action's standard deviation in the update of this version; 0
         during `settling`.
         """
         settles = bool(self.settling) and self._settled(version, updates) >= 0.0
@@ -179,7 +182,7 @@ class DistillConfig:
     """Distillation of a policy into another (`learner.algorithms.distill`)."""
 
     teacher: str = ""
-    """The teacher policy: its file, or the hand of a pretrained one."""
+    """The teacher: a policy file, or the hand of a pretrained policy."""
     epochs: int = 2
     """Passes over the batch."""
     minibatches: int = 16
@@ -192,15 +195,15 @@ class DistillConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CurriculumConfig:
-    """The paper's two phases: stationary objects first, then free ones with larger constraint
-    weights.
+    """The paper's two phases: first fixed objects, then movable objects with larger weights of the
+    constraints.
     """
 
     stationary_updates: int = 0
-    """Updates during which objects are fixed and the table stays."""
+    """Number of updates during which objects are fixed and the table stays."""
     ramp: tuple[int, int] = (0, 0)
-    """First and last update of the ramp from the task's weights to `reward`; no ramp if they are
-    equal.
+    """First and last update of a linear change of the reward weights, from `task.reward` to
+    `curriculum.reward`. If both are equal, the weights do not change.
     """
     reward: RewardWeights = RewardWeights()
     """Weights of the reward terms at the end of the ramp."""
@@ -248,40 +251,42 @@ class RunConfig:
     """One training run."""
 
     name: str = "run"
-    """Name of the run; it is part of every key on the wire."""
+    """Name of the run, which is a part of every message's key."""
     seed: int = 0
     """Seed of networks, minibatches and environments."""
     environments: int = 64
-    """Environments of one actor."""
+    """Number of environments of each actor."""
     rollout_steps: int = 75
-    """Control steps in one rollout message."""
+    """Number of control steps of each environment in a rollout."""
     rollouts_per_update: int = 2
-    """Rollouts consumed by one update (the batch), of each learner rank."""
+    """Number of rollouts in the batch of an update, for each learner rank."""
     max_staleness: int = 1
-    """eta: greatest number of versions between an accepted rollout and the update that uses it."""
+    """Largest lag (eta) of a rollout: the number of versions between the policy that made it and
+    the policy that is updated with it."""
     updates: int = 1000
-    """Updates after which the run ends."""
+    """Number of updates of the run."""
     physics: PhysicsName = "auto"
     """Physics engine of the actors."""
     half_observations: bool = True
-    """Sends observations (and acts on them) as float16."""
+    """Rounds observations to float16, for the policy's actions and for the messages."""
     checkpoint_every: int = 25
-    """Updates between two checkpoints."""
+    """Number of updates between two checkpoints."""
     write_ahead: bool = True
-    """Writes rollouts to disk before acknowledging them, until a checkpoint holds their outcome: a
-    resumed run continues with them whatever was killed. If false, a killed learner loses what it
-    had accepted since the checkpoint."""
+    """Writes every rollout to disk before it is acknowledged, and keeps it until a checkpoint
+    contains the update that used it. A resumed run then uses these rollouts, whichever process was
+    killed. If false, a killed learner loses the rollouts since the last checkpoint."""
     collapse_patience: int = 60
-    """Consecutive updates without contact, or with less than half of the best success, that end the
-    run; 0: never.
+    """Number of consecutive updates with hardly any contact, or with less than half of the best
+    success, after which the run stops; 0 switches this off.
     """
     episode_every: int = 10
-    """Rollouts of an actor between two episodes published for logs. It is a minimum, since an
-    episode may extend over several rollouts."""
+    """Smallest number of an actor's rollouts between two episodes that are published for logs. It
+    may be more, because an episode may extend over several rollouts."""
     log_rollout_every: int = 20
-    """Rollouts of an actor between two published for logs; 1 publishes all of them, 0 none."""
+    """Number of an actor's rollouts between two that are published for logs; 1 publishes all of
+    them, 0 none."""
     log_rollout_worlds: int = 4
-    """Environments of a rollout published for logs; 0 publishes all of them."""
+    """Number of environments of a rollout that are published for logs; 0 publishes all of them."""
     task: TaskConfig = TaskConfig()
     """The task."""
     curriculum: CurriculumConfig = CurriculumConfig()
@@ -325,13 +330,16 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
     except (dacite.DaciteError, TypeError, OverflowError) as error:  # such as null for a number
-        raise CongraspError(f"The configuration does not match this version: {error}.") from None
+        raise CongraspError(
+            f"The configuration does not match this version of congrasp: {error}.",
+            "Use the version that wrote it, or start a new run.",
+        ) from None
     file_name(config.name, "a run")
     return config
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"it holds {name}")
+    raise ValueError(f"it contains {name}")
 
 
 def digest(config: Any) -> str:

@@ -171,7 +171,7 @@ def mano_file() -> pathlib.Path:
 def _files(kind: str, path: pathlib.Path) -> list[pathlib.Path]:
     """The file, or those of a folder that belong to its kind, by their names."""
     if not path.exists():
-        raise CongraspError(f"There is no {path}.")
+        raise CongraspError(f"There is no file or folder {path}.")
     if not path.is_dir():
         return [path]
     suffix = SET_SUFFIX if kind == CONSTRAINTS else OBJECT_SUFFIX

@@ -57,7 +57,7 @@ class GraspRequest:
         if not isinstance(self.constraints, Mapping):
             raise RefusedError(
                 "The constraints must be a dict of dicts.",
-                "Pass {'heading': {'direction': …}}, say.",
+                "Pass, for example, {'heading': {'direction': …}}.",
             )
         for name, fields in self.constraints.items():
             if not isinstance(fields, Mapping):

@@ -1,14 +1,14 @@
 """A ROS 2 node between a policy server and a robot; without ROS 2 the same messages go over Zenoh.
 
     congrasp serve --policy allegro-student
-    python examples/ros2_node.py mug:7 --hand allegro --dry-run                       # where there
-    is rclpy python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      #
-    zenoh-bridge-ros2dds, or a robot
+    python examples/ros2_node.py mug:7 --hand allegro --dry-run    # with rclpy
+    # with zenoh-bridge-ros2dds, or a robot that uses Zenoh:
+    python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447
 
 | topic | type | what |
 |---|---|---|
 | in: `joint_states` | sensor_msgs/JointState | the finger joints, by name, any order |
-| in: `wrist_pose` | geometry_msgs/PoseStamped | what carries the hand; its palm without `--mount` |
+| in: `wrist_pose` | geometry_msgs/PoseStamped | pose of the palm, or of the flange with `--mount` |
 | in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file |
 | in: `--cloud-topic` | sensor_msgs/PointCloud2 | instead of `object_pose`, for a policy with a
 camera |
@@ -18,13 +18,14 @@ table at z = 0 |
 of day otherwise |
 | out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`)
 |
-| out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in
-`--world` |
+| out: `wrist_command` | geometry_msgs/PoseStamped | target pose of the palm, or of the flange with
+`--mount`, in `--world` |
 
-The episode begins where the hand is when all have come: before the object, open. Commands keep to
-the limits that the server names. While a topic is silent, or the policy, the hand holds; then it
-freezes, or opens if nothing was lifted, until the node is started again. It is for hands with a
-motor for each joint.
+The episode begins at the hand's current pose when all inputs have arrived. The hand must then be
+open and in front of the object. Commands keep to the limits in the server's metadata. While a topic
+or the policy is silent, the hand holds its last targets. If the silence lasts, it freezes, or opens
+if the object was not lifted, until the node is restarted. The node supports hands with a motor for
+each joint.
 """
 
 import contextlib

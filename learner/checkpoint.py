@@ -174,7 +174,7 @@ def read_checkpoint(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, An
         data = file.read()
     message = decode(data, max_bytes=len(data))
     if message.meta.get("version") != _update(path):
-        raise CongraspError("Its header has another update than the file's name.")
+        raise CongraspError("The update in its header is not that in its file name.")
     try:
         meta = json.loads(message.arrays[_META].tobytes())
     except (KeyError, ValueError):

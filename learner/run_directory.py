@@ -89,7 +89,8 @@ def create_run(
     check_spelling(run_dir)
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
-            f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it."
+            f"{run_dir} already contains a run.",
+            "Pass another --run-dir, or --resume to resume the run.",
         )
     if remains := _remains(run_dir):
         raise CongraspError(
@@ -375,7 +376,7 @@ def _check_initial(run_dir: pathlib.Path, before: RunConfig, initial: pathlib.Pa
     for each in records:
         named_inputs.check_input(each, initial, remedy)
     if not records and not (run_dir / INITIAL_FILE).exists():
-        raise CongraspError(f"{run_dir} did not begin with the policy {initial}.", remedy)
+        raise CongraspError(f"{run_dir} did not start from the policy {initial}.", remedy)
 
 
 def _kept_checksum(run_dir: pathlib.Path) -> str:

@@ -76,8 +76,8 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
     assert lines[0].startswith("congrasp.load_policy needs the package '")
     assert lines[0].endswith("'. Run: pip install 'congrasp[train]'")
     assert lines[1:] == [
-        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop starts "
-        "from measured poses.",
+        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. Pass the measured "
+        "values to GraspRequest.",
         "follow (16,) True",
     ]
 
@@ -111,7 +111,7 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     ("options", "fault"),
     [
         ({"policy": "none.safetensors"}, "none.safetensors cannot be read"),
-        ({"attempts": 0}, "There are 0 attempts"),
+        ({"attempts": 0}, "attempts is 0"),
         ({"seed": -1}, "The seed is -1"),
     ],
 )

@@ -58,7 +58,7 @@ class MovedArm:
     joint_position: Annotated[
         np.ndarray, "(T, N) rad, or m of slides, in the order of arm_joint_names"
     ]
-    joint_slides: Annotated[np.ndarray, "(N,) bool, whether a joint is a slide"]
+    joint_slides: Annotated[np.ndarray, "(N,) bool, True for prismatic joints"]
     joint_link: Annotated[
         np.ndarray, "(N,) the link that a joint moves; joints of one link act in this order"
     ]

@@ -121,9 +121,9 @@ class Episode:
     about: dict[str, Any]
     """Origin: version of the policy, file of the object, command; `phases`, see the property."""
     time: Annotated[np.ndarray, "(T,) s"]
-    table: Annotated[np.ndarray, "(T,) bool, whether the table stands"]
+    table: Annotated[np.ndarray, "(T,) bool, True while the table is present"]
     joint_position: Annotated[np.ndarray, "(T, F) rad, finger joints in the order of joint_names"]
-    joint_target: Annotated[np.ndarray, "(T, F) rad, what the joints' position servos aimed at"]
+    joint_target: Annotated[np.ndarray, "(T, F) rad, targets of the joint position servos"]
     link_position: Annotated[
         np.ndarray, "(T, L, 3) m, world, origins of the links in the order of link_names"
     ]

@@ -72,8 +72,8 @@ def known_hand(reference: object) -> Hand:
 def _unknown(reference: object) -> CongraspError:
     """Error for a hand that a message cannot name."""
     return CongraspError(
-        f"{ascii(reference)[:60]} is not a hand that a message can name.",
-        f"It is one of: {', '.join(sorted(HANDS))}.",
+        f"{ascii(reference)[:60]} is not a built-in hand, and messages may name only those.",
+        f"Choose from: {', '.join(sorted(HANDS))}.",
     )
 
 
@@ -106,5 +106,5 @@ def get_hand(reference: str) -> Hand:
         raise CongraspError(what, f"Pass the file that 'congrasp hands import {reference}' writes.")
     raise CongraspError(
         f"There is no hand '{reference}'.",
-        f"Choose one of: {', '.join(sorted({*HANDS, *user_hands}))}; or name a hand file.",
+        f"Choose one of: {', '.join(sorted({*HANDS, *user_hands}))}; or pass a hand file.",
     )

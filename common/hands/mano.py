@@ -248,9 +248,9 @@ def own_mano_hand() -> Hand:
     model = own_mano_model()
     if model is None:
         raise CongraspError(
-            "The hand 'mano' needs your copy of MANO_RIGHT.pkl, which this package may not "
-            "contain.",
-            f"Get it from mano.is.tue.mpg.de and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
+            "The hand 'mano' requires the file MANO_RIGHT.pkl, whose licence does not permit its "
+            "redistribution.",
+            f"Download it from mano.is.tue.mpg.de, and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
         )
     return mano_hand(model)
 

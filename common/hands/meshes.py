@@ -51,7 +51,7 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
         vertices = arrays.get(f"{name}/vertices", np.zeros(0))
         faces = arrays.get(f"{name}/faces", np.zeros(0))
         if not _is_mesh(vertices, faces):
-            raise CongraspError(f"{file} holds no mesh of '{name[:60]}'.", _REMEDY)
+            raise CongraspError(f"{file} contains no mesh of '{name[:60]}'.", _REMEDY)
         farthest = np.abs(vertices).max()
         if farthest > MAX_DISTANCE:
             raise CongraspError(

@@ -88,7 +88,7 @@ def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> N
     for member in members:
         is_array = member.filename.endswith(".npy")
         if not is_array or member.compress_type not in _COMPRESSION_METHODS:
-            raise ValueError("it holds something else than arrays")
+            raise ValueError("it contains members that are not arrays")
     if len({member.filename for member in members}) < len(members):
         raise ValueError("it holds an array twice")
 

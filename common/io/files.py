@@ -103,20 +103,26 @@ def check_free(path: pathlib.Path, *, force: bool = False) -> None:
 
 
 def check_output(option: str, path: pathlib.Path, *, is_folder: bool) -> None:
-    """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other
-    one of these.
+    """Raises a CongraspError if an output cannot be created, or exists with the wrong type.
+
+    Args:
+      option: the command's option, for the message.
+      path: path of the output.
+      is_folder: True for an output folder, False for an output file.
     """
     if is_folder and path.exists() and not path.is_dir():
-        raise CongraspError(f"{option} is the file {path}.", "Pass a folder; it need not exist.")
+        raise CongraspError(
+            f"{option} is the file {path}.", "Pass a folder, which need not exist yet."
+        )
     if not is_folder and path.is_dir():
-        raise CongraspError(f"{option} is the folder {path}.", "Pass a file in it.")
+        raise CongraspError(f"{option} is the folder {path}.", "Pass a file, such as one in it.")
     folders = list(path.absolute().parents)
     if is_folder:
         folders.insert(0, path)
     parent = next(folder for folder in folders if os.path.lexists(folder))
     if not parent.is_dir():
         raise CongraspError(
-            f"{option} is {path}, but {parent} is a file or a link to nothing.",
+            f"{option} is {path}, but {parent} is a file or a broken link.",
             "Pass another path.",
         )
     if not os.access(parent, os.W_OK | os.X_OK):

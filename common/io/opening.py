@@ -86,7 +86,7 @@ def _check_file(path: pathlib.Path, status: os.stat_result) -> None:
         raise _irregular(path)
     if status.st_nlink > 1:
         raise CongraspError(
-            f"{path} is a hard link: writing would change another file, too.",
+            f"{path} is a hard link, so that writing to it would also change another file.",
             "Replace it by a copy.",
         )
 

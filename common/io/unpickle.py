@@ -184,7 +184,7 @@ class _StorageUnpickler(_Unpickler):
 
 
 def _resolved(part: Any) -> Any:
-    """Array, or plain value, that an object stands for; None if it stands for none."""
+    """Array or plain value that a stand-in represents; None for an unknown class."""
     match part:
         case _Array():
             return _array(part)

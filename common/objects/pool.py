@@ -34,8 +34,8 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
         objects = [catalogue.get(name) for name in catalogue.list()]
         if not objects:
             raise CongraspError(
-                f"The folder {config.folder} holds no object.",
-                "Fill it with 'congrasp objects import'.",
+                f"The folder {config.folder} contains no object.",
+                "Import objects into it with 'congrasp objects import'.",
             )
         return objects
     if config.count < 1:

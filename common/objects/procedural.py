@@ -103,12 +103,12 @@ def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[st
 def _check(seed: int, families: Sequence[str]) -> None:
     """Raises a CongraspError for a negative seed or an unknown family."""
     if seed < 0:
-        raise CongraspError(f"The seed {seed} is negative.", "Seeds start at 0.")
+        raise CongraspError(f"The seed {seed} is negative.", "Pass a seed of at least 0.")
     for family in families:
         if family not in BUILDERS:
             raise CongraspError(
                 f"There is no object family '{family}'.",
-                f"Families: {', '.join((*FAMILIES, *GROUPS))}.",
+                f"Choose from the families {', '.join((*FAMILIES, *GROUPS))}.",
             )
 
 

@@ -96,12 +96,17 @@ class PolicySpec:
         return InferenceParameters({"actor": tree["actor"]}, Affine(row, row))
 
     def require(self, spec: "PolicySpec", source: str) -> None:
-        """Raises a `CongraspError` unless `spec`, that of `source`, has the schema of this one."""
+        """Raises a `CongraspError` unless another spec has the schema of this one.
+
+        Args:
+          spec: the other spec.
+          source: words after "The policy" in the message, which identify the policy of `spec`.
+        """
         if spec.schema != self.schema:
             raise CongraspError(
                 f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not "
                 f"for hand '{self.hand_name}' (schema {self.schema}).",
-                "Use a policy of this hand, task and network, or change them.",
+                "Use a policy with the same hand, task and network.",
             )
 
 
@@ -312,7 +317,7 @@ def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> 
         if len(old_inputs) == size and set(old_inputs) <= set(new_inputs):
             layout = (("state", len(new_inputs)), *bundle.spec.layout[1:])
             extended_spec = dataclasses.replace(bundle.spec, layout=layout)
-        spec.require(extended_spec, "to begin with")
+        spec.require(extended_spec, "that initialises the training")
         index = {name: i for i, name in enumerate(old_inputs)}
         state = np.array([index.get(name, -1) for name in new_inputs])
     same_critic = spec.privileged == bundle.spec.privileged
@@ -361,7 +366,7 @@ def load(path: pathlib.Path) -> PolicyBundle:
         message = decode(data)
     except CongraspError as error:
         raise CongraspError(
-            f"The policy {path} is damaged, or not a policy: {error}", remedy
+            f"The policy {path} is damaged, or is not a policy: {error}", remedy
         ) from None
     return PolicyBundle.from_message(message, str(path))
 

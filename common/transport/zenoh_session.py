@@ -157,7 +157,7 @@ def _open_files() -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
     if limit < _MAX_FILES:
         _log.warning(
-            "This process may open %d files: more than %d silent connections keep new peers out. "
+            "This process may open %d files: above %d idle connections, new peers cannot connect. "
             "Raise the hard limit to %d (ulimit -n, LimitNOFILE=).",
             limit,
             limit // 4,

@@ -179,7 +179,7 @@ def read_teacher(named: str) -> PolicyBundle:
     """
     if not named:
         raise CongraspError(
-            "Distillation needs a teacher.", "Name a hand or a policy file with --teacher."
+            "Distillation needs a teacher.", "Pass a hand or a policy file with --teacher."
         )
     return bundles.load(named_policy(named))
 
@@ -192,19 +192,18 @@ def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
     if teacher.spec.hand != spec.hand:
         raise CongraspError(
             f"{what} cannot teach the hand '{spec.hand_name}'.",
-            "Name a teacher of the same hand with --teacher.",
+            "Pass a teacher of the same hand with --teacher.",
         )
     if teacher.task.observation != "full" or teacher.spec.layout != full_layout(task):
         raise CongraspError(
-            f"{what} does not observe what this task shows.",
-            "Take the task from the teacher: 'congrasp train --teacher', without other --task.… "
-            "settings of its own.",
+            f"{what} has other observations than those of this task.",
+            "Use the teacher's task: run 'congrasp train --teacher' without --task.… options.",
         )
     # The time is observed as a share of the episode
     for name in ("control", "control_dt", "dynamic_center"):
         if getattr(teacher.task, name) != getattr(task, name):
             raise CongraspError(
-                f"{what} learnt with another '{name}' than this task's.",
+                f"{what} was trained with another '{name}' than that of this task.",
                 f"Leave out --task.{name.replace('_', '-')}.",
             )
 

@@ -158,7 +158,8 @@ class Ranks:
         host, _, port = coordinator.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65535:
             raise CongraspError(
-                f"'{coordinator}' is no address of rank 0.", "Give --coordinator HOST:PORT."
+                f"'{coordinator}' is not a valid address of rank 0.",
+                "Pass --coordinator HOST:PORT.",
             )
         # All interfaces unless it is the loopback: rank 0 may not resolve the name by which others
         # reach it.
@@ -223,7 +224,7 @@ class Ranks:
         decision = self.poll(ROUND_SECONDS)
         if decision is None:
             raise TransportError(
-                f"The {self.count} ranks did not come together within {ROUND_SECONDS:.0f} s."
+                f"The {self.count} ranks did not synchronise within {ROUND_SECONDS:.0f} s."
             )
         return decision
 
@@ -236,7 +237,7 @@ class Ranks:
             yield
             return
         text = (
-            f"The ranks did not get through an update within {ROUND_SECONDS:.0f} s; rank "
+            f"The ranks did not complete an update within {ROUND_SECONDS:.0f} s; rank "
             f"{self.rank} stops."
         )
         timer = threading.Timer(ROUND_SECONDS, self._on_lost, (text,))
@@ -357,7 +358,7 @@ def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Lin
                     continue
                 missing = sorted(set(range(1, count)) - links.keys())
                 raise TransportError(
-                    f"Ranks {missing} of {count} did not come within {JOIN_SECONDS:.0f} s."
+                    f"Ranks {missing} of {count} did not join within {JOIN_SECONDS:.0f} s."
                 ) from None
             except (OSError, CongraspError, KeyError, ValueError):
                 continue
@@ -385,7 +386,7 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
             if time.monotonic() > deadline:
                 raise TransportError(
                     f"Rank 0 does not answer at {host}:{port}: {error}.",
-                    "Name its host and port with --coordinator.",
+                    "Pass its host and port with --coordinator.",
                 ) from None
             time.sleep(0.5)
 

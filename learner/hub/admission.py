@@ -106,7 +106,7 @@ def _check_metric(name: str, array: np.ndarray, ranges: Ranges) -> None:
     """Raises a `CongraspError` for a metric that the task lacks, or a value out of its range."""
     if name not in ranges.episodes:
         raise CongraspError(
-            f"The rollout names {ascii(name)[:60]}, which is not a metric of the task."
+            f"The rollout has {ascii(name)[:60]}, which is not a metric of the task."
         )
     least, most = ranges.episodes[name]
     _check_within(name, array, least, most)
@@ -162,6 +162,6 @@ def _magnitudes(array: np.ndarray, most: np.ndarray) -> Iterator[tuple[np.ndarra
 def _outside(name: str, value: Any, least: float, most: float) -> CongraspError:
     """Error for a number that the task cannot produce."""
     return CongraspError(
-        f"The rollout's array '{name}' holds {value:.4g}; the task's are within {least:.4g} and "
-        f"{most:.4g}."
+        f"The rollout's array '{name}' holds {value:.4g}, which is not within the task's limits "
+        f"{least:.4g} and {most:.4g}."
     )

@@ -299,5 +299,5 @@ def _rates(steps: list[int], seconds: float) -> dict[str, float]:
 def _check_sender(key: str, actor: str) -> None:
     if sender(key) != actor:
         raise CongraspError(
-            f"A message of the actor {ascii(actor)[:70]} came under the key {ascii(key)[:140]}."
+            f"Actor {ascii(actor)[:70]} published on {ascii(key)[:140]}, the key of another actor."
         )

@@ -131,7 +131,7 @@ def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[
     joints = _joints_to(model, mount.body)
     if not joints or any(model.jnt_type[joint] not in _JOINT_TYPES for joint in joints):
         raise CongraspError(
-            f"{path} has no chain of hinges and slides from its base to '{flange_name}'.",
+            f"{path} has no chain of hinge and slide joints from its base to '{flange_name}'.",
             "Pass the arm's last body or site with --flange.",
         )
     names = tuple(model.joint(joint).name for joint in joints)
@@ -213,7 +213,7 @@ def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> _Flange:
         return _frame_of(bodies.index(name))
     raise CongraspError(
         f"{path} has no site or body '{name}'.",
-        f"It ends with {', '.join(bodies[-_MAX_LISTED_BODIES:])}.",
+        f"Its last bodies are {', '.join(bodies[-_MAX_LISTED_BODIES:])}.",
     )
 
 
@@ -299,7 +299,8 @@ def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarra
         limits = numbers_in(text)
         if len(limits) not in (1, len(joints)) or not (limits > 0).all():
             raise CongraspError(
-                f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}."
+                f"--arm-speed is '{text}'.",
+                f"Write one positive number, or {len(joints)} positive numbers.",
             )
         return np.broadcast_to(limits, len(joints))
     urdf_limits = _urdf_speeds(robot_text(path))

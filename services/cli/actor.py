@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Actor:
-    """Run one actor for a learner on this or another machine; actors may join and leave during
+    """Run one actor for a learner on this or another machine. Actors may join and leave during the
     training.
 
     Examples:
@@ -37,37 +37,38 @@ class Actor:
     """
 
     launch: pathlib.Path | None = None
-    """`launch.json` of a run that `congrasp train` started; the other options of its actor --id
-    default to its values. For the processes of `congrasp train`.
+    """`launch.json` of a run that `congrasp train` started, whose values for the actor --id are the
+    defaults of the other options. `congrasp train` passes it to its processes.
     """
     connect: str = LEARNER_URL
-    """The learner's endpoint, such as tcp/10.0.0.5:7447."""
+    """Endpoint of the learner, such as tcp/10.0.0.5:7447."""
     run: str = "quickstart"
     """Name of the run."""
     id: Annotated[str, tyro.conf.arg(name="id")] = ""
-    """Name of this actor, unique in the run; host name and process number by default."""
+    """Name of this actor, unique in the run; by default the host name and the process number."""
     physics: PhysicsName = "auto"
-    """Engine; auto takes warp on an NVIDIA GPU and native on a CPU."""
+    """Physics engine; auto takes warp on an NVIDIA GPU and native on a CPU."""
     threads: int = 0
-    """Threads of the native engine; 0 uses all cores."""
+    """Number of threads of the native engine; 0 uses all cores."""
     patience: float | None = None
-    """Seconds without a learner after which the actor gives up; by default it waits without end."""
+    """Seconds for which the actor waits for a disconnected learner; without limit by default."""
     audit: pathlib.Path | None = None
-    """Journal of every rollout and the learner's reply, for 'congrasp audit'; by default in
-    ~/.local/state/congrasp/audit, where that command finds it on this machine."""
+    """Journal of every rollout and the learner's reply, for 'congrasp audit'. By default it is in
+    ~/.local/state/congrasp/audit, where 'congrasp audit' on this machine finds it."""
     no_audit: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write no journal."""
     references: pathlib.Path | None = None
-    """File that preserves the reference poses from the policy's grasps for the next start."""
+    """File in which the actor stores the reference poses from the policy's grasps. At its next
+    start it reads them from there."""
     watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
-    """Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on
-    the wire.
+    """Folder of an actor's certificate (congrasp certs). The number of the certificate is the
+    prefix of the actor's name in messages.
     """
 
     def __call__(self) -> int:
-        """Acts until the run ends or a signal comes."""
+        """Acts until the run ends, or until a signal."""
         from congrasp.common.runtime.stages import since_start
 
         if self.no_audit and self.audit is not None:

@@ -18,7 +18,7 @@ def audit(
 
     Exits with 1 if a rollout was lost, else with 5 for a surplus (a rollout used twice, or made by
     no actor), else with 6 if a rollout or a journal is damaged, else with 7 if something cannot be
-    judged, for lines are missing.
+    judged because lines are missing.
 
     Args:
       run_dir: Directory of the run.

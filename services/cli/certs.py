@@ -23,17 +23,18 @@ def init(
     host: tuple[str, ...] = (),
     force: bool = False,
 ) -> int:
-    """Create a private authority, and number 0 of every role: all that a run on one machine needs.
+    """Create a private certificate authority, and certificate number 0 of every role, which are
+    sufficient for a run on one machine.
 
-    A certificate is valid for the run that it names. The authority's ca.key signs certificates:
-    keep it unreadable for others. Commands on this machine take --certs FOLDER.
+    A certificate is valid for one run. The authority's key, ca.key, signs certificates: protect it
+    from other users. Commands on this machine take the authority's folder as --certs.
 
     Args:
       folder: Folder for the authority and the certificates.
       run: Name of the run.
-      host: Names and addresses of this machine, under which others will connect to its learner or
-        policy server.
-      force: Replace an existing authority; its certificates become invalid.
+      host: Host names and addresses under which other machines connect to the learner or the
+        policy server of this machine.
+      force: Replace an existing authority, whose certificates then become invalid.
 
     Examples:
       congrasp certs init certs --run human --host 10.0.0.5
@@ -57,21 +58,21 @@ def issue(
     days: float = 365.0,
     force: bool = False,
 ) -> int:
-    """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take
-    --certs FOLDER.
+    """Issue a certificate, which is a folder. Copy it to the machine where the role runs, and pass
+    it as --certs to the commands there.
 
-    Learners accept new certificates without changes. Several actors may share one, if they trust
-    one another.
+    A running learner accepts new certificates. Several actors may share a certificate if they trust
+    each other.
 
     Args:
       folder: Folder of the authority.
       role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or
         observer (status, recorder).
       run: Name of the run; by default that of the authority.
-      number: Distinguishes the certificates of a role; by default the lowest free one.
-      host: Names and addresses under which others will connect to it (learner and server).
-      days: Days until it expires.
-      force: Replace the certificate of this number; the old one stays valid until it expires.
+      number: Number of the certificate among those of the role; by default the lowest free number.
+      host: Host names and addresses under which others connect to the learner or server.
+      days: Days until the certificate expires.
+      force: Replace the certificate of this number. The old one remains valid until it expires.
 
     Examples:
       congrasp certs issue certs --role actor
@@ -87,17 +88,16 @@ def issue(
 def revoke(
     folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None
 ) -> int:
-    """Revoke a certificate whose key is lost or stolen: learners and servers no longer admit its
-    owner.
+    """Revoke a certificate whose key is lost or stolen, so that learners and servers reject it.
 
-    Those on this machine notice within seconds, and all their peers reconnect. If it belongs to a
-    learner or a server, its peers disconnect. Elsewhere, copy the file 'revoked' into the folders
-    of the certificates.
+    Learners and servers on this machine apply this within seconds, and all their peers reconnect.
+    If the certificate is that of a learner or a server, its peers disconnect. On other machines,
+    copy the file 'revoked' into the folders of the certificates.
 
     Args:
       folder: Folder of the authority.
-      role: The certificate's role.
-      number: The certificate's number.
+      role: Role of the certificate.
+      number: Number of the certificate.
       run: Name of the certificate's run; by default that of the authority.
 
     Examples:
@@ -111,8 +111,8 @@ def revoke(
 
 
 def show(folder: Folder = pathlib.Path("certs")) -> int:
-    """Show the certificates of a folder, when they expire and which are revoked; the exit code is 1
-    if one has expired.
+    """Show the certificates of a folder, their expiry dates, and which are revoked. The exit code
+    is 1 if a certificate has expired.
 
     Args:
       folder: Folder of an authority or of one certificate.

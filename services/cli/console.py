@@ -32,18 +32,25 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 
 
 def in_range(least: float, most: float = math.inf, unit: str = "", **options: float) -> None:
-    """Raises a CongraspError for the first option that is not from the minimum to the maximum."""
+    """Raises a CongraspError for the first option that is outside of a range.
+
+    Args:
+      least: smallest valid value.
+      most: greatest valid value.
+      unit: unit of the values, for the message.
+      options: values by the names of their options.
+    """
     for name, value in options.items():
         if not least <= value <= most:
-            bounds = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
+            bounds = f"at least {least:g}"
+            if most < math.inf:
+                bounds = f"between {least:g} and {most:g}"
             remedy = f"It must be {bounds} {unit}".rstrip()
             raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"{remedy}.")
 
 
 def say(*lines: object) -> None:
-    """Prints lines; what a terminal would obey is written as escapes, since names in them come from
-    files.
-    """
+    """Prints lines with control characters escaped, since names in them may be from a file."""
     for line in lines:
         print(printable(str(line)))
 

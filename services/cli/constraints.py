@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Generate:
-    """Generate the constraint sets of objects, one self-describing file each.
+    """Generate constraint sets, one self-describing file for each object.
 
-    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20
-    reference poses, and wrist trajectories that end at them, from 15 to 25 cm away, replayed
-    through the wrist's controller. 80 % of them are for training, and the others are held out.
+    A set has, for the whole surface and again for the graspable region, 256 headings by the paper's
+    rules, 20 reference poses, and wrist trajectories. A trajectory begins 15 to 25 cm away from a
+    reference pose, ends at it, and is replayed through the wrist's controller. 80 % of the
+    constraints are for training, and the others are held out.
 
     Examples:
       congrasp constraints generate mug:7 box:0
@@ -48,19 +49,19 @@ class Generate:
     count: int = 0
     """Number of additional procedural objects."""
     families: tuple[str, ...] = ()
-    """Their families, in turn, or groups of them: basic (if none is named), household, all,
-    scans.
+    """Families of the procedural objects, which are used in turn, or groups of families: basic (the
+    default), household, all, scans.
     """
     first_seed: int = 0
-    """Seed of the first of them; the others follow."""
+    """Seed of the first procedural object; each further object has the next seed."""
     hand: str = "human"
-    """Name of the hand, or its file."""
+    """Name or file of the hand."""
     references: Literal["closed", "policy"] = "closed"
-    """closed: poses that close the hand around the object; policy: final states of a policy's
-    grasps under headings, as in the paper."""
+    """Origin of the reference poses. closed: the hand is closed around the object by geometry;
+    policy: final states of a policy's grasps under headings, as in the paper."""
     policy: pathlib.Path | None = None
-    """Policy file for its references; by default the hand's reference policy, which was trained
-    without any.
+    """Policy for --references policy; by default the hand's reference policy, which was trained
+    without reference poses and trajectories.
     """
     folder: str = "objects"
     """Folder of objects."""
@@ -77,7 +78,8 @@ class Generate:
 
         if not self.objects and self.count < 1:
             raise CongraspError(
-                "There is no object for which to generate constraints.", "Pass objects, or --count."
+                "There are no objects for which to generate constraints.",
+                "Pass objects, or --count.",
             )
         hand = get_hand(self.hand)
         with tracked() as track:
@@ -110,8 +112,8 @@ class Generate:
             if name != distinct_name:
                 raise CongraspError(
                     f"Several of the objects are called '{name}'.",
-                    "Name each once; 'congrasp objects import A B --out DIR' gives different ones "
-                    "different names.",
+                    "Pass each object once. If they are different objects, import them with "
+                    "'congrasp objects import A B --out DIR', which gives them distinct names.",
                 )
         return objects
 
@@ -138,21 +140,21 @@ def _references(
     references = Experiment(bundle, objects, seed=seed, track=track).references_of(bundle)
     on_whole_surface = references.grasps[:, 0]
     print(
-        f"Grasps per object: {on_whole_surface.min()} to {on_whole_surface.max()}; where there is "
-        f"none, the hand is closed around the object."
+        f"Grasps per object: {on_whole_surface.min()} to {on_whole_surface.max()}. For objects "
+        "without a grasp, the hand is closed around the object by geometry."
     )
     return references.bank
 
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Make constraint sets of captured grasps by the paper's rules, and report what was dropped and
-    why.
+    """Make constraint sets of captured grasps by the paper's rules, and report the dropped
+    sequences with the reasons.
 
-    From each sequence come a reference pose (the `human` hand's finger angles in the grasping
-    frame) and a wrist trajectory to it of 15 waypoints, and, where the object's parts are labelled,
-    those that may be touched. Only right hands are used. Objects are imported from the data set's
-    meshes.
+    Each captured sequence gives a reference pose (finger angles of the `human` hand in the frame of
+    the grasp), a wrist trajectory of 15 waypoints to this pose, and, if the object's parts are
+    labelled, the parts that may be touched. Only right hands are used. Objects are imported from
+    the data set's meshes.
 
     Examples:
       congrasp constraints import grab GRAB/
@@ -162,29 +164,30 @@ class Import:
     format: Annotated[
         str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")
     ]
-    """Data set of the files."""
+    """Name of the data set."""
     path: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The data set's folder, or one of its files."""
+    """Folder of the data set, or one of its files."""
     meshes: tuple[pathlib.Path, ...] = ()
     """Folders with the objects' meshes, if they are not in the data set."""
     mano: pathlib.Path | None = None
-    """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact
-    with it.
+    """File MANO_RIGHT.pkl; by default that of the variable CONGRASP_MANO. dexycb requires it, and
+    grab and oakink are more exact with it.
     """
     hand: str = "human"
-    """Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist
-    by its grasp axes, with the captured headings and affordance, and closes its fingers around the
-    object at the end."""
+    """Hand of the sets. Another hand than human cannot use the captured finger angles. It follows
+    the captured wrist with its grasp axes, keeps the captured headings and affordance, and closes
+    its fingers around the object at the end."""
     headings: Literal["sampled", "demonstrated"] = "sampled"
-    """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
+    """sampled: 256 headings per object by the paper's rules; demonstrated: the headings of the
+    captured grasps."""
     affordance: Literal["auto", "parts", "contacts", "none"] = "auto"
-    """Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where
-    they are labelled."""
+    """Graspable region. parts: the labelled parts that fingers touch; contacts: the surface that
+    fingers touch; none: the whole surface; auto: parts if the object's parts are labelled."""
     beyond: float = 0.1
-    """Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not
-    used for other hands."""
+    """Radians by which a captured joint angle may exceed the human hand's limits. Such an angle is
+    clamped; sequences with larger excesses are dropped. Not used for other hands."""
     out: pathlib.Path = pathlib.Path("constraints")
-    """Folder for the sets, and for import.json, which holds the outcome of each sequence."""
+    """Folder for the sets, and for import.json, which contains the result of each sequence."""
     objects: pathlib.Path = pathlib.Path("objects")
     """Folder for the objects."""
     seed: int = 0
@@ -214,7 +217,7 @@ class Import:
             )
         if not report.kept and not report.dropped:
             raise CongraspError(
-                f"{self.path} holds no sequence of {self.format}.",
+                f"{self.path} contains no sequence of {self.format}.",
                 f"Pass the folder with {importer.HOLDS}.",
             )
         catalogue = Catalogue(self.objects)
@@ -261,9 +264,9 @@ def show(
 
     Args:
       file: A file of 'congrasp constraints generate' or 'import'.
-      png: Picture to write: headings, affordance, trajectories and reference poses.
-      rest: Resting pose of the picture, from 1; 0 uses the one with the most poses.
-      seed: Seed of the drawn selection.
+      png: PNG file to write: headings, affordance, trajectories and reference poses.
+      rest: Number of the drawn resting pose, from 1; 0 uses the one with the most reference poses.
+      seed: Seed of the random selection that is drawn.
 
     Examples:
       congrasp constraints show sets/mug_7.constraints.safetensors

@@ -22,12 +22,12 @@ Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", 
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and
-    rates.
+    """Make a dataset of verified grasps: Parquet files (shards) with a schema, and a dataset card
+    with counts and rates.
 
-    Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm,
-    pushed. A second run of the same command makes the missing shards. The same policy, objects,
-    seed, engine and batch give the same shards.
+    Every episode is simulated to its end: the object is held for two seconds without the table,
+    lifted by 15 cm, and pushed. Repeat an interrupted command to make the missing shards. The same
+    policy, objects, seed, engine and batch give the same shards.
 
     Examples:
       congrasp dataset meshes/ --out grasps --per-object 100
@@ -35,38 +35,38 @@ class Dataset:
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of
-    the generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
+    """Meshes (STL, OBJ, PLY, GLB), object files, folders of these, names of objects in --folder, or
+    objects of the generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
     out: pathlib.Path = pathlib.Path("dataset")
     """Folder of the dataset."""
     per_object: int = 100
-    """Episodes of each object, evenly over the constraints; those that an object does not allow are
-    left out.
+    """Number of episodes of each object, evenly divided among its constraints. Constraints that are
+    impossible on an object are left out.
     """
     constraints: tuple[str, ...] = ()
-    """Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory.
-    By default every constraint of the policy, and the paper's compositions."""
+    """Combinations of constraints to sample, joined by +, such as: heading pose+trajectory. By
+    default every constraint of the policy, and the paper's compositions."""
     keep: tuple[Verdict, ...] = ("held",)
-    """Outcomes that an episode needs to be written; all writes every episode."""
+    """Properties that an episode must have to be written; all writes every episode."""
     part: str = "1/1"
-    """K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their
-    shards together, and run the command once more for the card."""
+    """K/N makes every N-th shard, beginning with shard K. Different parts can be made on different
+    machines: copy their shards into one folder, and repeat the command there for the card."""
     shard: int = 0
     """Largest number of objects in a shard; 0 chooses by --per-object."""
     policy: pathlib.Path | None = None
-    """A policy file; by default the pretrained one of the hand."""
+    """A policy file; by default the pretrained policy of --hand."""
     hand: str = "human"
     """Hand of the pretrained policy."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
     batch: int = 0
-    """Number of parallel worlds; 0 uses the engine's default."""
+    """Number of environments that are simulated in parallel; 0 uses the engine's default."""
     seed: int = 0
     """Seed of constraints and episodes."""
     licence: str = "Apache-2.0"
     """Licence of the data, for the card (an SPDX name)."""
     folder: str = "objects"
-    """Folder of objects, which can be named in place of files."""
+    """Folder of imported or generated objects, which `objects` may name instead of files."""
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess")  # noqa: RUF009
     """Conversion of meshes to objects."""
 
@@ -140,11 +140,11 @@ class Dataset:
         from congrasp.services.grasp.jobs import find_objects
 
         objects, errors = find_objects(self.objects, self.folder)
-        remedy = "Name meshes, folders or mug:0-99."
+        remedy = "Pass meshes, folders, or objects of the generator such as mug:0-99."
         if errors:
             raise CongraspError(errors[0].error, remedy)
         if not objects:
-            raise CongraspError("No objects were named.", remedy)
+            raise CongraspError("There are no objects.", remedy)
         return objects
 
     def _constraint_sets(self, task: "TaskConfig") -> tuple[str, ...]:

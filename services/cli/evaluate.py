@@ -35,13 +35,15 @@ _PIPE_WIDTH = 160
 class Evaluate:
     """Evaluate policies by the paper's protocol, with the paper's figures for comparison.
 
-    An episode has as many control steps with the table as the policy was trained with, and 2 s
-    without it. Success is counted after the paper's 25 steps without the table, and again after the
-    2 s (held). Rates come with 95 % intervals whose clusters are objects (captured sequences); 'of
-    all objects' counts uncovered objects as failures. Errors and forces are those of successful
-    episodes in the paper's window of 25 steps. The policy acts with its mean. Every object has the
-    same number of episodes in a row, independent of other requested rows. Reference poses and
-    trajectories are grasps of a reference policy trained without any, at most 20 of each object.
+    An episode has as many control steps with the table as the policy was trained with, and then 2 s
+    without the table. It is a success if the object is held for the paper's 25 steps without the
+    table, and counts as held if it is held for the 2 s. Rates have 95 % confidence intervals, with
+    objects (or captured sequences) as clusters. The column 'of all objects' counts objects on which
+    the constraint is impossible as failures. Errors and forces are means over the successful
+    episodes, in the paper's window of 25 steps. The policy acts with the mean of its action
+    distribution. Within a row, every object has the same number of episodes; they do not depend on
+    the other requested rows. Reference poses and trajectories are at most 20 grasps per object of a
+    reference policy, which was trained without reference poses and trajectories.
 
     Examples:
       congrasp evaluate --table single composed --episodes 200
@@ -50,61 +52,62 @@ class Evaluate:
 
     policy: tuple[str, ...] = ()
     """Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by
-    default a pretrained one."""
+    default the pretrained policy of --hand."""
     table: tuple[Table, ...] = ("single",)
-    """single: one constraint a row; composed: two; cross: the rows of the paper's cross-dataset
-    table; hands: single constraints for all hands with a pretrained policy, or those of --policy;
-    ablation: the full system and variants without one of its parts, if --policy has policies of
-    them; objects: the heading alone on any number of objects, by size, mass and family; noise:
-    poses and trajectories with errors like captured ones; sensing: the heading alone with a
-    tracker's object poses, by their noise, delay, rate and losses, by friction, by errors of gains
-    and by late targets, a student and the pretrained policy; payload: the heading alone by the
-    objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of
-    RobustDexGrasp and of Isaac Lab's dexsuite; all: every table of one policy. Several may be
-    named."""
+    """Tables to compute, one or several. single: one constraint per row; composed: two constraints
+    per row; cross: the rows of the paper's cross-dataset table; hands: single constraints for all
+    hands with a pretrained policy, or for the hands of --policy; ablation: the full system and
+    variants without one of its components, which need a policy each in --policy; objects: the
+    heading alone on any number of objects, by size, mass and family; noise: poses and trajectories
+    with errors as in captured data; sensing: a student and the pretrained policy under the heading
+    alone, with object poses from a tracker, by noise, delay, rate and losses of the poses, by
+    friction, by errors of the servo gains and by latency of the targets; payload: the heading alone
+    by the objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of
+    RobustDexGrasp and of Isaac Lab's dexsuite; all: every table of one policy."""
     exam: Exam = "figures"
-    """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for
-    published figures; development has seeds from 1,000,000. Training uses neither."""
+    """Set of procedural test objects, of all families. figures has seeds from 2,000,000 and is for
+    published figures only; development has seeds from 1,000,000. Training uses neither."""
     objects: pathlib.Path | None = None
-    """Objects to grasp instead: a folder accepted or created by 'congrasp objects import'."""
+    """Folder of objects or meshes to grasp instead of the procedural objects, as for 'congrasp
+    objects import'."""
     constraints: pathlib.Path | None = None
-    """Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import';
-    its references are used instead of the reference policy's. Objects without a set are left
-    out."""
+    """Folder of constraint sets of --objects, from 'congrasp constraints generate' or 'import'. Its
+    references replace those of the reference policy. Objects without a set are left out."""
     split: Split = "all"
-    """Split of these sets: all constraints, the 80 % for training, or the held-out ones. Objects
-    without a heading in the split are left out, and rows of poses and trajectories cover the
-    objects that have one in the split."""
+    """Part of the constraint sets: all constraints, the 80 % for training, or the held-out ones.
+    Objects without a heading in this part are left out. Rows of poses and trajectories cover the
+    objects that have a pose or a trajectory in it."""
     episodes: int = 1000
-    """Episodes of each row; for the table 'objects', the total."""
+    """Number of episodes per row; for the table 'objects', the total number."""
     physics: PhysicsName = "auto"
-    """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
+    """Physics engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
     reference_physics: PhysicsName = "auto"
-    """Engine of the reference policy's grasps; auto takes that of --physics. Pass the same one to
-    compare engines on the same episodes."""
+    """Physics engine of the reference policy's grasps; auto takes that of --physics. To compare
+    engines on the same episodes, pass the same reference engine to each evaluation."""
     pool: int = 0
-    """Number of procedural objects; 0 uses one of each family, and for the table 'objects' one per
-    episode, at most 50,000."""
+    """Number of procedural objects. 0 uses one object of each family, and for the table 'objects'
+    one object per episode, at most 50,000."""
     batch: int = 0
-    """Number of parallel worlds; 0 uses the engine's default."""
+    """Number of environments that are simulated in parallel; 0 uses the engine's default."""
     seed: int = 0
     """Seed of constraints and episodes."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
-    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts,
-    unless it also draws --pictures."""
+    """Also write the rows to this JSON file. A stopped evaluation resumes from the rows in
+    FILE.parts, unless --pictures is set."""
     pictures: pathlib.Path | None = None
-    """Also draw failures, with their causes, and successes of every constraint into this folder."""
+    """Folder for pictures of failures, with their causes, and of successes under every
+    constraint."""
     hand: str = "human"
     """Hand of the pretrained policy."""
     method: str | None = None
-    """ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
-    no-feedforward, two-phase, single-stage, student or camera. A policy of another method is
-    refused; default: that of the policy."""
+    """Method to evaluate: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp,
+    no-dynamic-center, no-feedforward, two-phase, single-stage, student or camera. A policy of
+    another method is refused. By default the method of the policy."""
     by: Literal["object"] | None = None
-    """object: also print the rates of each object; --json always has them."""
+    """object: also print the rates of each object. The file of --json always contains them."""
     friction: float = 1.0
-    """Sliding friction between hand and object. The published code of the paper's predecessor
-    (GraspXL) simulates 3.
+    """Sliding friction between hand and object. The published code of GraspXL, the paper's
+    predecessor, uses 3.
     """
 
     def __call__(self) -> int:
@@ -135,7 +138,8 @@ class Evaluate:
         self._print(evaluations, lineup, engine)
         if without_set:
             print(
-                f"Left out: objects without a constraint set, or a heading in it ({self.split}): "
+                "Left out: objects without a constraint set, or without a heading in the split "
+                f"'{self.split}': "
                 f"{', '.join(without_set)}."
             )
         if self.json is not None:
@@ -146,7 +150,7 @@ class Evaluate:
         return 0
 
     def _check(self) -> None:
-        """Raises a CongraspError for options that are out of range or need another."""
+        """Raises a CongraspError if an option is out of range, or needs another one."""
         in_range(1, episodes=self.episodes)
         in_range(0, pool=self.pool, batch=self.batch)
         in_range(0.05, 10.0, friction=self.friction)
@@ -154,7 +158,8 @@ class Evaluate:
             need_package("--pictures", "matplotlib")
         if self.constraints is not None and not self.objects:
             raise CongraspError(
-                "--constraints needs the sets' objects.", "Pass their folder with --objects."
+                "--constraints needs the objects of the constraint sets.",
+                "Pass the objects' folder with --objects.",
             )
 
     def _many_objects(self, engine: PhysicsName) -> "Pools | None":

@@ -19,15 +19,16 @@ def policy(
 ) -> int:
     """Write a policy as ONNX or StableHLO.
 
-    Normalisation is inside; the file also holds the hand, the meaning and order of every input and
-    output, and the hand's MuJoCo model. docs/policy-export.md and examples/onnx_grasp.py show its
-    use.
+    The exported program normalises its inputs. The file also contains the hand, the meaning and
+    order of every input and output, and the hand's MuJoCo model. docs/policy-export.md and
+    examples/onnx_grasp.py show its use.
 
     Args:
-      policy: The policy file (.safetensors), or 'allegro-student'; the pretrained one otherwise.
+      policy: A policy file (.safetensors), or the name of a pretrained policy such as
+        allegro-student; by default the pretrained policy of --hand.
       hand: Hand of the pretrained policy.
-      to: The format.
-      out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
+      to: Format of the file.
+      out: The file to write; by default policy.onnx or policy.stablehlo.zip.
       force: Replace an existing file.
 
     Examples:
@@ -51,9 +52,9 @@ def policy(
 class ExportMotion:
     """Write a grasp motion for another program.
 
-    glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a
-    bag with joint trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for
-    each motion. docs/exports.md describes each.
+    Formats: glb for Blender, the web, Unity and Unreal; usd for Isaac, Houdini and Maya; bvh for
+    motion capture programs; ros2 for a bag with joint trajectory, TF and URDF; lerobot for a
+    dataset (version 3.0) with an episode for each motion. docs/exports.md describes them.
 
     Examples:
       congrasp export motion grasps/mug/grasp.npz --to glb
@@ -61,23 +62,23 @@ class ExportMotion:
     """
 
     paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
-    """Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes
-    several."""
+    """Motions of 'congrasp grasp' (.npz), recordings (.mcap), or the folder of a run. Only lerobot
+    takes several motions."""
     to: Literal["glb", "usd", "bvh", "ros2", "lerobot"] = "glb"
-    """The format."""
+    """Format of the export."""
     out: pathlib.Path | None = None
     """The file or folder to write; by default one named after the object, such as mug.glb, in the
     working directory."""
     index: int = -1
-    """Index of the recorded episode, from 0; -1 is the last."""
+    """Index of the episode in a recording, from 0; -1 is the last episode."""
     success: bool = False
-    """Count only episodes that succeeded."""
+    """Apply --index to successful episodes only."""
     fps: float = 0.0
-    """Frames a second, such as 24 for a film; the motion's own 100 by default."""
+    """Frames per second, such as 24 for a film; by default the 100 of the motion."""
     camera: bool = False
-    """Also record videos of the motions; only lerobot has videos."""
+    """Also render videos of the motions; only lerobot has videos."""
     force: bool = False
-    """Replace an existing file; a folder is never replaced."""
+    """Replace an existing file. Existing folders are never replaced."""
 
     def __call__(self) -> int:
         """Writes the motions, and prints the number of their frames."""

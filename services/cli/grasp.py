@@ -52,15 +52,16 @@ Constraints: Any = dataclasses.make_dataclass("Constraints", _fields(), frozen=T
 
 @dataclasses.dataclass(frozen=True)
 class Grasp:
-    """Make grasp motions for custom objects.
+    """Make grasp motions for your own objects.
 
-    Every object gets a folder in --out: grasp.npz (self-describing arrays), grasp.mcap (Foxglove,
-    Rerun), grasp.png, portrait.png, object.png (before and after its import, with a hand at true
-    scale) and result.json.
+    Every object gets a folder in --out: grasp.npz (self-describing arrays), grasp.mcap (for
+    Foxglove and Rerun), grasp.png, portrait.png, object.png (the mesh before and after its import,
+    next to a hand at true scale) and result.json.
 
-    Several attempts are simulated in parallel, and the best is kept: first by a hold of two seconds
-    without the table (or after the lift), then by small errors, a still object and low forces.
-    Repeat the command to resume an interrupted one.
+    Several attempts are simulated in parallel, and the best one is kept. An attempt that holds the
+    object for two seconds without the table (or after the lift) is better than one that does not.
+    Among equals, small errors, a still object and low forces decide. Repeat an interrupted command
+    to resume it.
 
     Examples:
       congrasp grasp examples/mug.obj --video
@@ -69,8 +70,8 @@ class Grasp:
     """
 
     objects: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator
-    (mug:7), or names in --folder."""
+    """Meshes (STL, OBJ, PLY, GLB), object files, folders of these, FAMILY:SEED for an object of the
+    generator (mug:7), or names of objects in --folder."""
     out: pathlib.Path = pathlib.Path("grasps")
     """Folder for the results."""
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints()  # noqa: RUF009
@@ -84,14 +85,16 @@ class Grasp:
     overlays: bool = False
     """Draw constraints and contacts into the video; grasp.png always shows them."""
     camera: str = ""
-    """Viewpoint of pictures and video, in degrees around the table and above it: --camera "120 25";
-    by default the one that shows fingers, contacts and object best."""
+    """Viewpoint of pictures and video as azimuth and elevation in degrees, such as --camera "120
+    25"; by default the viewpoint that shows fingers, contacts and object best."""
     pictures: bool = True
     """Write pictures."""
     policy: pathlib.Path | None = None
-    """A policy file, or 'allegro-student'; by default the pretrained one of the hand."""
+    """A policy file, or the name of a pretrained policy such as allegro-student; by default the
+    pretrained policy of --hand."""
     hand: str = "human"
-    """Hand of the pretrained policy; human:left takes its mirror image."""
+    """Hand of the pretrained policy; human:left is the left hand, as the mirror image of the
+    right."""
     attempts: int = 16
     """Number of attempts simulated in parallel, at most 1024."""
     seed: int = 0
@@ -99,21 +102,22 @@ class Grasp:
     physics: PhysicsName = "native"
     """Engine of the attempts: native (MuJoCo C) or physx."""
     approach: float | None = None
-    """Seconds in which the hand first comes from the side of the table; longer where an arm needs
-    it (1 m/s). By default 0, and 0.7 with --video.
+    """Duration, in seconds, of the reach from the side of the table, which precedes the grasp. The
+    reach takes longer if the wrist would exceed 1 m/s. 0 leaves it out. By default 0, and 0.7 with
+    --video.
     """
     lift: float | None = None
-    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the
-    table. By default 0, and 0.12 with --video.
+    """Height, in metres, by which the hand lifts the object off the table. With 0 the table is
+    removed instead. By default 0, and 0.12 with --video.
     """
     rest: str = ""
-    """Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows
-    them).
+    """Resting pose of the object on the table: upright, or its number, counted from 1 ('congrasp
+    objects rests' draws the poses).
     """
     folder: str = "objects"
-    """Folder of objects, which can be named in place of files."""
+    """Folder of imported or generated objects, which `objects` may name instead of files."""
     again: bool = False
-    """Repeat finished objects."""
+    """Repeat objects that are finished already."""
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess")  # noqa: RUF009
     """Conversion of meshes to objects."""
     arm: Annotated[ArmOptions, tyro.conf.OmitArgPrefixes] = ArmOptions()  # noqa: RUF009
@@ -149,13 +153,13 @@ class Grasp:
         return _conclude(results, len(entries), self.out)
 
     def _check(self) -> None:
-        """Raises a CongraspError for an option out of range, or without the one it needs."""
+        """Raises a CongraspError if an option is out of range, or needs another one."""
         if not self.objects:
             raise CongraspError(
                 "There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj"
             )
         check_together(self, ("size", "fps", "overlays"), "video")
-        in_range(1, _MAX_ATTEMPTS, "side by side", attempts=self.attempts)
+        in_range(1, _MAX_ATTEMPTS, attempts=self.attempts)
         in_range(0.0, 10.0, "seconds", approach=self._approach)
         in_range(0.0, 0.5, "metres", lift=self._lift)
         in_range(1.0, 120.0, "frames a second", fps=self.fps)

@@ -84,8 +84,8 @@ def sheet(
     hands: Annotated[tuple[str, ...], tyro.conf.Positional] = ("human", "allegro", "sharpa"),
     out: pathlib.Path = pathlib.Path("hands.png"),
 ) -> int:
-    """Draw hands open, half closed and closed, with their grasp frames, with the visual meshes of
-    their files if any.
+    """Draw hands open, half closed and closed, with their grasp frames. Custom hands are drawn with
+    the visual meshes of their files, if there are any.
 
     Args:
       hands: Names of hands, or hand files.
@@ -122,9 +122,9 @@ def _skin(name: str, hand: "Hand") -> "Skin | None":
 class Import:
     """Import a hand from a URDF or MJCF file: missing values are proposed, listed and drawn.
 
-    The result is one JSON file, which every command takes as --hand, by its name or its path; the
-    visual meshes are stored next to it. Check the picture, and correct the file where a proposal is
-    wrong: poses, fingertips, gains, couplings and capsules are all in it.
+    The result is one JSON file, with the visual meshes next to it. Every command takes the name or
+    the path of this file as --hand. Check the picture. If a proposed value is wrong, correct it in
+    the file, which contains all poses, fingertips, gains, couplings and capsules.
 
     Examples:
       congrasp hands import hand.urdf
@@ -132,25 +132,26 @@ class Import:
     """
 
     file: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The hand's URDF or MJCF, a right or left hand of hinges."""
+    """URDF or MJCF file of a right or left hand with hinge joints."""
     name: str = ""
-    """Its name; that of the file by default."""
+    """Name of the hand; by default the name of the file."""
     palm: str = ""
-    """Body of the palm; by default the one from which most fingers branch."""
+    """Body of the palm; by default the body from which most fingers branch."""
     thumb: str = ""
-    """The last body of the finger that opposes the others; by default one called thumb, or the one
-    that best faces the others."""
+    """Last body of the thumb, the finger that opposes the others; by default a body called thumb,
+    or else the last body of the finger that best faces the others."""
     object_scale: float = 0.0
-    """Factor on the objects that it learns to grasp; by default from its opening, 1 for a human
-    hand's."""
+    """Factor on the size of the objects in training. By default it follows from the opening of the
+    hand, and is 1 for a human hand."""
     collision: Literal["capsules", "own"] = "capsules"
-    """Collision shapes in physics: own uses the file's boxes, cylinders, balls, ellipsoids and
-    capsules, and capsules for links that collide by meshes."""
+    """Collision shapes in physics. capsules: fitted capsules; own: the boxes, cylinders, spheres,
+    ellipsoids and capsules of the file, and fitted capsules for links that have collision
+    meshes."""
     out: pathlib.Path | None = None
-    """The file to write; by default NAME.json in the folder of your own hands ('congrasp hands
-    list' names it)."""
+    """JSON file to write; by default NAME.json in the folder of your own hands ('congrasp hands
+    list' prints this folder)."""
     png: pathlib.Path | None = None
-    """The picture; by default next to the file."""
+    """PNG file to write; by default next to the JSON file."""
 
     def __call__(self) -> int:
         """Writes the hand's file and picture, and prints how to train it."""
@@ -197,10 +198,15 @@ def _store(
 
     hand = proposal.hand
     if hand.name in HANDS:
-        raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Pass another --name.")
+        raise CongraspError(
+            f"'{hand.name}' is the name of a hand of congrasp.", "Pass another --name."
+        )
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
     if path.exists():
-        say(f"The file {path} of an earlier import is replaced (--name or --out keeps it).")
+        say(
+            f"The file {path} of an earlier import is replaced (to keep it, pass another --name or "
+            "--out)."
+        )
     write_atomically(path, hand_text(hand).encode())
     save_meshes(path, proposal.meshes)
     get_hand.cache_clear()
@@ -214,17 +220,18 @@ def check(
     png: pathlib.Path | None = None,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
 ) -> int:
-    """Check whether a hand can grasp at all, before it is trained: one line for each check, with
-    its remedy.
+    """Check before training if a hand can grasp at all. The output has one line for each check,
+    with a remedy.
 
-    Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a
-    cylinder and a box, which are lifted and pushed, are simulated. The picture shows the grips and
-    every joint. The exit code is 1 if a check failed; doubtful results may be intended.
+    Palm, joints, opening and strength are measured. Servos, overlaps of links, and grips of a ball,
+    a cylinder and a box, which are lifted and pushed, are simulated. The picture shows the grips
+    and every joint. The exit code is 1 if a check failed. A doubtful result is not a failure, since
+    it may be intended.
 
     Args:
-      hand: A hand, by its name or its file.
-      png: The picture; by default NAME-check.png.
-      json: Also write the lines to this file.
+      hand: Name or file of a hand.
+      png: PNG file to write; by default NAME-check.png.
+      json: JSON file to which the results of the checks are also written.
 
     Examples:
       congrasp hands check allegro
@@ -251,12 +258,13 @@ def check(
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training,
-    evaluation.
+    """Make a policy and a report for the hand of a URDF or MJCF file: import, self-check, training
+    and evaluation.
 
-    On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate
-    and view take the policy as --hand NAME. Without a GPU the training is short and of an easier
-    task. It stops if the self-check fails. Repeat the command to resume a stopped one.
+    On a GPU this trains the full task with the recipe for all hands. Afterwards grasp, serve,
+    evaluate and view use the policy with --hand NAME. Without a GPU the training is short, and its
+    task is easier. The command stops if the self-check fails. Repeat an interrupted command to
+    resume it.
 
     Examples:
       congrasp hands train my_hand.urdf
@@ -264,31 +272,30 @@ class Train:
     """
 
     hand: Annotated[str, tyro.conf.Positional]
-    """The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a
-    hand's name or file."""
+    """URDF or MJCF file of the hand, or the name or JSON file of an imported hand. A URDF or MJCF
+    file is imported unless a custom hand of the same name exists."""
     name: str = ""
-    """As in 'congrasp hands import', like the next three."""
+    """Name of the hand, as in 'congrasp hands import'."""
     palm: str = ""
-    """Body of the palm."""
+    """Body of the palm, as in 'congrasp hands import'."""
     thumb: str = ""
-    """The last body of the finger that opposes the others."""
+    """Last body of the thumb, as in 'congrasp hands import'."""
     object_scale: float = 0.0
-    """Factor on the objects that it learns to grasp."""
+    """Factor on the size of the objects, as in 'congrasp hands import'."""
     out: pathlib.Path | None = None
     """Folder for the self-check, the run and the report; runs/hands/NAME by default."""
     anyway: bool = False
-    """Train it although its self-check failed."""
+    """Train the hand even if its self-check fails."""
     physics: PhysicsName = "auto"
-    """Engine of the full task and of the evaluation."""
+    """Physics engine of the full task and of the evaluation."""
     episodes: int = 0
-    """Episodes of each row of the report; 0 uses 200, without a GPU 24."""
+    """Number of episodes per row of the report; 0 uses 200, or 24 without a GPU."""
     pool: int = 0
-    """Objects of the report; 0 uses 64, without a GPU 12."""
+    """Number of objects of the report; 0 uses 64, or 12 without a GPU."""
     training: str = ""
-    """Further options of 'congrasp train', as one text."""
+    """Further options of 'congrasp train', as one string."""
     patience: int = 240
-    """Minutes after which the training is stopped, to be resumed by the next 'congrasp hands
-    train'.
+    """Minutes after which the training is stopped. The next 'congrasp hands train' resumes it.
     """
 
     def __call__(self) -> int:
@@ -340,7 +347,9 @@ def _imported(hand: str, choices: "Choices") -> str:
     name = proposal.hand.name
     existing = own_hands().get(name)
     if existing is not None:
-        print(f"The hand '{name}' is {existing}; 'congrasp hands import' would replace it.")
+        print(
+            f"Using the existing hand '{name}' ({existing}); 'congrasp hands import' replaces it."
+        )
     else:
         _store(proposal)
     return name

@@ -26,52 +26,53 @@ class Options:
     """Options of a learner's process."""
 
     run_dir: pathlib.Path
-    """Directory of the run."""
+    """Folder of the run."""
     launch: pathlib.Path | None = None
-    """`launch.json` of a run that `congrasp train` started; the other options default to its
-    values. For the processes of `congrasp train`.
+    """`launch.json` of a run that `congrasp train` started, whose values are the defaults of the
+    other options. `congrasp train` passes it to its processes.
     """
     preset: str = "quickstart"
-    """Named initial configuration."""
+    """Configuration to start from, as for `congrasp train`."""
     hand: str | None = None
-    """The hand, by its name or its file; by default the preset's."""
+    """Name or file of the hand; by default the hand of the preset."""
     listen: str = LEARNER_URL
-    """Endpoint for the actors, which takes four ports from this one on. Other machines need
+    """Endpoint for actors. It uses this port and the next three. For actors on other machines, pass
     tls/0.0.0.0:PORT.
     """
     certs: pathlib.Path | None = None
-    """Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each
-    role to its rights.
+    """Folder of the learner's certificate (congrasp certs). It enables mutual TLS, and restricts
+    each role to its rights.
     """
     initial: pathlib.Path | None = None
-    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors`
-    of a run, or a policy of the package, whose critic starts again.
+    """Policy whose weights replace the random initial weights: `policy.safetensors` of a run, or a
+    policy of the package. Its networks must have the sizes of the run. A policy of the package has
+    no critic, so the critic starts from random weights.
     """
     teacher: str | None = None
-    """A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks
-    read it.
+    """Policy to distil, as for `congrasp train`: a policy file, or the hand of a pretrained policy.
+    Every rank reads it.
     """
     resume: bool = False
-    """Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint
-    starts again.
+    """Resume the run in --run-dir from its newest intact checkpoint. A run without a checkpoint
+    starts from the beginning.
     """
     or_resume: bool = False
-    """Begin the run, or resume it if --run-dir holds one: for supervisors that give the same
-    command every time.
+    """Start the run, or resume it if --run-dir contains a run. This is for supervisors, which
+    always start the same command.
     """
     rank: int = 0
-    """Number of this process among several that train together; each needs a separate GPU
+    """Number of this process among the --ranks processes. Each process needs its own GPU
     (CUDA_VISIBLE_DEVICES).
     """
     ranks: int = 1
-    """Learner processes that train together: data parallel, each with separate actors. The run is
-    in the --run-dir of rank 0; rank r listens 4 r ports above --listen."""
+    """Number of learner processes for data-parallel training, each with its own actors. The run is
+    in the --run-dir of rank 0. Rank r listens 4 r ports above --listen."""
     coordinator: str = "127.0.0.1:7440"
-    """Host and port of rank 0; this port and the next must be free there."""
+    """Host and port of rank 0. This port and the next one must be free on its machine."""
     inside: bool = False
-    """Also run an actor in this process, so that its rollouts never leave the device."""
+    """Also run an actor in this process, so that its rollouts stay on the device."""
     shared: Annotated[LearnerOptions, tyro.conf.arg(name="")] = LearnerOptions()  # noqa: RUF009
-    """Options that `congrasp train` has as well."""
+    """Options of the learner that `congrasp train` has, too."""
 
     @property
     def resumes(self) -> bool:
@@ -104,15 +105,15 @@ class Options:
 
 
 def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
-    """Run only the learner; actors on this or other machines connect to it with `congrasp actor
+    """Run only the learner. Actors on this or other machines connect to it with `congrasp actor
     --connect`.
 
-    A new run takes its configuration from the preset and the command line; a directory with a run
-    keeps its configuration, except for --updates, --ppo.… and others that only the learner uses.
+    A new run has the configuration of the preset and the command line. A resumed run keeps its
+    configuration, except for options that only the learner uses, such as --updates and --ppo.….
 
     Args:
-      options: This process.
-      config: The run.
+      options: Options of this process.
+      config: Configuration of the run.
       watch: Monitoring.
 
     Examples:

@@ -48,9 +48,10 @@ def generate(
     Args:
       out: Folder for the objects.
       count: Number of objects.
-      seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
-      families: Families, in turn, or groups of them: basic (if none is named), household, all
-        (both), scans.
+      seed: Seed of the first object; each further object has the next seed. Training never uses
+        seeds from one million upward.
+      families: Families of the objects, which are used in turn, or groups of families: basic (the
+        default), household, all (both), scans.
 
     Examples:
       congrasp objects generate --count 100
@@ -80,7 +81,8 @@ def list_objects(
     Args:
       folder: Folder of objects.
       families: List the generator's families instead.
-      png: Picture to write: every object, its graspable region green and its avoid region red.
+      png: PNG file to write: a picture of every object, with the graspable region in green and the
+        avoid region in red.
 
     Examples:
       congrasp objects list my-objects --png my-objects.png
@@ -106,7 +108,7 @@ def list_objects(
     if names:
         show_table(_LIST_COLUMNS, rows)
     else:
-        print(f"{folder} holds no object.")
+        print(f"{folder} contains no objects.")
     if png is not None and objects:
         from congrasp.services.viz.object_sheet import overview
 
@@ -141,7 +143,7 @@ def show(
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
         mug:7.
       folder: Folder of objects.
-      png: Picture to write: labelled surface, convex pieces, headings on the table.
+      png: PNG file to write: the labelled surface, the convex pieces, and headings on the table.
 
     Examples:
       congrasp objects show mug:7 --png mug.png
@@ -173,7 +175,7 @@ def rests(
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as
         mug:7.
       folder: Folder of objects.
-      png: Picture to write: a thumbnail of each.
+      png: PNG file to write, with a thumbnail of each resting pose.
 
     Examples:
       congrasp objects rests mug:7 --png rests.png
@@ -218,14 +220,14 @@ class Affordance:
     colour: str = "green"
     """Colour of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb."""
     half_space: tuple[float, ...] = ()
-    """Three numbers of a direction and one in metres: the region farther than that along the
-    direction is graspable. In the object's frame, whose origin is its centre of mass."""
+    """Four numbers: a direction in the object's frame and a distance in metres. The surface beyond
+    this distance along the direction, measured from the centre of mass, is graspable."""
     invert: bool = False
-    """Use the selection as the avoid region, and the rest as the graspable one."""
+    """Use the selected region as the avoid region, and the rest as the graspable region."""
     name: str = ""
-    """Name of the new object; by default it replaces the old one."""
+    """Name of the new object; by default the object is replaced."""
     folder: str = "objects"
-    """Folder of objects, to which the new one goes."""
+    """Folder of objects, in which the new object is stored."""
 
     def __call__(self) -> int:
         """Stores the divided object, and prints the share of its graspable region."""
@@ -237,13 +239,15 @@ class Affordance:
         graspable = self._selection(obj) != self.invert
         if graspable.all():
             raise CongraspError(
-                f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.",
-                "Choose a smaller part.",
+                f"The selected part covers the whole surface of '{obj.name}'.",
+                "Select a smaller part.",
             )
         labelled = two_parts(obj, graspable, self.name)
         file = Catalogue(self.folder).add(labelled)
         share = 1 - labelled.non_graspable_points.mean()
-        print(f"{share:.0%} of the surface of {labelled.name} may be grasped; it is in {file}.")
+        print(
+            f"{share:.0%} of the surface of {labelled.name} is graspable; the object is in {file}."
+        )
         return 0
 
     def _check(self) -> None:
@@ -251,7 +255,7 @@ class Affordance:
         is_defined = (self.part_mesh is not None, self.painted is not None, bool(self.half_space))
         if sum(is_defined) != 1:
             raise CongraspError(
-                "The graspable region is not defined.",
+                "The graspable region must be defined by exactly one option.",
                 "Pass one of --part-mesh, --painted and --half-space.",
             )
         if len(self.half_space) not in (0, 4):

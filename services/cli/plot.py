@@ -18,11 +18,12 @@ def plot(
     and errors.
 
     Args:
-      paths: Runs' folders, or MCAP files, which are overlaid; a run in progress is drawn up to its
-        last half second. Or the JSON file of one 'congrasp evaluate --json'.
+      paths: Folders of runs or MCAP files, whose curves are drawn into the same figures, or one
+        JSON file of 'congrasp evaluate --json'. The last half second of a run in progress is
+        missing.
       out: Folder for the figures; by default 'plots' next to the recordings or the JSON file.
         Required for several runs.
-      formats: Formats of the files.
+      formats: File formats of the figures.
 
     Examples:
       congrasp plot runs/mine

@@ -27,27 +27,29 @@ class Query:
     """
 
     connect: str = SERVER_URL
-    """The server's endpoint."""
+    """Endpoint of the server."""
     name: str = "policy"
-    """Name of the served run."""
+    """Name under which the policy is served ('congrasp serve --name')."""
     object_seed: int = 1_000_000
-    """Seed of the procedural object and of the heading."""
+    """Seed of the procedural object and of the heading in the query."""
     repeat: int = 1
     """Total number of queries."""
     concurrency: int = 1
     """Number of concurrent clients, each with a separate connection."""
     states: int = 1
-    """States in one query, up to 64; each gets an answer."""
+    """Number of states in a query, up to 64; each state gets an answer."""
     rate: float = 0.0
-    """Queries a second of each client; 0 sends the next after each answer."""
+    """Queries per second of each client; with 0 a client sends a query as soon as it has the answer
+    to the last one."""
     timeout: float = 1.0
-    """Deadline of one query, s."""
+    """Deadline of a query, s."""
     certs: pathlib.Path | None = None
     """Folder of a client's certificate (congrasp certs)."""
     health: bool = False
-    """Only check whether the server is ready; the exit code is 0 if it is, else 4."""
+    """Only check if the server is ready. The exit code is then 0, and 4 if it is not."""
     json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded."""
+    """Measure the latency and print it as JSON: p50_ms, p99_ms, answers_per_s, failed,
+    overloaded."""
 
     def __call__(self) -> int:
         """Queries the server, and prints the answer or the latency."""

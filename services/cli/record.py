@@ -35,20 +35,21 @@ def record(
     log_format: LogFormat = "text",
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and
-    episodes.
+    """Record the metrics, events, versions, rollouts and episodes of a run to MCAP, on this or
+    another machine.
 
-    Ctrl-C ends it and finishes the file. A slow or killed recorder never blocks the run, and its
-    file is readable up to the last half second.
+    Ctrl-C stops the recorder and completes the file. A slow or killed recorder never blocks the
+    run. If it is killed, its file is readable except for the last half second.
 
     Args:
-      connect: The learner's endpoint, such as tcp/10.0.0.5:7447.
+      connect: Endpoint of the learner, such as tcp/10.0.0.5:7447.
       run: Name of the run.
       out: Folder for the MCAP files.
-      live: Also serve everything to the Foxglove app on this port of the loopback interface:
+      live: Port of the loopback interface at which the Foxglove app can follow the run live:
         ws://127.0.0.1:PORT.
-      duration: Seconds after which to stop; by default on Ctrl-C.
-      log_format: Text, or one JSON object per line: time, level, role, id, run, text, fields.
+      duration: Seconds after which the recorder stops; by default it stops on Ctrl-C.
+      log_format: Format of log lines: text, or JSON objects with time, level, role, id, run, text
+        and fields.
       certs: Folder of an observer's certificate (congrasp certs).
 
     Examples:

@@ -38,16 +38,16 @@ def episode(
     frames: Annotated[int, tyro.conf.arg(aliases=["--moments"])] = 8,
     video: pathlib.Path | None = None,
 ) -> int:
-    """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red,
-    waypoints, pose.
+    """Draw frames of a recorded episode with its constraints: heading arrow, avoid region in red,
+    waypoints, reference pose.
 
     Args:
-      path: A run's folder, or one MCAP file.
+      path: The folder of a run, or an MCAP file.
       out: The PNG file to write.
-      index: Index of the recorded episode, from 0; -1 is the last.
-      success: Count only episodes that succeeded.
-      frames: Pictures on the sheet.
-      video: Also write the whole episode as an MP4.
+      index: Index of the recorded episode, from 0; -1 is the last episode.
+      success: Apply --index to successful episodes only.
+      frames: Number of frames in the picture.
+      video: MP4 file to which the whole episode is also written.
 
     Examples:
       congrasp render episode runs/mine --success

@@ -19,11 +19,11 @@ _POOL = 64
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Write one HTML file about a policy: results and those of the paper, failures and successes,
-    and its training.
+    """Write an HTML report about a policy: its results next to those of the paper, its failures and
+    successes, and its training.
 
-    It evaluates the policy by the paper's protocol first, and draws some of these episodes. With
-    200 episodes per row that takes some minutes on a CPU; for a quick look pass --episodes 16.
+    The command evaluates the policy by the paper's protocol, and draws some of the episodes. With
+    200 episodes per row this takes some minutes on a CPU. For a quick report pass --episodes 16.
 
     Examples:
       congrasp report runs/mine --episodes 16
@@ -31,13 +31,13 @@ class Report:
     """
 
     source: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
-    """A run's folder or a policy file; by default a pretrained policy."""
+    """Folder of a run, or a policy file; by default the pretrained policy of --hand."""
     out: pathlib.Path = pathlib.Path("report.html")
-    """The file to write."""
+    """The HTML file to write."""
     objects: pathlib.Path | None = None
-    """Objects to grasp, as for 'congrasp evaluate'; held-out procedural ones by default."""
+    """Objects to grasp, as for 'congrasp evaluate'; by default held-out procedural objects."""
     episodes: int = 200
-    """Episodes in each row."""
+    """Number of episodes per row."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
     pool: int = _POOL
@@ -47,10 +47,10 @@ class Report:
     hand: str = "human"
     """Hand of the pretrained policy."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
-    """Also write the rows to this file."""
+    """Also write the rows to this JSON file."""
     check: pathlib.Path | None = None
-    """A file of 'congrasp hands check --json' to include in the report, with its --png of the same
-    name.
+    """File of 'congrasp hands check --json' to include in the report. The picture of --png must be
+    next to it under the same name.
     """
 
     def __call__(self) -> int:

@@ -33,12 +33,12 @@ class Reproduce:
     """Reproduce the paper's tables: train missing policies, evaluate, and write a page, JSON and
     LaTeX.
 
-    On a GPU it trains the full system for each hand, then the baselines and ablations that learn,
-    each as 'congrasp train' in a separate run below OUT/policies; a failure does not stop the rest.
-    Then it evaluates all tables. Every figure is shown with the paper's, its interval and the
-    difference; figures that are not comparable are listed with the reason. Repeat the command to
-    resume a stopped one: trainings resume from their last checkpoint, and finished tables are only
-    repeated if policy or settings changed.
+    On a GPU this trains the full system for each hand, and then the baselines and ablations that
+    are trained. Each training is a separate run of 'congrasp train' in OUT/policies; a failure does
+    not stop the others. Then all tables are evaluated. The page shows every figure with its
+    interval, the paper's figure and the difference, and lists figures that are not comparable with
+    the reason. Repeat an interrupted command to resume it: trainings resume from their last
+    checkpoint, and finished tables are repeated only if the policy or the settings changed.
 
     Examples:
       congrasp reproduce --quick
@@ -50,32 +50,32 @@ class Reproduce:
     pictures.
     """
     quick: bool = False
-    """Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two
-    CPU cores.
+    """Use the pretrained policies without any training, and evaluate 48 episodes per row. This
+    takes minutes on two CPU cores.
     """
     hands: tuple[str, ...] = ()
-    """Hands whose full system is evaluated; the other tables use the first one. By default all with
-    a pretrained policy."""
+    """Hands whose full system is evaluated; the tables of a single hand use the first of them. By
+    default all hands with a pretrained policy."""
     methods: tuple[str, ...] = ()
-    """Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward,
-    two-phase, single-stage; by default all."""
+    """Methods to compare with the full system: pd, graspxl, dgrasp, no-dynamic-center,
+    no-feedforward, two-phase, single-stage; by default all."""
     policy: tuple[str, ...] = ()
-    """Policies that need no training, in the form of 'congrasp evaluate --policy'."""
+    """Policies to use instead of training them, as for 'congrasp evaluate --policy'."""
     captured: tuple[pathlib.Path, ...] = ()
     """Folders of captured data sets, each with the folders 'objects' and 'constraints' that
     'congrasp constraints import' makes; most of the paper's tables need them."""
     episodes: int = 0
-    """Episodes of a row; 0 takes 1,000, with --quick 48."""
+    """Number of episodes per row; 0 uses 1,000, or 48 with --quick."""
     pool: int = 0
-    """Procedural objects of a row; 0 takes 64, with --quick 24."""
+    """Number of procedural objects per row; 0 uses 64, or 24 with --quick."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
     seed: int = 0
     """Seed of constraints and episodes."""
     training: str = ""
-    """Further options of every 'congrasp train', as one text."""
+    """Further options of every 'congrasp train', as one string."""
     patience: int = 240
-    """Minutes after which a training is stopped, to be resumed by the next 'congrasp reproduce'."""
+    """Minutes after which a training is stopped. The next 'congrasp reproduce' resumes it."""
 
     def __call__(self) -> int:
         """Trains, evaluates, and prints a summary."""

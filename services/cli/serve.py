@@ -32,27 +32,29 @@ class Serve:
     """
 
     policy: pathlib.Path | None = None
-    """A policy file, reread whenever it changes, or 'allegro-student', whose inputs a robot can
-    measure; by default the pretrained policy of the hand."""
+    """A policy file, which is read again whenever it changes, or the name of a pretrained policy.
+    Policies such as allegro-student observe only what a robot can measure. By default the
+    pretrained policy of --hand."""
     hand: str = "human"
     """Hand of the pretrained policy."""
     connect: str = ""
-    """A learner's endpoint to follow instead of a file."""
+    """Endpoint of a learner whose newest policy is served, instead of a policy file."""
     run: str = "quickstart"
-    """Name of the run to follow."""
+    """Name of the learner's run, with --connect."""
     patience: float | None = None
-    """Seconds without the learner of --connect after which the server gives up at its start; by
-    default it waits without end."""
+    """Seconds for which the server waits for the learner of --connect when it starts; without
+    limit by default."""
     listen: str = SERVER_URL
-    """Endpoint for the clients."""
+    """Endpoint for clients."""
     name: str = "policy"
-    """Name under which the policy is served."""
+    """Name under which clients find the policy."""
     watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
-    """Folder of a server's certificate (congrasp certs), for its clients and for the learner."""
+    """Folder of the server's certificate (congrasp certs), for connections to clients and to the
+    learner."""
     insecure: bool = False
-    """Listen beyond loopback without certificates."""
+    """Accept connections from other machines without certificates."""
 
     def __call__(self) -> int:
         """Serves until a signal."""
@@ -70,7 +72,7 @@ class Serve:
         if self.policy is not None and self.connect:
             raise CongraspError(
                 f"The server can follow either {self.policy} or {self.connect}.",
-                "Give one of --policy and --connect.",
+                "Pass one of --policy and --connect.",
             )
         jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
         metrics = ServerMetrics()

@@ -30,39 +30,41 @@ def train(  # noqa: PLR0913
     resume: bool = False,
     evaluation: int | None = None,
 ) -> int:
-    """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback
-    interface.
+    """Train a policy: one learner and its actors on this machine, which exchange messages over
+    Zenoh on the loopback interface.
 
-    Starts from a preset; every field of the run can be set on the command line. `--preset full
-    --hand HAND` is the full task for any hand, by the recipe for all of them; human, allegro and
-    sharpa are presets that mean the same.
+    The configuration is that of a preset, and every field of it can be set on the command line.
+    `--preset full --hand HAND` trains any hand on the full task, with one recipe for all hands. The
+    presets human, allegro and sharpa are short for this with these hands.
 
     Args:
-      config: The run.
-      launch: Its processes.
-      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or
-        check, which trains nothing and shows that physics, messages, log, server and pictures work
-        here.
-      method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl,
-        dgrasp, no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots
-        (student, with a tracker; camera, with a depth camera). By default that of the preset, ours.
-      hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by
-        default the preset's.
+      config: Configuration of the run.
+      launch: Processes of the run.
+      preset: Configuration to start from: quickstart, full, human, allegro or sharpa. The preset
+        check does not train a useful policy: it tests physics, messages, log, server and pictures
+        on this machine.
+      method: Method whose settings are used: ours (the full method), a baseline or ablation of the
+        paper (graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase, single-stage), or a
+        policy for robots (student: with an object tracker; camera: with a depth camera). By default
+        the method of the preset, which is ours.
+      hand: The hand: its name ('congrasp hands list') or its file ('congrasp hands import'). By
+        default the hand of the preset.
       run_dir: Folder of the run; runs/NAME-DATE by default.
-      initial: A policy to begin with instead of random weights, of the same networks:
-        `policy.safetensors` of a run, or a policy of the package, whose critic starts again.
-      teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for
-        robots, which sees the joints, the wrist and a tracker's object poses, no forces and no
-        velocities (docs/students.md), or with `--method camera` a partial point cloud
-        (docs/camera.md). The task is the teacher's, the algorithm `distill`.
-      constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp
-        constraints import'); their objects are those of --objects.folder, and --objects.procedural
-        adds others.
-      split: Split of these sets: training (the default), held out, or all.
+      initial: Policy whose weights replace the random initial weights: `policy.safetensors` of a
+        run, or a policy of the package. Its networks must have the sizes of the run. A policy of
+        the package has no critic, so the critic starts from random weights.
+      teacher: Policy to distil into a student: a policy file, or the hand of a pretrained policy.
+        The student observes the joints, the wrist and object poses from a tracker, but neither
+        forces nor velocities (docs/students.md). With `--method camera` it observes a partial point
+        cloud (docs/camera.md). The task is the teacher's, and the algorithm is `distill`.
+      constraints: Folder of constraint sets to train with, such as captured ones ('congrasp
+        constraints import'). --objects.folder holds their objects, and --objects.procedural adds
+        objects of the generator.
+      split: Part of these sets to use: training (the default), held-out, or all.
       resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the
         run; options that only the learner uses, such as --updates and --ppo.…, may be changed.
-      evaluation: Episodes of the evaluation after training, on held-out objects; by default 192, or
-        three times --environments if that is less; 0 leaves it out.
+      evaluation: Number of episodes of the evaluation after training, on held-out objects. By
+        default 192, or three times --environments if that is less. 0 skips the evaluation.
 
     Examples:
       congrasp train --preset quickstart --run-dir runs/mine
@@ -124,8 +126,8 @@ def _check_hand(run_dir: str, config: RunConfig, preset: str, hand: str | None) 
     """Raises a CongraspError for a preset of another hand than that of the run to resume."""
     if preset and get_preset(preset, hand).task.hand != config.task.hand:
         raise CongraspError(
-            f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset "
-            f"{preset} is not for.",
+            f"{run_dir} is a run of the hand '{get_hand(config.task.hand).name}', but --preset "
+            f"{preset} is for another hand.",
             "Leave out --preset, or choose another --run-dir.",
         )
 

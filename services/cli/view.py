@@ -23,12 +23,12 @@ _RUN = "quickstart"
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Request a grasp in the browser and play it: set the heading, paint the avoid region, draw the
-    wrist's path.
+    """Open the studio in a browser: set the heading, paint the avoid region, draw the wrist's path,
+    and watch the resulting grasp.
 
-    With a run's folder, or with --connect, it uses the newest weights of a run in training and
-    shows the run: its curves, its actors and their episodes. With a run's folder, or with
-    --recordings, a click on a curve finds the episodes of that time.
+    With a run's folder or --connect, the studio grasps with the newest weights of a run in training
+    and shows its curves, its actors and their episodes. With a run's folder or --recordings, a
+    click on a curve lists the episodes of that time.
 
     Examples:
       congrasp view runs/mine
@@ -36,30 +36,32 @@ class View:
     """
 
     run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
-    """Folder of a run on this machine, live or finished, in place of --connect, --run, --recordings
+    """Folder of a live or finished run on this machine. It replaces --connect, --run, --recordings
     and --policy.
     """
     objects: pathlib.Path | None = None
-    """Custom objects: a mesh, a folder of meshes, or a folder of 'congrasp objects import'."""
+    """Your own objects: a mesh, a folder of meshes, or a folder of 'congrasp objects import'."""
     policy: pathlib.Path | None = None
-    """A policy file, reread whenever it changes; by default the pretrained ones."""
+    """A policy file, which is read again whenever it changes; by default the pretrained
+    policies."""
     connect: str = ""
-    """Endpoint of a learner to follow, such as tcp/10.0.0.5:7447."""
+    """Endpoint of the learner of a run, such as tcp/10.0.0.5:7447."""
     run: str = _RUN
-    """Name of the run to follow."""
+    """Name of the learner's run, with --connect."""
     recordings: pathlib.Path | None = None
-    """Folder of the recordings (*.mcap) of a live or finished run."""
+    """Folder with recordings (*.mcap) of a live or finished run."""
     host: str = "127.0.0.1"
-    """Interface of the page. There is no password: every client that reaches it can use it."""
+    """Interface at which the page is offered. There is no password: whoever reaches this interface
+    can use the page."""
     port: int = 7480
-    """Port of the page; 0 takes a free one."""
+    """Port of the page; 0 takes a free port."""
     allow_host: tuple[str, ...] = ()
-    """Names under which a proxy on this machine offers the page, such as hub.example.org."""
+    """Host names under which a proxy on this machine offers the page, such as hub.example.org."""
     insecure: bool = False
-    """Offer the page beyond loopback."""
+    """Allow --host to offer the page to other machines."""
     certs: pathlib.Path | None = None
-    """Folder of certificates (congrasp certs), for --connect: an observer's, and a server's to
-    grasp with the weights of the run."""
+    """Folder of certificates (congrasp certs) for --connect: that of an observer, and that of a
+    server to grasp with the weights of the run."""
 
     def __call__(self) -> int:
         """Offers the page until a signal."""
@@ -83,8 +85,9 @@ class View:
 
         if self.connect or self.policy or self.recordings or self.run != _RUN:
             raise CongraspError(
-                f"The folder {run_dir} is in place of --connect, --run, --policy and --recordings.",
-                "Give either the folder or these.",
+                f"The folder {run_dir} cannot be combined with --connect, --run, --policy or "
+                "--recordings.",
+                "Pass either the folder or these options.",
             )
         name = open_run(run_dir).name
         page = dataclasses.replace(self, run=name, recordings=run_dir)
@@ -115,7 +118,7 @@ class View:
         if self.policy is not None and self.connect:
             raise CongraspError(
                 f"The studio can take either {self.policy} or the weights of {self.connect}.",
-                "Give one of --policy and --connect.",
+                "Pass one of --policy and --connect.",
             )
         host = f"[{self.host}]" if ":" in self.host else self.host
         check_exposure(f"tcp/{host}:{self.port}", None, insecure=self.insecure)

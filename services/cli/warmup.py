@@ -23,26 +23,26 @@ def warmup(
     export: pathlib.Path | None = None,
     source: Annotated[pathlib.Path | None, tyro.conf.arg(name="import")] = None,
 ) -> int:
-    """Compile the programs of `congrasp train` on this machine in advance: kernels, programs, the
-    constraint bank.
+    """Prepare this machine for `congrasp train`: compile its programs and GPU kernels, and compute
+    its constraint bank.
 
-    Makes the first update of such a training and discards it. It fills the caches in
-    JAX_COMPILATION_CACHE_DIR (compiled programs; by default congrasp/jax in the user's cache
-    folder), WARP_CACHE_PATH (GPU kernels; by default warp in that folder) and congrasp/banks in the
-    user's cache folder (XDG_CACHE_HOME). They can be filled while a container image is built, and
-    carried as one file to machines with the same kind of GPU and the same versions. Other numbers
-    of environments or steps need other programs. On several GPUs, run it before `congrasp train
-    --ranks`: otherwise each rank compiles.
+    The command computes the first update of such a training and discards it. This fills the caches
+    in JAX_COMPILATION_CACHE_DIR (compiled programs; by default congrasp/jax in the user's cache
+    folder), WARP_CACHE_PATH (GPU kernels; by default warp in the user's cache folder) and
+    congrasp/banks in the user's cache folder (XDG_CACHE_HOME). You can fill them while a container
+    image is built, or copy them as one file to machines with the same type of GPU and the same
+    versions. Other numbers of environments or steps need other programs. On several GPUs, run this
+    command before `congrasp train --ranks`; otherwise each rank compiles.
 
     Args:
-      preset: Named configuration that will be trained.
-      hand: The hand, by its name or its file; by default the preset's.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      environments: Environments of an actor; 0: those of the preset.
-      rollout_steps: Control steps of a rollout; 0: those of the preset.
-      export: Tar file into which everything in these caches is then written.
-      source: Such a file, from which the caches are filled instead. It holds programs that will run
-        here: import only files that you trust.
+      preset: Preset of the training.
+      hand: Name or file of the hand; by default the hand of the preset.
+      physics: Physics engine; auto takes warp on an NVIDIA GPU and native on a CPU.
+      environments: Number of environments of an actor; 0 uses that of the preset.
+      rollout_steps: Number of control steps of a rollout; 0 uses that of the preset.
+      export: Tar file to which the content of the caches is written afterwards.
+      source: File of --export from which the caches are filled instead. It contains programs that
+        will run on this machine, so import only files that you trust.
 
     Examples:
       congrasp warmup --preset human

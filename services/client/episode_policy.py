@@ -93,7 +93,7 @@ class EpisodePolicy(Policy):
         """See `Policy.act_each`."""
         forks.require_same_process(self._opened, "policy")
         if not states:
-            raise RefusedError("There is no state to act in.", "Give one or more.")
+            raise RefusedError("There is no state.", "Pass at least one state.")
         return self._ask(time.perf_counter(), states)
 
     def close(self) -> None:
@@ -170,8 +170,8 @@ class EpisodePolicy(Policy):
 
 
 def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
-    """Returns a state whose new points do not get the normals of the episode's first ones: zeros
-    are estimated.
+    """Returns a state without the normals of the episode's first points if it has new points. Their
+    normals are zero, which requests that the server estimates them.
     """
     new_points = [state[name] for name in ("cloud", "surface_points") if name in state]
     if not new_points or "surface_normals" in state or "surface_normals" not in episode:

@@ -36,20 +36,20 @@ def numbers(name: str, value: Any) -> np.ndarray:
     """A field's value, unchanged if it is bool, else as float32.
 
     Raises:
-      RefusedError: it is no array of numbers.
+      RefusedError: the value is not a numeric array.
     """
     try:
         array = np.asarray(value)
         return array if array.dtype == bool else array.astype(np.float32)
     except (TypeError, ValueError):
-        raise RefusedError(f"The field '{name}' is no array of numbers.") from None
+        raise RefusedError(f"The field '{name}' is not a numeric array.") from None
 
 
 def checked(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Returns fields as arrays, in metres and radians.
 
     Raises:
-      RefusedError: a field is no array of numbers, or in mm, cm or degrees.
+      RefusedError: a field is not a numeric array, or is in mm, cm or degrees.
     """
     fields = {name: numbers(name, value) for name, value in values.items()}
     # Numbers that are not finite are refused by the first `act`
@@ -68,7 +68,7 @@ def _check_metres(name: str, points: np.ndarray | None) -> None:
     spread = np.median(np.abs(points - np.median(points, 0)))
     if spread > _MAX_SPREAD:
         raise RefusedError(
-            f"The field '{name}' has half of its points beyond {spread:.3g} m.",
+            f"The median extent of the field '{name}' would be {spread:.3g} m.",
             "Give it in metres.",
         )
 
@@ -91,19 +91,19 @@ def episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
     """The constant fields of an episode's queries, and the first targets.
 
     Raises:
-      RefusedError: the request lacks one of them, or one is no array of numbers.
+      RefusedError: the request lacks a required field, or a field is not a numeric array.
     """
     required = _REQUIRED if request.cloud is None else _REQUIRED_WITH_CAMERA
     lacking = [f"'{name}'" for name in required if getattr(request, name) is None]
     if lacking or request.wrist is None:
         raise RefusedError(
             f"The request lacks {' and '.join(lacking)}.",
-            "A control loop starts from measured poses.",
+            "Pass the measured values to GraspRequest.",
         )
     if request.above:
         raise RefusedError(
-            "The request is for a hand from above.",
-            "Give the heading's direction to a control loop.",
+            "The request has the option `above`, which a control loop does not support.",
+            "Pass an explicit direction of the heading.",
         )
     base_position, base_quaternion = position_and_quaternion("wrist", request.wrist)
     position, quaternion = position_and_quaternion("object_pose", request.object_pose)
@@ -128,12 +128,12 @@ def position_and_quaternion(name: str, pose: Pose | None) -> tuple[Any, Any]:
     """Position and quaternion of a pose; None for both without one.
 
     Raises:
-      RefusedError: it is no pair.
+      RefusedError: the pose is not a pair.
     """
     if pose is None:
         return None, None
     try:
         position, quaternion = pose
     except (TypeError, ValueError):
-        raise RefusedError(f"'{name}' is no pair of a position and a quaternion.") from None
+        raise RefusedError(f"'{name}' must be a (position, quaternion) pair.") from None
     return position, quaternion

@@ -148,11 +148,14 @@ class Guard(Closing):
         if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
             raise CongraspError(
                 "The open pose must have a finite angle for each finger joint of the limits.",
-                "For a hand with fewer motors than joints, make limits of its joints by hand "
+                "For a hand with fewer motors than joints, construct JointLimits yourself "
                 "(docs/robots.md).",
             )
         if not (0.0 <= wait < period and 0.0 < stale <= hold):
-            raise CongraspError("The times must be: 0 <= wait < period, and 0 < stale <= hold.")
+            raise CongraspError(
+                f"wait is {wait}, period {period}, stale {stale} and hold {hold}.",
+                "Choose 0 <= wait < period, and 0 < stale <= hold.",
+            )
         if fallback not in ("freeze", "open"):
             raise CongraspError(f"The fallback is {ascii(fallback)[:40]}.", "It is freeze or open.")
         self.counters = Counters()
@@ -354,7 +357,7 @@ def _completed(
         if metadata["limits"] is None:
             raise CongraspError(
                 f"Joints of the hand '{metadata['hand']}' share motors.",
-                "Make limits of its joints by hand (JointLimits).",
+                "Construct JointLimits yourself and pass them as `limits`.",
             )
         limits = JointLimits(**metadata["limits"])
     if open_pose is None:

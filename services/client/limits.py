@@ -51,12 +51,10 @@ class JointLimits:
             value.flags.writeable = False
             object.__setattr__(self, field.name, value)
         if self.lower.ndim != 1 or len(self.lower) < 6:
-            raise CongraspError(
-                "The limits are of the finger joints and the six joints of the wrist."
-            )
+            raise CongraspError("The limits must cover the finger joints and the six wrist joints.")
         if not (self.lower <= self.upper).all() or not (self.kp > 0.0).all():
             raise CongraspError(
-                "The limits have a lower bound above the upper one, or a kp that is not positive."
+                "The limits have a lower bound above an upper bound, or a kp that is not positive."
             )
 
     def _check_field(self, name: str, value: np.ndarray) -> None:

@@ -76,8 +76,8 @@ class Packer:
         """
         if len(states) > self._max_states:
             raise RefusedError(
-                f"These are {len(states)} states.",
-                f"The policy takes {self._max_states} at a time.",
+                f"The query has {len(states)} states.",
+                f"Pass at most {self._max_states} states at a time.",
             )
         vectors = np.tile(self._vector, (len(states), 1))
         required = [name for name in MEASURED if name in self._fields]
@@ -108,7 +108,7 @@ class Packer:
                     continue
                 raise RefusedError(
                     f"The query has an unknown field '{name}'.",
-                    f"Known: {', '.join(self._fields)}.",
+                    f"Choose from: {', '.join(self._fields)}.",
                 )
             offset, *rest = self._fields[name]
             shape = tuple(rest)

@@ -54,7 +54,7 @@ class Policy(Closing, Protocol):
             world frame.
 
         Raises:
-          RefusedError: the request lacks one of them, or a value is no array of numbers.
+          RefusedError: the request lacks a required field, or a field is not a numeric array.
         """
         ...
 

@@ -86,11 +86,13 @@ class PolicyClient(EpisodePolicy):
         metadata = dict(reply.meta)
         if "query" not in metadata:
             raise RefusedError(
-                "The server does not describe its queries.", "Update congrasp where it runs."
+                "The server does not describe its queries.",
+                "Update congrasp on the server's machine.",
             )
         if metadata["hand"] != self._hand:
             raise RefusedError(
-                f"The policy is for the hand {ascii(metadata['hand'])[:60]}, not '{self._hand}'."
+                f"The policy is for the hand {ascii(metadata['hand'])[:60]}, not '{self._hand}'.",
+                "Connect to a server of this hand, or pass another hand.",
             )
         self._is_known = True
         return metadata

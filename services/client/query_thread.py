@@ -130,5 +130,5 @@ class QueryThread:
         except Exception as error:
             return TransportError(f"The policy failed: {type(error).__name__}: {error}")
         if not isinstance(answer, Answer):
-            return TransportError("The policy's answer is none.")
+            return TransportError("The policy did not return an Answer.")
         return answer

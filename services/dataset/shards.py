@@ -94,7 +94,7 @@ def _read(path: pathlib.Path, changed: int) -> _Content:
             pass
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise CongraspError(
-            f"{path} is damaged, or no shard of a dataset ({str(error)[:100]}).",
+            f"{path} is damaged, or is not a shard of a dataset ({str(error)[:100]}).",
             "Delete it, and repeat the command to make it again.",
         ) from None
     return _Content(description, schema, hashlib.sha256(data).hexdigest())
@@ -124,7 +124,7 @@ def _check_description(
     for name, value in about.items():
         if description.get(name) != value:
             raise CongraspError(
-                f"{path} is of another dataset: its {name} is {description.get(name)}, not "
+                f"{path} belongs to another dataset: its {name} is {description.get(name)}, not "
                 f"{value}.",
                 "Pass another --out, or the options of the first command (in card.json).",
             )

@@ -36,8 +36,8 @@ def captured_objects(
     objects_with_set, sets = load_for(folder, objects, split)
     if not sets:
         raise CongraspError(
-            f"{folder} holds no constraint set ({split}) of these objects.",
-            "Pass folders that belong together, or another --split.",
+            f"{folder} contains no constraint set ({split}) of these objects.",
+            "Pass the folders of the same import, or another --split.",
         )
     sources = {constraint_set.meta.get("source", "") for constraint_set in sets}
     paper = ""

@@ -166,8 +166,8 @@ PLAUSIBILITY: Columns[Row] = (
     *((column, _rate_cell(name)) for column, name in _PUSHES.items()),
 )
 """Plausibility: deepest penetrations (mean, 95th percentile), also of the hand's meshes into the
-object if it has some; peak speed and acceleration of the wrist; rates. A push stands for six in a
-row (`actors.stress.Protocol`)."""
+object if it has some; peak speed and acceleration of the wrist; rates. Each push is a series of six
+(`actors.stress.Protocol`)."""
 POSTURE: Columns[Row] = (("posture off, °", _posture),)
 """Deviation of the fingers from natural postures (`common.task.posture`); files of earlier versions
 have none."""

@@ -97,8 +97,10 @@ class Lineup(NamedTuple):
         for one, _ in self.entrants:
             if one.hand != hand:
                 raise CongraspError(
-                    f"The constraint sets are for the hand '{hand}', the policy for '{one.hand}'.",
-                    f"Generate them for it with 'congrasp constraints import … --hand {one.hand}'.",
+                    f"The constraint sets are for the hand '{hand}', but the policy is for "
+                    f"'{one.hand}'.",
+                    f"Import sets for the policy's hand: 'congrasp constraints import … --hand "
+                    f"{one.hand}'.",
                 )
 
 
@@ -150,7 +152,8 @@ def _policy_files(path: pathlib.Path) -> list[pathlib.Path]:
     files = sorted({*path.glob(POLICY_FILE), *path.glob(f"*/{POLICY_FILE}")})
     if not files:
         raise CongraspError(
-            f"The folder {path} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file."
+            f"The folder {path} contains no {POLICY_FILE}.",
+            "Pass the folder of a run, or a policy file.",
         )
     return files
 
@@ -163,7 +166,7 @@ def _check_different(entrants: Sequence[Entrant]) -> None:
         if key in keys:
             raise CongraspError(
                 f"Two policies have the hand '{entrant.hand}' and the method '{entrant.method}'.",
-                "Evaluate one at a time.",
+                "Evaluate them with separate commands.",
             )
         keys.add(key)
 

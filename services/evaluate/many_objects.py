@@ -139,7 +139,8 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
     results = [result for result in results if result.episodes]
     if not results:
         raise CongraspError(
-            "None of the objects can be approached.", "Scale them for the hand, or pass others."
+            "None of the objects can be approached.",
+            "Scale the objects for the hand, or pass other objects.",
         )
     first = 0
     facts: list[_ObjectFacts] = []

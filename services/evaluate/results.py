@@ -87,7 +87,9 @@ def read_results(file: pathlib.Path) -> Results:
         about = read_json(file, _MAX_FILE_BYTES, remedy)
         rows = [Row.from_json(row) for row in about.pop("rows")]
     except (LookupError, TypeError, AttributeError):
-        raise CongraspError(f"{file} is not a file of results of this version.", remedy) from None
+        raise CongraspError(
+            f"{file} is not a results file of this version of congrasp.", remedy
+        ) from None
     for name in _REQUIRED:
         if name not in about:
             raise CongraspError(f"{file} lacks '{name}'.", remedy)

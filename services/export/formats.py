@@ -66,11 +66,13 @@ def _check_content(count: int, kind: str, camera: bool) -> None:
         return
     if count > 1:
         raise CongraspError(
-            f"A {kind} file holds one motion, but {count} were given.", "Pass one at a time."
+            f"A {kind} file contains a single motion, but there are {count}.",
+            "Export them with separate commands.",
         )
     if camera:
         raise CongraspError(
-            f"A {kind} file holds no video.", f"Remove --camera, or pass --to {DATASETS[0]}."
+            f"A {kind} file cannot contain a video.",
+            f"Remove --camera, or pass --to {DATASETS[0]}.",
         )
 
 

@@ -143,16 +143,19 @@ def _episode_row(
 
 
 def _frame_rate(motions: Sequence[Episode]) -> int:
-    """Frames a second of motions of one robot."""
+    """Frames per second of motions of one robot."""
     dt = motions[0].control_dt
     fps = round(1 / dt)
     if abs(fps * dt - 1) > 1e-6:
-        raise CongraspError(f"A control step of {dt} s makes no whole number of frames a second.")
+        raise CongraspError(
+            f"A control step of {dt} s does not give an integer number of frames per second.",
+            "LeRobot stores integer frame rates alone: export another format.",
+        )
     robot = _robot(motions[0])
     if any(_robot(motion) != robot for motion in motions):
         raise CongraspError(
             "A dataset has one robot and one control step, but the motions differ.",
-            "Export each set.",
+            "Export the motions of each robot and control step as a separate dataset.",
         )
     return fps
 

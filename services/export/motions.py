@@ -27,12 +27,13 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
     if path.suffix == ".npz":
         if index not in (-1, 0):
             raise CongraspError(
-                f"{path} is one motion and has no number {index}.", "Remove --index."
+                f"{path} holds a single motion, without the number {index}.", "Remove --index."
             )
         return load_motion(path)
     if path.is_file() and path.suffix != ".mcap":
         raise CongraspError(
-            f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder."
+            f"{path} contains no motion.",
+            "Pass a grasp.npz, a recording (.mcap) or a run's folder.",
         )
     from congrasp.services.record.reader import pick_episode  # with MCAP's packages
 
@@ -52,7 +53,8 @@ def at_rate(motion: Episode, fps: float) -> Episode:
     rate = 1 / motion.control_dt
     if not 0 < fps <= rate + _RATE_TOLERANCE:
         raise CongraspError(
-            f"--fps is {fps:g}.", f"The motion has {rate:g} frames a second: set at most as many."
+            f"--fps is {fps:g}.",
+            f"Pass at most {rate:g}, the frames per second of the motion.",
         )
     last = motion.steps - 1
     count = int(last * fps / rate + _RATE_TOLERANCE) + 1

@@ -36,14 +36,14 @@ def to_attempt(
     batch: int,
     rng: np.random.Generator,
 ) -> tuple[RequestedEpisodes, np.ndarray, int]:
-    """Samples episodes that attempt a request at an object with its regions.
+    """Samples episodes that attempt a request for an object with labelled regions.
 
     Returns:
       The episodes, the resting pose of each (B,), and the number of distinct ones, which come
       first.
 
     Raises:
-      CongraspError: no approach fits the request, or its reference leads through the table.
+      CongraspError: no approach fits the request, or its reference path leads through the table.
     """
     episodes = repeated(hand, task, obj, request, batch)
     path = prescribed(request)
@@ -103,10 +103,10 @@ def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
 def headings(
     hand: Hand, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the
-    table allows.
+    """Samples headings for which the table leaves room: positions, directions, cross-finger axes
+    (B, 3) and resting poses (B,).
 
-    Likelier resting poses come more often.
+    Likely resting poses are sampled more often.
 
     Raises:
       CongraspError: no approach fits the request.
@@ -133,7 +133,7 @@ def headings(
 
 
 class _Option(NamedTuple):
-    """A heading in a resting pose that leaves room for it."""
+    """A heading, and a resting pose in which the table leaves room for the hand."""
 
     rest: int
     position: np.ndarray
@@ -149,7 +149,7 @@ class _Option(NamedTuple):
 def _sampled_headings(
     hand: Hand, obj: GraspObject, request: GraspRequest, rng: np.random.Generator
 ) -> Headings:
-    """Headings at an object under a request, whatever its resting pose.
+    """Headings of a request for an object, independent of its resting pose.
 
     Raises:
       CongraspError: no approach reaches the graspable part.
@@ -167,7 +167,8 @@ def _sampled_headings(
         if candidates:
             return candidates
     raise CongraspError(
-        f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
+        f"No approach reaches the graspable region of '{obj.name}' without touching its avoid "
+        "region.",
         _remedy(request, "make the graspable part larger"),
     )
 
@@ -175,7 +176,9 @@ def _sampled_headings(
 def _with_room(
     hand: Hand, obj: GraspObject, request: GraspRequest, candidates: Headings
 ) -> list[_Option]:
-    """Headings in each resting pose that leaves room for them; likelier poses weigh more."""
+    """Headings in each resting pose in which the table leaves room for them; likely poses have
+    higher weights.
+    """
     options = []
     reachable = within_reach(candidates, obj, obj.rest_poses, outline(hand))
     for rest, (cleared, room) in enumerate(zip(*reachable, strict=True)):
@@ -208,11 +211,17 @@ def _is_free(request: GraspRequest) -> bool:
 
 
 def _too_flat(hand: Hand, obj: GraspObject, rest: int) -> CongraspError:
-    """Error for an object whose likeliest resting pose leaves no room; `rest` is one that does."""
+    """Error for an object whose likeliest resting pose leaves the hand no room.
+
+    Args:
+      hand: the hand.
+      obj: the object.
+      rest: index of a resting pose that leaves room.
+    """
     height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
     return CongraspError(
-        f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in "
-        f"its likeliest resting pose, which leaves the fingers no room over the table.",
+        f"'{obj.name}' lies too flat for the {hand.name} hand: it is {1000 * height:.0f} mm high "
+        f"in its likeliest resting pose, which leaves the fingers no room above the table.",
         f"Set --rest {rest + 1} to grasp it in another resting pose.",
     )
 
@@ -232,8 +241,11 @@ def _balanced(obj: GraspObject) -> GraspObject:
 
 
 def _remedy(request: GraspRequest, otherwise: str) -> str:
-    """Remedy for a request that no approach fits: leave out an option that restricts it, or
-    `otherwise`.
+    """Remedy for a request that no approach fits.
+
+    Args:
+      request: the request.
+      otherwise: remedy besides leaving out the options that restrict the approach.
     """
     options = {
         "--rest": request.rest is not None,
@@ -247,7 +259,7 @@ def _remedy(request: GraspRequest, otherwise: str) -> str:
 
 
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
-    """Error and remedy where the table leaves room for no approach."""
+    """Error and remedy if the table does not leave room for any approach."""
     if request.rest is not None:
         return (
             f"'{obj.name}' cannot be approached under these constraints in resting pose "
@@ -261,15 +273,15 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
         )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (
-        "In every resting pose, the hand would have to come through the table.",
-        f"In its likeliest pose straight down is --heading "
+        "In every resting pose, the hand would have to approach through the table.",
+        f"Set another --heading. In the likeliest resting pose, straight down is --heading "
         f'"{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
     )
 
 
 def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
-    """Wrist positions (n, 3) and last orientation (4,) prescribed by the strongest constraint; None
-    if it is free.
+    """Wrist positions (n, 3) and last orientation (4,) that the strongest constraint prescribes;
+    None if no constraint prescribes them.
     """
     for constraint in reversed(CONSTRAINTS):
         if constraint.name in request.constraints:
@@ -286,19 +298,20 @@ def valid_rests(
     is not from below.
 
     Raises:
-      CongraspError: there is none, or the requested pose `rest` is not among them.
+      CongraspError: there is no such resting pose, or the requested one, `rest`, is not among them.
     """
     valid = np.flatnonzero(_clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(
-            f"With this reference the hand would be in the table in every resting pose of "
-            f"'{obj.name}'.",
-            "The wrist must stay 2 cm above the table, and the hand must come from above or "
-            "horizontally.",
+            f"With this reference pose or path, the hand would be in the table in every resting "
+            f"pose of '{obj.name}'.",
+            "Use a reference whose wrist stays 2 cm above the table, and whose hand approaches "
+            "from above or horizontally.",
         )
     if rest is not None and rest not in valid:
         raise CongraspError(
-            f"With this reference the hand would be in the table in resting pose {rest + 1}.",
+            f"With this reference pose or path, the hand would be in the table in resting pose "
+            f"{rest + 1}.",
             "Leave out --rest.",
         )
     return valid if rest is None else np.array([rest])

@@ -38,7 +38,7 @@ class _Skeleton(NamedTuple):
 
 
 def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
-    """A joint's positions (T, 3) and orientations in a BVH file's own unit and axes, and seconds
+    """Positions (T, 3) and orientations of a joint in the unit and axes of a BVH file, and seconds
     between frames.
 
     Raises:
@@ -65,13 +65,13 @@ def _joint_path(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, 
     if skeleton.chain is None:
         raise CongraspError(
             f"{path} has no joint {ascii(joint)[:60]}.",
-            f"Its joints are: {', '.join(skeleton.names)[:2000]}.",
+            f"Choose from its joints: {', '.join(skeleton.names)[:2000]}.",
         )
     _, count, *_, seconds, numbers = tail.split(maxsplit=5)
     rows = np.array(numbers.split(), float).reshape(int(count), skeleton.columns)
     if not (np.isfinite(rows).all() and 0.0 < float(seconds) <= 1.0):
         raise ValueError(
-            "it holds numbers that are not finite, or a frame takes more than a second"
+            "it contains numbers that are not finite, or its frames last more than a second"
         )
     position = np.zeros((len(rows), 3))
     rotation = Rotation.identity(len(rows))
@@ -91,7 +91,7 @@ def _link_motion(link: _Link, rows: np.ndarray) -> tuple[np.ndarray, Rotation]:
         axis = channel[0].upper()
         kind = channel[1:].lower()
         if kind == "position":
-            # A position takes the place of the offset, as most programs read it.
+            # A position replaces the offset, as in most programs.
             moved[:, "XYZ".index(axis)] = column
         elif kind == "rotation":
             turn = turn * Rotation.from_euler(axis, column[:, None], degrees=True)

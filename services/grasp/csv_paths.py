@@ -158,7 +158,7 @@ def read_csv(path: pathlib.Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray
     _check_clock(path, reader.lines)
     table = np.array([line.pose for line in reader.lines])
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > UNIT_LENGTH:
-        raise CongraspError(f"{path} holds quaternions that are not of length one.", _WRITE_ROWS)
+        raise CongraspError(f"{path} has quaternions whose length is not one.", _WRITE_ROWS)
     return reader.columns.metres * table[:, :3], table[:, 3:]
 
 
@@ -193,5 +193,5 @@ def _check_clock(path: pathlib.Path, lines: list[_Line]) -> None:
         seconds = seconds + clock[:, 1] / _NANOSECONDS_PER_SECOND
     late = runs_back(seconds)
     if late.any():
-        fault = f"line {numbers[late.argmax()]} of {path} is earlier than one before."
-        raise CongraspError(fault, "Sort the lines by time, and cut the file to one motion.")
+        fault = f"line {numbers[late.argmax()]} of {path} is earlier than a line above it."
+        raise CongraspError(fault, "Sort the lines by time, and keep only one motion in the file.")

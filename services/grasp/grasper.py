@@ -124,9 +124,9 @@ class Grasper:
           physics: engine, except `auto` and those that are compiled.
         """
         if attempts < 1:
-            raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
+            raise CongraspError(f"attempts is {attempts}.", "It must be at least 1.")
         if seed < 0:
-            raise CongraspError(f"The seed is {seed}.", "Use 0 or more.")
+            raise CongraspError(f"The seed is {seed}.", "It must be at least 0.")
         self._arm = arm
         self._hand = get_hand(policy.spec.hand)
         self._left = left
@@ -409,16 +409,21 @@ class Grasper:
 def _no_motion(
     obj: GraspObject, arm: str, attempts: int, refusals: collections.Counter[str]
 ) -> CongraspError:
-    """Error if an arm can execute no attempt that holds the object, with the limits that forbid
-    them.
+    """Error if no attempt holds the object, or the arm can execute none that does.
+
+    Args:
+      obj: the object.
+      arm: name of the arm.
+      attempts: number of attempts.
+      refusals: numbers of attempts that violate a limit of the arm, by the name of the limit.
     """
     if not refusals:
         return CongraspError(
-            f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts."
+            f"None of {attempts} attempts holds '{obj.name}'.", "Increase --attempts."
         )
     limits = ", ".join(f"{limit} {count}" for limit, count in refusals.most_common())
     return CongraspError(
         f"{arm} can execute none of the {refusals.total()} attempts that hold '{obj.name}'. "
         f"Reasons: {limits}.",
-        "Set another --base or --mount, or more --attempts.",
+        "Set another --base or --mount, or increase --attempts.",
     )

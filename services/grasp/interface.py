@@ -49,7 +49,7 @@ def open_grasper(
     """
     right, left = right_name(hand)
     if left and arm.arm:
-        raise CongraspError("Arms carry right hands only.", "Leave out --arm or :left.")
+        raise CongraspError("--arm supports right hands only.", "Leave out --arm or :left.")
     bundle = bundles.load(policy_file(policy, right))
     planner = None
     if arm.arm:

@@ -135,15 +135,15 @@ def rest_pose(obj: GraspObject, text: str) -> int:
         upright = upright_rest(obj)
         if upright is None:
             raise CongraspError(
-                f"'{obj.name}' does not rest with its z axis up in any of its {count} resting "
-                f"poses.",
-                f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} "
-                f"--png rests.png",
+                f"The z axis of '{obj.name}' points up in none of its {count} resting poses.",
+                f"Set --rest to a number from 1 to {count}; 'congrasp objects rests {obj.name} "
+                f"--png rests.png' draws them.",
             )
         return upright
     if not text.isdecimal() or len(text) > 4 or not 1 <= int(text) <= count:
         raise CongraspError(
-            f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright."
+            f"--rest is '{text}'.",
+            f"Pass a number from 1 to {count}, the resting poses of '{obj.name}', or upright.",
         )
     return int(text) - 1
 

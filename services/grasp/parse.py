@@ -47,7 +47,8 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
     unknown = sorted(set(texts) - set(options))
     if unknown:
         raise CongraspError(
-            f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}."
+            f"There is no constraint option '{unknown[0]}'.",
+            f"Choose from: {', '.join(options)}.",
         )
     words = {name: _plain(option, texts.get(name)) for name, option in options.items()}
     values = {
@@ -138,12 +139,15 @@ def _part(text: str, target: Target) -> Part:
     names = [word.strip() for word in text.split(",")]
     if path.exists() and set(names) <= set(obj.part_names):
         raise CongraspError(
-            f"'{text}' is a file here, and a part of '{obj.name}'.", f"Pass ./{text} for the file."
+            f"'{text}' is ambiguous: it is a file and a part of '{obj.name}'.",
+            f"Pass ./{text} for the file.",
         )
     if not path.suffix and not path.exists():
         unknown = [part for part in names if part not in obj.part_names]
         if unknown:
-            remedy = f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part."
+            remedy = (
+                f"Its parts are: {', '.join(obj.part_names)}. A mesh file of the part works, too."
+            )
             raise CongraspError(f"'{obj.name}' has no part '{unknown[0]}'.", remedy)
         inside = np.isin(obj.labels, [obj.part_names.index(part) for part in names])
         return Part(text, np.where(inside, 0.0, 1.0))

@@ -59,13 +59,16 @@ def _finger_angles(joints: Any, hand: Hand, path: pathlib.Path) -> np.ndarray:
         unknown = sorted(set(joints) - set(names))
         if unknown:
             raise CongraspError(
-                f"the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}."
+                f"the hand '{hand.name}' has no joint '{unknown[0]}'.",
+                f"Choose from its joints: {', '.join(names)}.",
             )
         joints = [joints.get(name, 0.0) for name in names]
     q = _floats(joints, (len(names),), f"'joints' of {path}")
     largest = np.abs(q).max()
     if largest > 2 * np.pi:
-        raise CongraspError(f"a joint of {path} is at {largest:.4g}.", "Angles are in radians.")
+        raise CongraspError(
+            f"a joint angle of {path} is {largest:.4g}.", "Write joint angles in radians."
+        )
     return coupled(hand, np.clip(q, hand.lower, hand.upper))
 
 
@@ -113,7 +116,7 @@ def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.nd
         )
     except Dropped as dropped:
         raise CongraspError(
-            f"{path}: {dropped.reason}.", "Move the skeleton, or name another joint."
+            f"{path}: {dropped.reason}.", "Move the skeleton, or pass another joint."
         ) from None
     return {"position": places, "quaternion": turns}
 
@@ -130,11 +133,14 @@ def _motion(path: pathlib.Path, hand: Hand, index: int) -> Episode:
     """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
     if index:
         raise CongraspError(
-            f"{path} is one motion and has no number {index}.", "Leave the number out."
+            f"{path} holds a single motion, without the number {index}.", f"Remove ':{index}'."
         )
     motion = load_motion(path)
     if motion.hand != hand.name:
-        raise CongraspError(f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.")
+        raise CongraspError(
+            f"{path} is a motion of the hand '{motion.hand}', not '{hand.name}'.",
+            "Pass a motion of this hand.",
+        )
     return motion
 
 
@@ -164,13 +170,14 @@ def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
     obj = target.obj
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(
-            f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'."
+            f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.",
+            "Pass a constraint set of this hand.",
         )
     size = np.ptp(obj.visual_vertices, axis=0)
     size_in_set = np.ptp(constraints.arrays["visual/vertices"], axis=0)
     if not np.allclose(size, size_in_set, rtol=0.02, atol=1e-3):
         scale = float(constraints.meta["object_scale"])
-        remedy = "Name the set of this object."
+        remedy = "Pass the constraint set of this object."
         if scale != 1.0:
             remedy = (
                 f"The {hand.name} hand is trained on objects {scale:g} times as large: add --scale "
@@ -184,7 +191,8 @@ def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
     count = constraints.arrays["pose/q"].shape[1]
     if index >= count:
         raise CongraspError(
-            f"{path} has no number {index}.", f"Its poses and trajectories are 0 to {count - 1}."
+            f"{path} has no number {index}.",
+            f"Its poses and trajectories have the numbers 0 to {count - 1}.",
         )
     return constraints
 
@@ -192,7 +200,7 @@ def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
 def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
     """A JSON file that has these keys."""
     remedy = (
-        f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
+        f"Write a JSON file with {', '.join(keys)}, or pass a motion (.npz) or a constraint set."
     )
     content = read_json(path, _MAX_BYTES, remedy)
     for key in keys:
@@ -220,10 +228,12 @@ def _resampled(
     moves = np.concatenate([[True], np.diff(along) > 1e-6])
     if moves.sum() < 2:
         raise CongraspError(
-            f"the wrist does not move in {path}.", "Give two different waypoints or more."
+            f"the wrist does not move in {path}.", "Write at least two different waypoints."
         )
     if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
-        raise CongraspError(f"{path} has a quaternion of length zero.")
+        raise CongraspError(
+            f"{path} has a quaternion of length zero.", "Write unit quaternions (w, x, y, z)."
+        )
     along = along[moves]
     samples = np.linspace(0.0, along[-1], waypoints)
     places = np.stack([np.interp(samples, along, column) for column in position[moves].T], -1)

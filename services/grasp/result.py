@@ -34,7 +34,7 @@ class Result(NamedTuple):
         if facts["rest"] > 1:
             parts.append(f"in resting pose {facts['rest']}, not the likeliest")
         parts.append(
-            f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
+            f"best of {facts['attempts']} attempts ({facts['attempts_held']} hold the object)"
         )
         parts += _errors(facts)
         parts.append(f"strongest link {facts['force_link_max']:.1f} N")

@@ -40,8 +40,8 @@ class Target(NamedTuple):
         with np.errstate(over="ignore"):
             away = float(np.linalg.norm(self.obj.points - position, axis=-1).min())
         if away > _MAX_DISTANCE:
-            remedy = "Give metres, in the axes and with the origin of its file."
-            raise CongraspError(f"{what} lies {away:.3g} m from '{self.obj.name}'.", remedy)
+            remedy = "Pass metres, in the coordinates of the object's file."
+            raise CongraspError(f"{what} is {away:.3g} m away from '{self.obj.name}'.", remedy)
 
 
 def unit_vector(vector: np.ndarray, name: str) -> np.ndarray:
@@ -49,6 +49,7 @@ def unit_vector(vector: np.ndarray, name: str) -> np.ndarray:
     largest = np.abs(vector).max()
     if largest < 1e-9:
         raise CongraspError(
-            f"{name} has no direction: all its numbers are zero.", "Make one of them 1 or -1."
+            f"{name} has no direction: all its numbers are zero.",
+            'Pass a direction, such as "0 0 -1".',
         )
     return vector / largest / np.linalg.norm(vector / largest)

@@ -59,7 +59,7 @@ def read_wrist_path(
         orthogonal.
     """
     if not path.is_file():
-        raise CongraspError(f"There is no file {path}.", "Name a CSV, NPZ or BVH file.")
+        raise CongraspError(f"There is no file {path}.", "Pass a CSV, NPZ or BVH file.")
     recorded = _read(path, joint)
     return recorded._replace(rotation=recorded.rotation * _hand_in_wrist(fingers, back))
 
@@ -75,7 +75,9 @@ def _read(path: pathlib.Path, joint: str) -> WristPath:
     elif kind == ".npz":
         position, quaternion = _read_npz(path)
     else:
-        raise CongraspError(f"{path} is neither CSV, NPZ nor BVH.", "Convert it to one of them.")
+        raise CongraspError(
+            f"{path} is not a CSV, NPZ or BVH file.", "Convert it to one of these formats."
+        )
     return WristPath(position, Rotation.from_quat(quaternion, scalar_first=True), _FRAME_S)
 
 
@@ -83,10 +85,12 @@ def _hand_in_wrist(fingers: str, back: str) -> Rotation:
     """Rotation of the hand's wrist frame to a file's, from the axes of fingers and back in it."""
     for name in (fingers, back):
         if name not in _AXES:
-            raise CongraspError(f"'{name}' is no axis.", f"Choose one of: {', '.join(_AXES)}.")
+            raise CongraspError(f"'{name}' is not an axis.", f"Choose from: {', '.join(_AXES)}.")
     if _AXES[fingers] @ _AXES[back]:
         raise CongraspError(
-            f"Fingers along {fingers} and the back of the hand along {back} do not fit."
+            f"The axis {fingers} of the fingers and the axis {back} of the back of the hand are "
+            "not perpendicular.",
+            "Pass two different axes of the wrist frame.",
         )
     y = -_AXES[fingers]
     z = _AXES[back]
@@ -106,7 +110,7 @@ def _read_npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     position, quaternion = (data[name].astype(float) for name in meanings)
     if np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > UNIT_LENGTH:
         raise CongraspError(
-            f"{path} holds quaternions that are not of length one.",
-            "Write w, x, y, z, of length one.",
+            f"{path} has quaternions whose length is not one.",
+            "Write unit quaternions (w, x, y, z).",
         )
     return position, quaternion

@@ -81,7 +81,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             task.
         """
         if num_envs < 1:
-            raise CongraspError(f"There are {num_envs} environments.", "Make one or more.")
+            raise CongraspError(f"num_envs is {num_envs}.", "It must be at least 1.")
         if not task.pop("autoreset", True):
             autoreset_mode = AutoresetMode.DISABLED
         self._mode = _mode_of(autoreset_mode)

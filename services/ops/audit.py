@@ -137,7 +137,8 @@ def _learner_journals(folder: pathlib.Path) -> list[pathlib.Path]:
     if not learners:
         raise CongraspError(
             f"There is no journal of a learner in {folder}.",
-            "A single process ('--actors 0', '--inside') and '--no-audit' keep none.",
+            "An actor in the learner's process ('--actors 0', '--inside') and '--no-audit' write "
+            "no journal.",
         )
     return learners
 
@@ -157,8 +158,8 @@ def _actor_journals(
         places = " or ".join(str(each) for each in (folder, *user_folders))
         raise CongraspError(
             f"There is no journal of an actor in {places}.",
-            "Actors on other machines have theirs in ~/.local/state/congrasp/audit there: copy "
-            "them here and pass them with --journals FILE.",
+            "Copy the journals of actors on other machines from ~/.local/state/congrasp/audit "
+            "there, and pass them with --journals FILE.",
         )
     return actors
 

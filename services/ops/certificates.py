@@ -64,7 +64,7 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
     """
     if not force and ((folder / CA_FILE).exists() or (folder / CA_KEY_FILE).exists()):
         raise CongraspError(
-            f"{folder} already holds an authority.",
+            f"{folder} already contains a certificate authority.",
             "Issue certificates with it, or pass --force to replace it.",
         )
     key = ec.generate_private_key(ec.SECP256R1())
@@ -247,7 +247,7 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     listed = [read(path) for path in files if path.exists()]
     if not listed:
         raise CongraspError(
-            f"{folder} holds no certificates.",
+            f"{folder} contains no certificates.",
             f"Create them: {shell_command('congrasp', 'certs', 'init', folder)}",
         )
     return sorted(listed, key=lambda one: one.identity or Identity("", "", 0))
@@ -302,7 +302,7 @@ def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurve
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
         raise CongraspError(
-            f"{folder} holds no authority.",
+            f"There is no authority for certificates in {folder}.",
             f"Create one: {shell_command('congrasp', 'certs', 'init', folder)}",
         ) from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)

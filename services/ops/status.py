@@ -161,20 +161,20 @@ class Status:
     """
 
     run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
-    """Folder of a run whose learner runs on this machine, in place of --connect and --run."""
+    """Folder of a run whose learner runs on this machine. It replaces --connect and --run."""
     connect: str = LEARNER_URL
-    """The learner's endpoint."""
+    """Endpoint of the learner."""
     run: str = _RUN
     """Name of the run."""
     watch: bool = False
-    """Continue until Ctrl-C, also while the learner is disconnected."""
+    """Update the status until Ctrl-C, also while the learner is disconnected."""
     every: float = 1.0
     """Seconds between two queries with --watch."""
     certs: pathlib.Path | None = None
     """Folder of an observer's certificate (congrasp certs)."""
     json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print JSON instead of tables; with --watch one object a line, and null while the learner is
-    disconnected.
+    """Print JSON instead of tables. With --watch this is one object per line, and null while the
+    learner is disconnected.
     """
 
     def __call__(self) -> int:
@@ -213,8 +213,8 @@ class Status:
 
         if (self.connect, self.run) != (LEARNER_URL, _RUN):
             raise CongraspError(
-                f"The folder {run_dir} is in place of --connect and --run.",
-                "Give either the folder or these.",
+                f"The folder {run_dir} cannot be combined with --connect or --run.",
+                "Pass either the folder or these options.",
             )
         run = open_run(run_dir).name
         connect = learner_url(run_dir)

@@ -198,7 +198,7 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Ep
             remedy = f"Choose from {-count} to {count - 1}."
         elif success:
             remedy = "Leave out success=True."
-        raise CongraspError(f"{path} holds {count} {kind}, none with index {index}.", remedy)
+        raise CongraspError(f"{path} contains {count} {kind}, none with index {index}.", remedy)
     return last[0] if index < 0 else last[-1]
 
 

@@ -203,7 +203,7 @@ class Layout:
         if vectors is None or not fits or message.meta.get("layout") != self.digest:
             raise LayoutError(
                 "The query does not match the policy's layout.",
-                "Take it from the policy's metadata.",
+                "Read the layout from the policy's metadata.",
             )
         if not 1 <= len(vectors) <= STATES_LIMIT:
             raise CongraspError(
@@ -337,7 +337,9 @@ class Layout:
         if not finite:
             fields = self.unpack(query.vectors[state, None])
             field = next(name for name, value in fields.items() if not np.isfinite(value).all())
-            return CongraspError(f"The field '{field}'{which} is not finite.")
+            return CongraspError(
+                f"The field '{field}'{which} is not finite.", "Send finite numbers."
+            )
         first_length = 1 + len(self.known)
         fitting = passed[state, 1:first_length].tolist()
         if not all(fitting):

@@ -94,7 +94,7 @@ class PolicyServer:
         if first is None:
             raise CongraspError(
                 "There is no policy to serve yet.",
-                "Start the server after the run has published one.",
+                "Start the server after the run has published a policy.",
             )
         self._source = source
         self._on_answer = on_answer
@@ -277,9 +277,13 @@ class PolicyServer:
                 self._trouble = str(error)
 
     def _swap(self, newer: PolicyBundle) -> None:
-        """Uses a newer policy; raises a CongraspError if it is of another kind."""
+        """Serves a newer policy.
+
+        Raises:
+          CongraspError: it has another hand, task or network than the served policy.
+        """
         old = self._held.bundle
-        old.spec.require(newer.spec, "that the server was to change to")
+        old.spec.require(newer.spec, "that should replace the served one")
         if newer.task != old.task:
             raise CongraspError(
                 "The newer policy was trained on another task.", "Restart the server to serve it."

@@ -70,7 +70,9 @@ class Catalogue:
     def get(self, name: str) -> GraspObject:
         """The object; a CongraspError if there is none or it cannot be imported."""
         if name not in self._makers:
-            raise CongraspError(f"There is no object '{name[:60]}'.", "Choose one of the list.")
+            raise CongraspError(
+                f"There is no object '{name[:60]}'.", "Choose an object from the list."
+            )
         if name not in self._objects:
             self._objects[name] = self._makers[name]()
         return self._objects[name]
@@ -195,7 +197,10 @@ class Thumbnails:
         this number.
         """
         if not 0 <= rest < len(obj.rest_poses):
-            raise CongraspError(f"The object '{obj.name}' has no resting pose {rest + 1}.")
+            raise CongraspError(
+                f"The object '{obj.name}' has no resting pose {rest + 1}.",
+                "Choose one of its resting poses.",
+            )
         with self._lock:
             if self._object is not obj:
                 self._object = obj

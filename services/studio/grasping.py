@@ -72,7 +72,7 @@ class PolicyGrasping:
         if first is None:
             raise CongraspError(
                 f"There is no policy of {name} yet.",
-                "Start the studio when the run has published one.",
+                "Start the studio after the run has published a policy.",
             )
         self._source = source
         self._name = name

@@ -64,7 +64,7 @@ class Jobs:
             message = str(error)
         except Exception as error:  # the page shows any error of a job, and the studio continues
             kind = type(error).__name__
-            message = f"This went wrong and is a fault of congrasp: {kind}: {error}."
+            message = f"Internal error of congrasp: {kind}: {error}."
             log("error", message)
         with self._lock:
             self._state |= {"running": False, "share": 1.0, "error": message, "made": result}

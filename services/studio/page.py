@@ -325,7 +325,8 @@ class Motions:
         """A motion by its number; a CongraspError if there is none."""
         if key not in self._episodes:
             raise CongraspError(
-                f"There is no motion '{key[:60]}'.", "Press Grasp, or choose one of the list."
+                f"There is no motion '{key[:60]}'.",
+                "Press Grasp, or choose a motion from the list.",
             )
         return self._episodes[key]
 

@@ -48,7 +48,7 @@ class Recordings:
         if not path.exists():
             raise CongraspError(f"There is no file or folder {path}.", remedy)
         if not path.is_dir() and ".mcap" not in path.suffixes:
-            raise CongraspError(f"{path} is no recording (*.mcap).", remedy)
+            raise CongraspError(f"{path} is not a recording (*.mcap).", remedy)
         self.path = path
         self._lock = threading.Lock()
         self._messages: dict[str, Message] = {}
@@ -93,7 +93,7 @@ class Recordings:
             message = self._messages.get(key)
         if message is None:
             raise CongraspError(
-                "This episode is not among those found last.", "Click the curve again."
+                "This episode is not in the current list.", "Click the curve again."
             )
         return Episode.from_message(message)
 

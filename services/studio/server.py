@@ -133,9 +133,9 @@ class Sessions:
                 oldest, used = next(iter(self._open.values()))
                 if now - used < IDLE:
                     raise CongraspError(
-                        f"{MOST} browsers use this studio.",
-                        f"Try again when one has been idle for {IDLE / 60:.0f} minutes, or start "
-                        f"another studio.",
+                        f"{MOST} browsers, the maximum, use this studio.",
+                        f"Try again after one of them has been idle for {IDLE / 60:.0f} minutes, "
+                        f"or start another studio.",
                     )
                 self._open.popitem(last=False)
                 oldest.close()
@@ -457,9 +457,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return self._error(200, str(error))
         except Exception as error:  # the server continues after any error of a request
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            return self._error(
-                500, f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
-            )
+            return self._error(500, f"Internal error of congrasp: {type(error).__name__}: {error}.")
         self._send(200, *content)
 
     def _error(self, code: int, error: str) -> None:

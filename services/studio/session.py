@@ -196,14 +196,17 @@ class Session:
     def drawn(self) -> Download:
         """The picture or video that was rendered last; a CongraspError if there is none."""
         if self._drawn is None:
-            raise CongraspError("Nothing has been drawn yet.", "Save a motion as mp4 or png.")
+            raise CongraspError(
+                "No picture or video has been rendered yet.", "Save a motion as mp4 or png."
+            )
         return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
         """Content of the training window; `names` are the curves, separated by commas."""
         if self._window is None:
             raise CongraspError(
-                "The studio follows no run.", "Start it with --connect, or with --recordings."
+                "The studio is not connected to a run.",
+                "Start it with --connect, or with --recordings.",
             )
         return self._window.view([name for name in names.split(",") if name])
 
@@ -211,7 +214,7 @@ class Session:
         """Episodes that were recorded around a time."""
         if self._window is None or self._window.recordings is None:
             raise CongraspError(
-                "No recordings were named.", "Start the studio with --recordings FOLDER."
+                "The studio has no recordings.", "Start it with --recordings FOLDER."
             )
         try:
             recorded_at = float(time)
@@ -242,7 +245,7 @@ class Session:
             try:
                 actions[action](**request)
             except (TypeError, ValueError, OverflowError) as error:
-                raise CongraspError(f"'{action}' takes other values ({error}).") from None
+                raise CongraspError(f"Invalid value for '{action}': {error}.") from None
         return self.state()
 
     def _actions(self) -> dict[str, Callable[..., Any]]:
@@ -292,7 +295,8 @@ class Session:
         """Sets the object's mass: `mass_g`, else by a material, else its original mass."""
         if mass_g and not LIGHTEST_G <= mass_g <= HEAVIEST_G:
             raise CongraspError(
-                f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing."
+                f"The mass is {mass_g:g} g.",
+                f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or leave the field empty.",
             )
         obj = self._objects.get(self._object)
         mass_kg = mass_g / 1000 if mass_g else None
@@ -326,7 +330,8 @@ class Session:
         """Loads the policy of another hand."""
         if name not in self._hands:
             raise CongraspError(
-                f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}."
+                f"There is no policy for the hand '{name}'.",
+                f"Choose from the hands {', '.join(self._hands)}.",
             )
 
         def show(grasping: PolicyGrasping) -> None:

@@ -161,7 +161,9 @@ class Studio:
             )
         flags = self.fields[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):
-            raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
+            raise CongraspError(
+                f"'{constraint}' takes {len(flags)} flags.", f"Pass {len(flags)} booleans."
+            )
         chosen = np.array([bool(value) for value in values])
         self._set(constraint, {**self.fields[constraint], field: chosen})
         self._switch(constraint, True)
@@ -213,7 +215,7 @@ class Studio:
         if arc_length[-1] < _SHORTEST_PATH_M:
             raise CongraspError(
                 f"The path is {100 * arc_length[-1]:.1f} cm long.",
-                f"Draw {100 * _SHORTEST_PATH_M:.0f} cm or more.",
+                f"Draw a path of at least {100 * _SHORTEST_PATH_M:.0f} cm.",
             )
         end = self._reference_pose()
         share = np.linspace(0.0, 1.0, self.task.trajectory_points)
@@ -264,7 +266,7 @@ class Studio:
         if not len(slots):
             raise CongraspError(
                 f"The table leaves no room for a {name} in this resting pose.",
-                "Take another resting pose, or paint less.",
+                "Choose another resting pose, or paint a smaller region.",
             )
         slot = slots[(self._suggested[name] * _SLOT_STRIDE) % len(slots)]
         self._suggested[name] += 1
@@ -395,7 +397,8 @@ class Studio:
                 return constraint.name
         names = ", ".join(self.task.constraints)
         raise CongraspError(
-            f"The policy supports no constraint of the tool '{tool}'.", f"It supports {names}."
+            f"The policy supports no constraint of the tool '{tool}'.",
+            f"Choose from its constraints: {names}.",
         )
 
     def _closed(self) -> Fields:

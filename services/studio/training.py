@@ -219,7 +219,7 @@ class TrainingWindow:
             if state is None or state.episode is None:
                 raise CongraspError(
                     f"There is no episode of the actor '{actor}' yet.",
-                    "Wait: actors send one from time to time.",
+                    "Wait: actors publish an episode from time to time (--episode-every).",
                 )
             return state.episode
 

@@ -52,10 +52,12 @@ def detect() -> tuple[str, int]:
         )
         backend, count = result.stdout.split()
     except (subprocess.TimeoutExpired, ValueError):
-        raise CongraspError("JAX does not start here.", "Check 'congrasp doctor'.") from None
+        raise CongraspError(
+            "JAX does not start on this machine.", "Run 'congrasp doctor' for the cause."
+        ) from None
     return backend, int(count)
 
 
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:
-    """Resolves `auto` for the ranks, even if this process sees no GPU but they do."""
+    """Resolves `auto` for the ranks, which may see GPUs even if this process does not."""
     return resolve_physics(name, "cuda" if gpus else "")

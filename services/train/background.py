@@ -50,11 +50,11 @@ def train_in_background(
     if code is None:
         raise CongraspError(
             f"The training of {name} was stopped after {patience / 60:.0f} min.",
-            "Repeat the command to resume it; --patience gives it more time.",
+            "Repeat the command to resume it, with a larger --patience if it needs more time.",
         )
     if code or not (run_dir / POLICY_FILE).exists():
         raise CongraspError(
-            f"The training of {name} failed: {child.cause()}", f"Its log is {child.log}."
+            f"The training of {name} failed: {child.cause()}", f"Read its log, {child.log}."
         )
     seconds = round(time.monotonic() - began, 1)
     write_atomically(run_dir / _FINISHED_FILE, json.dumps({"seconds": seconds}).encode())

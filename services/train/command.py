@@ -354,7 +354,7 @@ def first_update() -> str:
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
-    """Evaluates headings on held-out objects, draws an episode, a success if there is one, and
+    """Evaluates headings on held-out objects, draws one episode (a success if possible), and
     queries a server.
     """
     objects = config.objects
@@ -363,7 +363,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
             families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED
         )
     pool = load_pool(objects)
-    console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
+    console.print(f"Evaluating {episodes} episodes on {len(pool)} held-out objects …")
     policy = dataclasses.replace(bundles.load(run_dir / POLICY_FILE), task=config.task)
     heading = Experiment(
         policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False

@@ -43,12 +43,13 @@ class LearnerOptions:
     """Options that `congrasp train` and `congrasp learner` share."""
 
     insecure: bool = False
-    """Listen beyond loopback without certificates."""
+    """Accept connections from other machines without certificates."""
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",)
-    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files
-    there, for `wandb sync`), wandb (needs an account); without a name, none."""
+    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files in
+    the run's folder, for `wandb sync`) or wandb (needs an account). The option without a value
+    switches all of them off."""
     audit: bool = True
-    """Journals of all rollouts in the run's folder, for 'congrasp audit'."""
+    """Write journals of all rollouts to the run's folder, for 'congrasp audit'."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,25 +57,26 @@ class Launch:
     """Options of a run's processes."""
 
     actors: int | None = None
-    """Actor processes. By default two, or one on fewer than four cores; on a GPU none: a single
-    actor then runs in the learner's process, and rollouts never leave the device."""
+    """Number of actor processes. By default two, or one on fewer than four cores. On a GPU the
+    default is 0: a single actor runs in the learner's process, and rollouts stay on the device."""
     ranks: int = 1
-    """Learners that train together, data parallel; each has --actors actors, and a separate GPU if
-    there are GPUs. The batch grows with them."""
+    """Number of learners for data-parallel training. Each learner has --actors actors, and its own
+    GPU if there are GPUs. The batch size is proportional to the number of learners."""
     listen: str | None = None
-    """Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine
-    can join.
+    """Endpoint for actors on other machines, such as tls/0.0.0.0:7447; by default only actors on
+    this machine can join.
     """
     certs: pathlib.Path | None = None
-    """The authority's folder (congrasp certs), for mutual TLS."""
+    """Folder of the certificate authority (congrasp certs), for mutual TLS."""
     metrics_port: int = 0
-    """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none."""
+    """Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 switches it
+    off."""
     learner: Annotated[LearnerOptions, tyro.conf.arg(name="")] = LearnerOptions()
     """Options of the learners."""
 
     def planned(self, config: RunConfig) -> "Plan":
-        """Chooses engine and number of actors; on a GPU one process does everything unless others
-        may connect.
+        """Chooses the engine and the number of actors; on a GPU learner and actor share a process
+        unless actors of other machines may connect.
 
         Raises:
           CongraspError: the options contradict each other or this machine, or the learner may not
@@ -86,7 +88,7 @@ class Launch:
                 "Pass a number of actor processes, or 0 to run the actor in the learner's process.",
             )
         if self.ranks < 1:
-            raise CongraspError(f"--ranks is {self.ranks}.", "Pass a number of learners from 1 on.")
+            raise CongraspError(f"--ranks is {self.ranks}.", "It must be at least 1.")
         others_may_join = self.listen is not None or self.certs is not None
         if others_may_join:
             self._check_connections(config.name)
@@ -106,8 +108,8 @@ class Launch:
         """
         if self.certs is not None and (self.certs / CERTIFICATE_FILE).exists():
             raise CongraspError(
-                f"{self.certs} belongs to one role.",
-                "Pass the authority's folder, which holds those of all roles.",
+                f"{self.certs} is the certificate of a single role.",
+                "Pass the folder of the certificate authority, which has those of all roles.",
             )
         credentials = urls.find_credentials(self.certs, "learner", run)
         check_exposure(self.listen or LEARNER_URL, credentials, insecure=self.learner.insecure)
@@ -117,7 +119,8 @@ class Launch:
             urls.find_credentials(self.certs, role, run)
         if self.actors == 0:
             raise CongraspError(
-                "With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors."
+                "With --actors 0 the learner opens no endpoint, but --listen and --certs need one.",
+                "Remove --listen and --certs, or --actors.",
             )
 
 

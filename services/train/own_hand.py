@@ -109,8 +109,8 @@ def _begin(request: Request) -> None:
         return
     if any(request.out.glob(f"*/{CONFIG_FILE}")):
         raise CongraspError(
-            f"{request.out} holds the training of another hand, or of an earlier version of this "
-            f"one.",
+            f"{request.out} contains the training of another hand, or of an earlier version of "
+            f"this hand.",
             "Pass another --out, or remove the folder.",
         )
     (request.out / CHECK).unlink(missing_ok=True)
@@ -133,7 +133,7 @@ def _check(request: Request, note: Callable[[str], None]) -> None:
     if any(finding.verdict == "failed" for finding in findings) and not request.anyway:
         raise CongraspError(
             f"The hand '{request.hand.name}' failed its self-check ({picture}).",
-            "Repair its file as the lines say, or pass --anyway to train it regardless.",
+            "Correct its file as the remedies say, or pass --anyway to train it regardless.",
         )
 
 
@@ -233,7 +233,7 @@ def _run(
         end = f"was ended after {_STAGE_TIMEOUT_S / 60:.0f} min"
     else:
         end = f"failed: {child.cause()}"
-    raise CongraspError(f"The {name} of '{request.hand.name}' {end}", f"Its log is {child.log}.")
+    raise CongraspError(f"The {name} of '{request.hand.name}' {end}", f"Read its log, {child.log}.")
 
 
 def _short_training_note(request: Request) -> str:

@@ -2,23 +2,25 @@
 
 Differences between hands in the recipe of the full task are computed from the hand.
 
-The size of a hand determines the factor s on its objects (`Hand.object_scale`; the paper's for its
-hands, `common.hands.motors.fitting_scale` for others), its strength is the force F with which its
-fingertips can press (the mean of `common.hands.motors.tip_forces`: torque limits over lengths); G
-is the number of its fingers. Its mass has no effect, because the virtual wrist is scaled to it
+Three properties of a hand matter. Its size determines the factor s on the size of its objects
+(`Hand.object_scale`: the paper's value for the paper's hands, `common.hands.motors.fitting_scale`
+for others). Its strength F is the mean force with which its fingertips can press
+(`common.hands.motors.tip_forces`: torque limits over lengths). G is the number of its fingers. Its
+mass has no effect, because the gains of the virtual wrist are scaled to the mass
 (`common.hands.spec.wrist_gains`).
 
-* **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is
-  that of the human hand's five: their force grows with the object's surface, s^2, and fewer fingers
-  press more each.
-* `force_max` = 5 N k, to half a newton: 5 N, 12 N (Allegro), 6 N (Sharpa).
-* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its
-  position needs more weight in larger hands of fewer fingers is empirical.
-* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: 0 for fingertips that can press
-  three times what is required, as human ones can; 1 for those that cannot press that much
-  (Allegro). Weak hands lose what they may hold at a part only, so that they train it more:
-  `p_affordance` = 0.6 + 0.2 h, and against what they then touch `affordance_distance` = 0.15 + 0.05
-  h, `affordance_force` = 0.30 + 0.10 h.
+* **Squeeze** k = s^2 5 / G. The fingers together may exert the same pressure on the object as the
+  five fingers of the human hand. Their total force therefore grows with the object's surface, s^2,
+  and each finger presses more if there are fewer fingers.
+* `force_max` = 5 N k, rounded to half a newton: 5 N (human), 12 N (Allegro), 6 N (Sharpa).
+* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the mean of its fingertips. That its
+  position needs a higher weight in larger hands with fewer fingers is an empirical finding.
+* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1. It is 0 for fingertips that can
+  press with three times the required force, such as human ones, and 1 for fingertips that cannot
+  press with the required force (Allegro). Weak hands often drop objects that they may hold by one
+  part only, so they train affordances more: `p_affordance` = 0.6 + 0.2 h. Because they then touch
+  the avoid region more often, `affordance_distance` = 0.15 + 0.05 h and `affordance_force` = 0.30 +
+  0.10 h.
 
 Everything else is the same for all hands.
 """

@@ -33,7 +33,9 @@ def check_config(config: RunConfig) -> None:
         _check_sets(config)
     if config.environments < 1 or config.rollout_steps < 1:
         raise CongraspError(
-            f"A rollout of {config.rollout_steps} steps of {config.environments} hands is empty."
+            f"A rollout of {config.rollout_steps} steps in {config.environments} environments is "
+            "empty.",
+            "Set --rollout-steps and --environments to at least 1.",
         )
 
 
@@ -45,8 +47,8 @@ def _check_sets(config: RunConfig) -> None:
     files = sorted(folder.glob(f"*{SET_SUFFIX}"))
     if not files:
         raise CongraspError(
-            f"{folder} holds no constraint set.",
-            "Fill it with 'congrasp constraints import' or 'congrasp constraints generate'.",
+            f"{folder} contains no constraint set.",
+            "Make sets with 'congrasp constraints import' or 'congrasp constraints generate'.",
         )
     hand = get_hand(config.task.hand).name
     of_hand = load(files[0]).meta["hand"]

@@ -117,7 +117,8 @@ def plot_runs(
         runs[label] = read_metrics(path)
         if not runs[label]:
             raise CongraspError(
-                f"The recordings in {path} hold no metrics.", "Was the learner recorded?"
+                f"The recordings in {path} contain no metrics.",
+                "Pass a recording of the learner, such as the folder of a run.",
             )
     written = []
     for name, (title, panels) in figures(runs).items():

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.env import GraspEnv
-from congrasp.actors.episode import _geometry
+from congrasp.actors.episode import object_pieces
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Programs, finished_episodes, no_probe
@@ -459,4 +459,4 @@ def _programs_in(value):
 def test_sizes_are_real_numbers_for_objects_of_meshes_too():
     bowl = procedural.generate(3, "bowl")
     assert {piece.kind for piece in bowl.pieces} == {"mesh"}
-    assert _geometry(bowl)["piece_size"].dtype == float
+    assert object_pieces(bowl).size.dtype == float

@@ -37,11 +37,11 @@ _HEAD = """# Gallery
 python -m tests.benchmarks gallery --scans object_sim    # these grasps, pictures and this page
 ```
 
-Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are MyoSuite's
-(Apache-2.0, `simhive/object_sim`). `runs/gallery` holds the grasps; two of them serve as references of others.
+Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are from MyoSuite
+(Apache-2.0, `simhive/object_sim`). The command writes the grasps to `runs/gallery`, and uses two of them as references of other grasps.
 The policies are {policies}.
 
-| grasp | command, attempts that hold the object |
+| grasp | command, and number of attempts that hold the object |
 |---|---|
 """
 _DIGITS = 16

@@ -209,7 +209,7 @@ def test_unknown_constraint_is_named():
         CongraspError, match=r"no constraint 'glove'.*Choose from: heading, affordance"
     ):
         get_constraint("glove")
-    with pytest.raises(CongraspError, match="heading is always active"):
+    with pytest.raises(CongraspError, match="lack the heading, which is always active"):
         known(TaskConfig(constraints=("pose",)))
     with pytest.raises(
         CongraspError,

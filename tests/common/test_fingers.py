@@ -256,7 +256,7 @@ def test_words():
         and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
     )
     with pytest.raises(
-        CongraspError, match=r"has no finger 'pinky'.*Known: thumb, index, middle, ring, little"
+        CongraspError, match=r"has no finger 'pinky'.*from: thumb, index, middle, ring, little"
     ):
         FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND, BOX)
     with pytest.raises(CongraspError, match="no finger 'little'"):
@@ -266,7 +266,7 @@ def test_words():
     ):
         FINGERS.parse({"fingers": ("index", "middle")}, HAND, BOX)
     for one in (("thumb",), ("thumb", "thumb")):
-        with pytest.raises(CongraspError, match="names only one finger"):
+        with pytest.raises(CongraspError, match="has only one finger"):
             FINGERS.parse({"fingers": one}, HAND, BOX)
 
 

@@ -137,7 +137,7 @@ def test_positive_angles_flex_towards_the_palm_and_spread_towards_the_thumb(hand
 def test_it_is_found_by_name_only_where_the_users_file_is(mano, monkeypatch):
     get_hand.cache_clear()
     monkeypatch.delenv(VARIABLE, raising=False)
-    with pytest.raises(CongraspError, match=rf"your copy of MANO_RIGHT.pkl.*{VARIABLE}="):
+    with pytest.raises(CongraspError, match=rf"requires the file MANO_RIGHT.pkl.*{VARIABLE}="):
         get_hand("mano")
     monkeypatch.setenv(VARIABLE, str(mano))
     assert get_hand("mano") is get_hand("mano")

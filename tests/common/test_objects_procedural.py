@@ -256,7 +256,7 @@ def test_pools_that_cannot_be_are_refused_in_words(config, words):
 
 
 def test_an_empty_folder_says_how_to_fill_it(tmp_path):
-    with pytest.raises(CongraspError, match=r"holds no object\. .*objects import"):
+    with pytest.raises(CongraspError, match=r"contains no object\. .*objects import"):
         load_pool(ObjectsConfig(folder=str(tmp_path)))
 
 

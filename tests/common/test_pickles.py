@@ -305,7 +305,7 @@ def test_arrays_come_back(tmp_path):
             "not an NPZ file",
             id="deep header",
         ),
-        pytest.param({"a.txt": b""}, "else than arrays", id="a text"),
+        pytest.param({"a.txt": b""}, "members that are not arrays", id="a text"),
     ],
 )
 def test_what_is_larger_than_it_looks_is_refused_before_it_is_in_memory(tmp_path, members, why):

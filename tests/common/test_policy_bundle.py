@@ -298,5 +298,5 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
         more.observation, batch._replace(count=np.float64(1e6), m2=batch.m2 * 1e6 / 6)
     )
     np.testing.assert_allclose(news.mean[~kept], raw[:, ~kept].mean(0), rtol=0.1, atol=1e-3)
-    with pytest.raises(CongraspError, match="to begin with is for hand 'human'"):
+    with pytest.raises(CongraspError, match="is for hand 'human'"):
         bundles.with_inputs_of(spec, plain, more)

@@ -90,7 +90,7 @@ def test_a_mark_without_results_is_an_error(marks):
 def test_a_file_of_another_kind_is_an_error(tmp_path):
     file = tmp_path / "human.json"
     file.write_text(json.dumps({"rows": [{"success": 1.0}]}))
-    with pytest.raises(CongraspError, match="not a file of results"):
+    with pytest.raises(CongraspError, match="not a results file"):
         read_results(file)
     file.write_text(json.dumps({"rows": []}))
     with pytest.raises(CongraspError, match="lacks"):

@@ -330,7 +330,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
     # Its key is its own, but the message says another's name.
     forged = rollout(actor=OTHER, incarnation="01", sequence=0, run_id="e", ticket="t")
     reply = actor.query(KEYS.rollout(ME), forged, timeout=5).meta
-    assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
+    assert reply["outcome"] == "refused" and "the key of another actor" in reply["why"]
     assert fresh.hub.status()["counters"]["accepted"] == 0
 
 

@@ -145,16 +145,17 @@ def test_a_teacher_that_does_not_fit_is_one_line(teacher):
         assert "\n" not in str(caught.value)
 
     refused(
-        "Distillation needs a teacher. Name a hand or a policy file with --teacher",
+        "Distillation needs a teacher. Pass a hand or a policy file with --teacher",
         distill=DistillConfig(),
     )
     refused("cannot be read", distill=DistillConfig(teacher="absent.safetensors"))
     refused(
         "cannot teach the hand 'human'", PolicySpec("human", spec.layout, spec.action_size, NETWORK)
     )
-    refused("learnt with another 'control_dt'", task=dataclasses.replace(run.task, control_dt=0.02))
+    refused("with another 'control_dt'", task=dataclasses.replace(run.task, control_dt=0.02))
     refused(
-        "does not observe what", task=dataclasses.replace(run.task, constraints=("heading", "pose"))
+        "has other observations than",
+        task=dataclasses.replace(run.task, constraints=("heading", "pose")),
     )
 
 

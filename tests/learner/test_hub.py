@@ -221,10 +221,10 @@ def test_nobody_speaks_for_another(bench):
     b = bench(version=0)
     assert b.ticket("t")["granted"]
     asked = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
-    with pytest.raises(RefusedError, match=r"actor 'a' came under the key .*/ticket/b'"):
+    with pytest.raises(RefusedError, match=r"Actor 'a' published on .*/ticket/b'"):
         b.ask(KEYS.ticket("b"), asked)
     reply = b.peer.query(KEYS.rollout("b"), rollout(), timeout=60).meta
-    assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
+    assert reply["outcome"] == "refused" and "the key of another actor" in reply["why"]
     ledger = b.ledger()
     # A's ticket is still a's
     assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (
@@ -302,7 +302,7 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
         ),
         "reward": (
             np.full((T, B), 1e19, np.float32),
-            r"'reward' holds 1e\+19; the task's are within -65 and 65",
+            r"'reward' holds 1e\+19, which is not within the task's limits -65 and 65",
         ),
         "action": (np.full((T, B, A), -3e38, np.float32), r"'action' holds -3e\+38"),
         "log_probability": (np.full((T, B), 100, np.float32), "'log_probability' holds 100"),

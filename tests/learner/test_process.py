@@ -289,7 +289,7 @@ def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):
     with pytest.raises(CongraspError, match="not a run directory"):
         learn(tmp_path, hub)
     create_run(tmp_path, CONFIG)
-    with pytest.raises(CongraspError, match="already has a run"):
+    with pytest.raises(CongraspError, match="already contains a run"):
         create_run(tmp_path, CONFIG)
     with pytest.raises(CongraspError, match="no checkpoint"):
         learn(tmp_path, hub, resume=True)

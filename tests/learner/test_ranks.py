@@ -164,8 +164,8 @@ def test_a_process_alone_agrees_with_itself():
     ("arguments", "complaint"),
     [
         ((2, 2, "127.0.0.1:7000"), "no rank 2 of 2"),
-        ((0, 2, "127.0.0.1"), "no address"),
-        ((0, 2, "127.0.0.1:99999"), "no address"),
+        ((0, 2, "127.0.0.1"), "not a valid address"),
+        ((0, 2, "127.0.0.1:99999"), "not a valid address"),
     ],
 )
 def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
@@ -175,7 +175,7 @@ def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
 
 def test_nobody_waits_for_ever_for_a_rank_that_never_comes(monkeypatch):
     monkeypatch.setattr(ranks_module, "JOIN_SECONDS", 0.5)
-    with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not come"):
+    with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not join"):
         Ranks.join(0, 2, f"127.0.0.1:{free_port()}")
     with pytest.raises(TransportError, match="Rank 0 does not answer"):
         Ranks.join(1, 2, f"127.0.0.1:{free_port()}")

@@ -66,7 +66,7 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
     assert defaults(["--resume", "--run-dir", str(folder)]) == {"config": config}
     assert defaults([f"--run-dir={folder}", "--or-resume", "--preset", "human"])["config"] == config
     assert defaults(["--run-dir", str(folder), "--preset=human"]) == {"config": get_preset("human")}
-    with pytest.raises(CongraspError, match="a run of 'human', which --preset allegro is not for"):
+    with pytest.raises(CongraspError, match="hand 'human', but --preset allegro is for another"):
         defaults(["--resume", "--run-dir", str(folder), "--preset", "allegro"])
     assert defaults(["--or-resume", "--run-dir", str(folder / "none")])["config"] == get_preset(
         "quickstart"

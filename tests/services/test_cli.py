@@ -139,15 +139,15 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
         (
             ["grasp", "mug:7", "--attempts", "100000000"],
-            "--attempts is 100000000. It must be from 1 to 1024",
+            "--attempts is 100000000. It must be between 1 and 1024",
         ),
         (["grasp"], "nothing to grasp"),
         (["grasp", ""], "An argument is empty"),
         (["grasp", "mug:7", "--out", ""], "--out is empty"),
-        (["grasp", "mug:7", "--approach", "-1"], "--approach is -1.0. It must be from 0 to"),
-        (["grasp", "mug:7", "--approach", "11"], "--approach is 11.0. It must be from 0 to"),
-        (["grasp", "mug:7", "--lift", "0.6"], "--lift is 0.6. It must be from 0 to"),
-        (["grasp", "mug:7", "--lift", "nan"], "--lift is nan. It must be from 0 to"),
+        (["grasp", "mug:7", "--approach", "-1"], "--approach is -1.0. It must be between 0 and"),
+        (["grasp", "mug:7", "--approach", "11"], "--approach is 11.0. It must be between 0 and"),
+        (["grasp", "mug:7", "--lift", "0.6"], "--lift is 0.6. It must be between 0 and"),
+        (["grasp", "mug:7", "--lift", "nan"], "--lift is nan. It must be between 0 and"),
         (["objects", "generate", "--out", "/nonexistent-out", "--count", "0"], "--count is 0"),
         (["objects", "import"], "nothing to import"),
         (["objects", "import", "nothing"], "no file or folder nothing. Check the path"),
@@ -182,7 +182,7 @@ def test_help_names_every_command_and_every_command_exists():
             ["serve", "--metrics-port", "99999999"],
             "metrics cannot be served at .*:99999999.*--metrics-port",
         ),
-        (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
+        (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is not a recording"),
         (
             ["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"],
             "other machines.*--certs",
@@ -211,7 +211,7 @@ def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch
 @pytest.mark.parametrize("out", ["link", "link/grasps"])
 def test_an_output_behind_a_link_to_nothing_is_refused(tmp_path, out):
     (tmp_path / "link").symlink_to(tmp_path / "gone")
-    with pytest.raises(CongraspError, match="link is a file or a link to nothing"):
+    with pytest.raises(CongraspError, match="link is a file or a broken link"):
         cli.run(["objects", "generate", "--out", str(tmp_path / out)])
 
 

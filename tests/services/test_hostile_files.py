@@ -497,7 +497,7 @@ def test_recordings_of_others_are_one_line(tmp_path):
     whole = episode_message()
     for number, (change, why) in enumerate(
         (
-            ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
+            ({"hand": "/etc/hosts.json"}, "not a built-in hand"),
             ({"success": None}, "'success' is None"),
             ({"metrics": []}, r"'metrics' is \[\]"),
         )

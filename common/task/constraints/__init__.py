@@ -55,7 +55,10 @@ def known(task: TaskSettings) -> tuple[Constraint, ...]:
     for name in task.constraints:
         get_constraint(name)
     if "heading" not in task.constraints:
-        raise CongraspError("The heading is always active.", "Add it to the task's constraints.")
+        raise CongraspError(
+            "The task's constraints lack the heading, which is always active.",
+            "Add 'heading' to them.",
+        )
     return tuple(constraint for constraint in CONSTRAINTS if constraint.name in task.constraints)
 
 

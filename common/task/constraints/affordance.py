@@ -103,14 +103,17 @@ class Affordance(Constraint):
     options = (
         Option(
             "affordance",
-            "Part to grasp: a mesh of it in the coordinates of the object's file, or names of its "
-            "parts.",
+            "Part of the object to grasp: a mesh of the part in the coordinates of the object's "
+            "file, or names of labelled parts.",
             "part",
         ),
         Option("avoid", "Part to avoid: a mesh file or part names, as in --affordance.", "part"),
     )
     needs = ("surface_avoid",)
-    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_avoid'.")
+    invalid = (
+        "An affordance needs surface points to grasp and surface points to avoid.",
+        "Set 'surface_avoid' to True for some points, and to False for others.",
+    )
 
     def available(self, draw: Draw) -> Array:
         """True where the object has both regions, and its graspable one can be approached in the
@@ -263,8 +266,8 @@ def _region_between(graspable: Part, avoid: Part, name: str) -> np.ndarray:
     if not (graspable.distance < avoid.distance).any():
         raise CongraspError(
             f"--affordance '{graspable.text}' and --avoid '{avoid.text}' contradict each other: "
-            f"all that may be grasped of '{name}' must not be touched.",
-            "Leave one of them out, or name different parts.",
+            f"the whole graspable region of '{name}' is to be avoided.",
+            "Leave one of them out, or pass different parts.",
         )
     region = np.asarray(avoid.distance < graspable.distance)
     _check_region_not_empty(region, graspable, name)
@@ -281,7 +284,7 @@ def _region_of(avoid: Part, name: str) -> np.ndarray:
     if region.all():
         raise CongraspError(
             f"'{avoid.text}' covers all of '{name}', so nothing may be touched.",
-            "Avoid a part of it.",
+            "Pass a smaller part.",
         )
     _check_region_not_empty(region, avoid, name)
     return region
@@ -296,8 +299,8 @@ def _region_outside(graspable: Part, name: str) -> np.ndarray:
     region = np.asarray(graspable.distance >= _PART_DISTANCE)
     if region.all():
         raise CongraspError(
-            f"Nothing of '{graspable.text}' lies on the surface of '{name}'.",
-            "The part must be in the coordinates of the object's file. Pass it with --affordance.",
+            f"'{graspable.text}' does not touch the surface of '{name}'.",
+            "Pass a part in the coordinates of the object's file with --affordance.",
         )
     _check_region_not_empty(region, graspable, name)
     return region
@@ -306,7 +309,10 @@ def _region_outside(graspable: Part, name: str) -> np.ndarray:
 def _check_region_not_empty(region: np.ndarray, part: Part, name: str) -> None:
     """Raises a CongraspError for a part of an object that leaves no point to avoid."""
     if not region.any():
-        raise CongraspError(f"'{part.text}' excludes nothing: all of '{name}' may be touched.")
+        raise CongraspError(
+            f"'{part.text}' has no effect: the whole surface of '{name}' may be touched.",
+            "Pass another part, or leave the option out.",
+        )
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:

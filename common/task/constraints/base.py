@@ -329,7 +329,9 @@ class Constraint:
         """
         for word in words:
             if word not in names:
-                raise CongraspError(f"--{option}: {lacks} '{word}'.", f"Known: {', '.join(names)}.")
+                raise CongraspError(
+                    f"--{option}: {lacks} '{word}'.", f"Choose from: {', '.join(names)}."
+                )
         return np.isin(names, words)
 
     def valid(self, surface: Surface, values: Any) -> Array:

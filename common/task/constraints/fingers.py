@@ -78,11 +78,14 @@ class Fingers(Constraint):
     options = (
         Option(
             "fingers",
-            "Fingers that may touch the object, such as: thumb index. All by default.",
+            "Fingers that may touch the object, such as: thumb index. All fingers by default.",
             many=True,
         ),
     )
-    invalid = ("The constraint 'fingers' needs the thumb and another finger.", "Allow both.")
+    invalid = (
+        "The constraint 'fingers' needs the thumb and another finger.",
+        "Allow both.",
+    )
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> FingersGoal:
         """Samples any set with the thumb; pinch, tripod and all fingers are more likely than
@@ -175,7 +178,8 @@ class Fingers(Constraint):
         )
         if allowed.sum() < 2:
             raise CongraspError(
-                "--fingers names only one finger, which cannot hold an object.", "Name two or more."
+                "--fingers has only one finger, which cannot hold an object.",
+                "Pass at least two fingers.",
             )
         if not allowed[0]:
             thumb = hand.fingers[0]

@@ -67,13 +67,11 @@ class Force(Constraint):
         Option(
             "force", "Upper limit of each link's force in newtons, such as: 3. No limit by default."
         ),
-        Option(
-            "gentle", "Uses the lowest force limit that suits the object's weight.", switch=True
-        ),
+        Option("gentle", "Use the lowest force limit that suits the object's weight.", switch=True),
     )
     invalid = (
         f"The constraint 'force' takes a limit between {_MIN_REQUEST:g} and {_MAX_REQUEST:g} N.",
-        "Set 'force_limit'.",
+        "Set 'force_limit' to a value in this range.",
     )
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> ForceGoal:
@@ -156,7 +154,7 @@ def _parsed_limit(text: str) -> float:
     if not _MIN_REQUEST <= limit <= _MAX_REQUEST:
         raise CongraspError(
             f"--force is '{text}', not a number between {_MIN_REQUEST:g} and {_MAX_REQUEST:g}.",
-            "Write --force 3.",
+            "Pass newtons, such as --force 3.",
         )
     return limit
 

@@ -114,15 +114,14 @@ class Heading(Constraint):
         Option(
             "heading",
             'Approach direction: three numbers in the axes of the object\'s file ("0 0 -1"), or '
-            "'above'. Free "
-            "by default.",
+            "'above' for a direction within 30 degrees of straight down. Any direction by default.",
             "direction",
             words=(ABOVE,),
         ),
         Option(
             "at",
-            "Target of the grasping hand's centre: three numbers in metres, in the coordinates of "
-            "the file.",
+            "Target position of the hand's centre in the grasp: three numbers in metres, in the "
+            "coordinates of the object's file.",
             "place",
         ),
     )

@@ -129,8 +129,8 @@ class Pose(Constraint):
     options = (
         Option(
             "pose",
-            "Reference pose: a grasp.npz, a constraint set (FILE:NUMBER), or JSON with joints, "
-            "position, quaternion.",
+            "Reference pose: a grasp.npz, a pose of a constraint set (FILE:NUMBER), or a JSON file "
+            "with joints, position and quaternion.",
             "pose",
         ),
     )

@@ -107,9 +107,9 @@ class Trajectory(Constraint):
     options = (
         Option(
             "trajectory",
-            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, CSV (x "
-            "y z w x y z), "
-            "or BVH (cm, y up; FILE:JOINT, RightHand by default).",
+            "Wrist path: a grasp.npz, a constraint set (FILE:NUMBER), a JSON file with position "
+            "and quaternion, a CSV file (x y z, and the quaternion w x y z), or a BVH file (cm, y "
+            "up; FILE:JOINT names the joint, RightHand by default).",
             "path",
         ),
     )

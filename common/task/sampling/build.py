@@ -97,8 +97,8 @@ def _build(
     )
     if not any(row["weight"] for row in rows):
         raise CongraspError(
-            f"None of {count} objects can be grasped: in every resting pose they lie too flat on "
-            f"the table.",
+            f"None of {count} objects can be grasped: they lie too flat on the table in every "
+            f"resting pose.",
             "Add other objects.",
         )
     # Closing a hand around objects takes seconds

@@ -37,9 +37,9 @@ def _check_hand(constraints: Message, first: Message) -> None:
     for key in ("hand", "finger_joints"):
         if meta[key] != first.meta[key]:
             raise CongraspError(
-                f"The set of '{meta['object']}' is for the hand '{meta['hand']}', that of "
-                f"'{first.meta['object']}' for '{first.meta['hand']}'.",
-                "Use sets of one hand together.",
+                f"The constraint set of '{meta['object']}' is for the hand '{meta['hand']}', but "
+                f"that of '{first.meta['object']}' is for '{first.meta['hand']}'.",
+                "Use only constraint sets of the same hand.",
             )
 
 
@@ -50,9 +50,9 @@ def _check_sizes(constraints: Message, first: Message) -> None:
         first_size = first.arrays[name].shape[-2]
         if size != first_size:
             raise CongraspError(
-                f"The sets of '{constraints.meta['object']}' and '{first.meta['object']}' differ "
-                f"in {name}: {size} and {first_size}.",
-                "Make them with the same settings.",
+                f"The constraint sets of '{constraints.meta['object']}' and "
+                f"'{first.meta['object']}' differ in {name}: {size} and {first_size}.",
+                "Generate both with the same settings.",
             )
 
 
@@ -68,7 +68,7 @@ def _row(constraints: Message, split: Split) -> ConstraintBank:
         raise CongraspError(
             f"The constraint set of '{constraints.meta['object']}' has no heading ({split}) in any "
             f"resting pose.",
-            "Remove it or use another split.",
+            "Remove the set, or use another split.",
         )
     heading_allowed = heading_allowed[:, usable]
     index = feasible_indices(heading_allowed)

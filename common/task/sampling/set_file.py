@@ -111,8 +111,8 @@ def load_for(
         constraints = load(path)
         if constraints.meta["object_digest"] != store.digest(obj):
             raise CongraspError(
-                f"{path} was made for another object '{obj.name}'.",
-                "Pass the folder of that object.",
+                f"{path} was made for another object with the name '{obj.name}'.",
+                "Pass the folder of that object, or generate the set again.",
             )
         if allowed_in_split(constraints, "heading", split)[0].any():
             chosen.append(obj)

@@ -168,7 +168,7 @@ def source_of(mesh: pathlib.Path) -> Source:
     sources = find_sources(mesh)
     if len(sources) > 1:
         raise CongraspError(
-            f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file."
+            f"{mesh} contains {len(sources)} objects.", "Pass the folder or the file of one object."
         )
     return sources[0]
 

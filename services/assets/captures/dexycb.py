@@ -69,8 +69,8 @@ def read(
     """
     if model is None:
         raise CongraspError(
-            "DexYCB's hand poses need your copy of MANO_RIGHT.pkl.",
-            f"Pass it with --mano, or set {VARIABLE}.",
+            "DexYCB's hand poses require the file MANO_RIGHT.pkl.",
+            f"Download it from MANO's site, and pass it with --mano or set {VARIABLE}.",
         )
     root = _root(path)
     all_meshes = meshes.beside(root / "models")
@@ -99,7 +99,9 @@ def _sequence(
     grasped = int(_value(name, meta, "ycb_grasp_ind"))
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
         raise Dropped(
-            name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}"
+            name,
+            "wrong layout",
+            f"'ycb_grasp_ind' {grasped} is not the index of an object of {ids}",
         )
     objects, hands = frames_of(
         name,
@@ -150,7 +152,7 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise Dropped(name, "unreadable", " ".join(str(error).split())) from None
     if not isinstance(content, dict):
-        raise Dropped(name, "wrong layout", f"{path} holds no settings")
+        raise Dropped(name, "wrong layout", f"{path} contains no settings")
     return content
 
 

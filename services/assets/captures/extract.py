@@ -117,7 +117,7 @@ def _wrist_distance(sequence: Sequence, surface: Surface, position: np.ndarray) 
     present = sequence.present
     distance = surface.distance(np.where(present[:, None], position, _FAR_AWAY))
     if not present.any():
-        raise Dropped(sequence.name, "frames missing", "hand and object are in no frame together")
+        raise Dropped(sequence.name, "frames missing", "no frame has both the hand and the object")
     nearest = distance[present].min()
     if nearest > _MAX_DISTANCE:
         reason = (

@@ -99,7 +99,7 @@ def _sequence(
     data = read_archive(file)
     bodies = {key.partition("/")[0] for key in data}
     if "rhand" not in bodies and "lhand" in bodies:
-        raise Dropped(name, "left hand", "it has no right hand")
+        raise Dropped(name, "left hand", "the sequence has no right hand")
     shapes = {field: (width,) for field, width in _FIELD_WIDTHS.items()}
     arrays = frames_of(name, "the file", data, shapes)
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))

@@ -172,6 +172,6 @@ def read_vertices(path: pathlib.Path) -> np.ndarray:
     geometry = load_geometry(path, "Download the file again.", maintain_order=True)
     if not hasattr(geometry, "vertices"):
         raise CongraspError(
-            f"{path} does not hold a single mesh or point cloud.", "Download the file again."
+            f"{path} does not contain a single mesh or point cloud.", "Download the file again."
         )
     return np.asarray(geometry.vertices, float)

@@ -73,7 +73,9 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     )
     if runs_back(time).any():
         raise Dropped(
-            name, "wrong layout", "its time runs back: sort its frames, and cut it to one motion"
+            name,
+            "wrong layout",
+            "its time decreases: sort its frames, and keep only one motion in the file",
         )
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
     if not present.any():
@@ -85,7 +87,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
         raise Dropped(
             name,
             "wrong units",
-            f"a joint is at {largest:.4g}: check that its angles are in radians",
+            f"a joint angle is {largest:.4g}: check that angles are in radians",
         )
     position, rotation = wrist_pose(robot)
     object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]

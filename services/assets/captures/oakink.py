@@ -73,13 +73,13 @@ def read(
     index = root / "anno" / "seq_all.json"
     if not index.is_file():
         raise CongraspError(
-            f"There is no {index}.", "Pass the folder that holds OakInk-Image's 'anno'."
+            f"There is no {index}.", "Pass the folder that contains OakInk-Image's 'anno'."
         )
     try:
         sequences = _sequences(read_json(index, _MAX_JSON_BYTES, _REMEDY))
     except (TypeError, ValueError):
         raise CongraspError(
-            f"{index} holds other rows than [sequence, subject, frame, camera].", _REMEDY
+            f"{index} has rows that are not [sequence, subject, frame, camera].", _REMEDY
         ) from None
     all_meshes = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
@@ -126,7 +126,7 @@ def _sequence(
     annotations = _annotations(name, files)
     reference = next((frame for frame in annotations if frame is not None), None)
     if reference is None:
-        raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
+        raise Dropped(name, "frames missing", "no frame has both a right hand and an object")
     filled = [frame or reference for frame in annotations]
     pose = np.stack([frame.hand_pose for frame in filled])
     object_pose = np.stack([frame.object_pose for frame in filled])

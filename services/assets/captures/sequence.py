@@ -103,7 +103,7 @@ class Sequence:
                     f"{field} has {len(values)} frames, but there are {frames}",
                 )
             if not np.isfinite(values[self.present]).all():
-                raise Dropped(self.name, "not finite", f"{field} holds values that are not finite")
+                raise Dropped(self.name, "not finite", f"{field} has values that are not finite")
 
 
 def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
@@ -146,9 +146,7 @@ def array_of(
     try:
         array = np.array(values[key], float)
     except (TypeError, ValueError):
-        raise Dropped(
-            name, "wrong layout", f"'{key}' of {where} holds no numbers of one shape"
-        ) from None
+        raise Dropped(name, "wrong layout", f"'{key}' of {where} is not a numeric array") from None
     fixed_sizes = [size for size in shape if isinstance(size, int)]
     if len(fixed_sizes) == len(shape) and array.size == math.prod(fixed_sizes):
         return array.reshape(fixed_sizes)
@@ -203,7 +201,7 @@ def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np
       Dropped: no frame is known.
     """
     if not present.any():
-        raise Dropped(name, "frames missing", "hand and object are in no frame together")
+        raise Dropped(name, "frames missing", "no frame has both the hand and the object")
     frames = np.where(present, np.arange(len(present)), present.argmax())
     return [array[frames] for array in arrays]
 

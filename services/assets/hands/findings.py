@@ -76,4 +76,4 @@ def read_findings(path: pathlib.Path) -> list[Finding]:
         rows = read_json(path, _MAX_FILE_BYTES, remedy)["findings"]
         return [Finding(**fields) for fields in rows]
     except (LookupError, TypeError) as error:
-        raise CongraspError(f"{path} holds no self-check: {error}.", remedy) from None
+        raise CongraspError(f"{path} is not a self-check: {error}.", remedy) from None

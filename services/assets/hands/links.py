@@ -68,7 +68,9 @@ def hand_tree(model: mujoco.MjModel, palm_name: str, notes: list[str]) -> Tree:
     names = [model.body(i).name for i in range(model.nbody)]
     if palm_name and palm_name not in names:
         existing = ", ".join(name for name in names if name)
-        raise CongraspError(f"There is no body '{palm_name}'.", f"Pass one of: {existing}.")
+        raise CongraspError(
+            f"There is no body '{palm_name}'.", f"Pass one of these as --palm: {existing}."
+        )
     palm = names.index(palm_name) if palm_name else find_palm(model, notes)
     owner = {palm: palm}
     groups = {palm: [palm]}

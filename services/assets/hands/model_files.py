@@ -125,13 +125,14 @@ def _check_fingers(path: pathlib.Path, tree: Tree, ends: tuple[int, ...]) -> Non
         return
     if not tree.model.njnt:
         raise CongraspError(
-            f"{path} has no joints.", "If it is a part, import the file that includes it."
+            f"{path} has no joints.",
+            "If it is a part of a description, import the file that includes it.",
         )
     count = "one finger" if ends else "no finger"
     palm = tree.model.body(tree.palm).name
     raise CongraspError(
         f"{path} has {count} on its palm '{identifier(palm, f'body_{tree.palm}')}'.",
-        "A hand has two or more: import a file with all of them, or pass another --palm.",
+        "A hand has at least two fingers: import a file with all of them, or pass another --palm.",
     )
 
 
@@ -182,7 +183,7 @@ def _check_ranges(path: pathlib.Path, hand: Hand) -> None:
     """Raises a CongraspError if no joint turns far enough to grasp."""
     if max(joint.upper - joint.lower for joint in hand.joints) < _MIN_RANGE:
         raise CongraspError(
-            f"No joint of the hand in {path} turns by 10 degrees.",
+            f"No joint of the hand in {path} has a range of 10 degrees.",
             'Check that its angles are in radians, or add <compiler angle="radian"/>.',
         )
 
@@ -194,7 +195,7 @@ def _check(path: pathlib.Path, hand: Hand, ignored: str = "") -> None:
             continue
         raise CongraspError(
             f"{path}: {fault}.",
-            "Correct the file, or write a hand file by hand (docs/add-a-hand.md).",
+            "Correct the file, or write the hand's JSON file yourself (docs/add-a-hand.md).",
         )
 
 

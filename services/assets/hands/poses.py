@@ -84,7 +84,8 @@ def thumb_of(hand: Hand, thumb: str, notes: list[str]) -> str:
     if thumb:
         if thumb not in tips:
             raise CongraspError(
-                f"'{thumb}' is not the last link of a finger.", f"Pass one of: {', '.join(tips)}."
+                f"'{thumb}' is not the last link of a finger.",
+                f"Pass one of these as --thumb: {', '.join(tips)}.",
             )
         return thumb
     for tip in tips:

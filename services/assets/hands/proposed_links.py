@@ -130,11 +130,12 @@ def _joint(tree: Tree, j: int, name: str, drive: Drive) -> Joint:
     """A hinge with its limits and gains."""
     if tree.model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(
-            f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported."
+            f"The joint '{name}' is not a hinge.",
+            "Remove it or fix it: only hands with hinge joints can be imported.",
         )
     limits = drive.limits(j)
     if limits is None:
-        raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
+        raise CongraspError(f"The joint '{name}' has no limits.", "Add its range to the file.")
     lower, upper = limits
     without_gains = Joint(
         name,

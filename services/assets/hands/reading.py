@@ -52,7 +52,7 @@ def confined(
         raise CongraspError(f"There is no file {path}.", "Check the path.")
     if path.stat().st_size > MAX_FILE:
         raise CongraspError(
-            f"{path} has more than {MAX_FILE >> 20} MB.", "Pass a robot description."
+            f"{path} is larger than {MAX_FILE >> 20} MB.", "Pass the URDF or MJCF file of the hand."
         )
     patience = SECONDS + _START_S
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
@@ -67,7 +67,9 @@ def confined(
                 patience=patience,
             )
         except TimeoutError:
-            raise CongraspError(f"{path} was not read within {patience:g} s.", _REMEDY) from None
+            raise CongraspError(
+                f"Reading {path} took longer than {patience:g} s.", _REMEDY
+            ) from None
         except ChildProcessError as error:
             limits = f"the limits are {SECONDS} s and {MEMORY >> 30} GB"
             raise CongraspError(

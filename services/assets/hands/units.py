@@ -73,7 +73,7 @@ def _check_distance(path: pathlib.Path, link: Link) -> None:
     farthest = max(distances, default=0.0)
     if farthest > _MAX_DISTANCE:
         raise CongraspError(
-            f"{path}: the link '{link.name}' turns {length(farthest)} from the palm"
+            f"{path}: the joint of the link '{link.name}' is {length(farthest)} away from the palm"
             f"{_NOT_OF_A_HAND}",
             _smaller_unit(farthest),
         )
@@ -87,7 +87,7 @@ def _check_angles(path: pathlib.Path, link: Link) -> None:
     angle = _largest_angle(largest)
     if angle > _MAX_ANGLE:
         raise CongraspError(
-            f"{path}: the joint '{largest.name}' turns to {angle:.4g} rad{_NOT_OF_A_HAND}",
+            f"{path}: the joint '{largest.name}' has a limit of {angle:.4g} rad{_NOT_OF_A_HAND}",
             _DEGREES,
         )
 

@@ -70,8 +70,8 @@ def relabelled(
     if share < LEAST_SHARE:
         raise CongraspError(
             f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
-            f"It must be {LEAST_SHARE:.0%} at least: choose a larger part, or swap the parts with "
-            f"--invert.",
+            f"It must be at least {LEAST_SHARE:.0%}: select a larger part, or swap the regions "
+            f"with --invert.",
         )
     return dataclasses.replace(
         obj,
@@ -124,15 +124,15 @@ def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> n
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
         raise CongraspError(
-            f"The direction {tuple(normal)} has no length.",
-            "Give three finite numbers, not all zero.",
+            f"The direction {tuple(normal)} is not a vector with a finite length above zero.",
+            "Pass three finite numbers that are not all zero.",
         )
     farthest = float(np.linalg.norm(obj.points, axis=-1).max())
     if not abs(offset) <= farthest:
         raise CongraspError(
-            f"The plane at {offset:g} m misses '{obj.name}', which reaches {farthest:.3f} m from "
-            f"its centre of mass.",
-            "Give the distance from there in metres.",
+            f"The plane at {offset:g} m does not intersect '{obj.name}', whose farthest point is "
+            f"{farthest:.3f} m from its centre of mass.",
+            "Pass the plane's distance from the centre of mass in metres.",
         )
     return obj.points @ (np.asarray(normal, float) / length) >= offset
 
@@ -174,8 +174,8 @@ def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     distance = from_part(obj, path)
     if distance.min() > _PART_DISTANCE:
         raise CongraspError(
-            f"{path} lies {100 * distance.min():.1f} cm from the surface of '{obj.name}'.",
-            "The part must be in the frame and unit of the object's own file.",
+            f"{path} is {100 * distance.min():.1f} cm away from the surface of '{obj.name}'.",
+            "Export the part in the frame and unit of the object's file.",
         )
     return distance <= _PART_DISTANCE
 
@@ -200,7 +200,8 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
         colours = getattr(visual, "vertex_colors", ())
     if not len(colours):
         raise CongraspError(
-            f"{path} has no coloured vertices.", "Paint them and export as PLY with colours."
+            f"{path} has no coloured vertices.",
+            "Paint the vertices, and export the mesh as PLY with colours.",
         )
     vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)
@@ -212,7 +213,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
         present = ", ".join(_hexadecimal(row) for row in _commonest(rgb))
         raise CongraspError(
             f"No vertex of {path} has the colour {_hexadecimal(colour)}.",
-            f"Its colours are {present}.",
+            f"Pass one of its colours with --colour: {present}.",
         )
     return has_colour[cKDTree(vertices).query(obj.points)[1]]
 
@@ -231,15 +232,15 @@ def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> No
       vertices: those of finite numbers.
     """
     if not len(vertices):
-        raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
+        raise CongraspError(f"{path} has no vertex with finite coordinates.", "Export it again.")
     box = np.stack([vertices.min(0), vertices.max(0)])
     object_box = np.stack([obj.visual_vertices.min(0), obj.visual_vertices.max(0)])
     deviation = float(np.abs(object_box - box).max())
     if deviation > _BOX_TOLERANCE * np.ptp(object_box, axis=0).max():
         raise CongraspError(
-            f"{path} does not show '{obj.name}': its bounding box is off by "
+            f"{path} is not a mesh of '{obj.name}': their bounding boxes differ by "
             f"{100 * deviation:.3g} cm.",
-            "It must be in the frame and unit of the object's own file.",
+            "Export it in the frame and unit of the object's file.",
         )
 
 

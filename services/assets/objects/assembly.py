@@ -110,7 +110,7 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         notes.append(_open_surface_note(source))
     solid = enclosed(np.asarray(surface.triangles)) if closed else None
     if solid and solid.overlaps:
-        notes.append("its bodies overlap: what lies in several of them weighs once")
+        notes.append("its bodies overlap: overlapping volume is weighed once")
     surfaces = _surfaces(meshes, solid, notes)
     weight_by_material = None
     if options.material:  # before the cut, which takes long: the material may be unknown

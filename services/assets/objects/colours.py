@@ -50,7 +50,9 @@ def sample_colours(
     except Exception as error:  # pictures and texture coordinates of files raise whatever they hold
         message = str(error) or type(error).__name__
         reason = message.splitlines()[0][:100].rstrip(" .!")
-        raise CongraspError(f"The colours of {paths[0]} cannot be read: {reason}.") from None
+        raise CongraspError(
+            f"The colours of {paths[0]} cannot be read: {reason}.", "Export it without textures."
+        ) from None
 
 
 def _meshes(path: pathlib.Path, up: Up, notes: list[str] | None) -> list[trimesh.Trimesh]:

@@ -64,12 +64,12 @@ def read_with_kind(path: pathlib.Path) -> tuple[str, bytes]:
     if suffix in SUFFIXES:
         return suffix[1:], data
     if _holds_rows_of_numbers(text):
-        raise CongraspError(f"{path} holds rows of numbers: a point cloud.", RECONSTRUCT)
+        raise CongraspError(f"{path} contains rows of numbers, such as a point cloud.", RECONSTRUCT)
     raise CongraspError(f"{path} is not an STL, OBJ, PLY or GLB file.", CONVERT)
 
 
 def _supported_kind(start: bytes, size: int) -> str:
-    """The kind of a mesh file by its beginning and its size in bytes; empty if it is none."""
+    """The kind of a mesh file by its beginning and its size in bytes; empty for other files."""
     if start.startswith(b"glTF"):
         return "glb"
     if start.startswith((b"ply\n", b"ply\r", b"ply ")):

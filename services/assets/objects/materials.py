@@ -58,19 +58,23 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     if len(by_part) < len(entries):
         raise CongraspError(
             f"--material assigns two materials to one part: '{text}'.",
-            "Name one, or PART=NAME for each.",
+            "Pass one material, or PART=NAME for each part.",
         )
     unknown = sorted(by_part.keys() - {"", *parts})
     if unknown:
         named_parts = [part for part in parts if part]
-        remedy = "Name the material alone: the object has no parts."
+        remedy = "Pass one material without a part: the object has no labelled parts."
         if named_parts:
-            remedy = f"The parts are: {', '.join(named_parts)}."
-        raise CongraspError(f"--material names the part '{unknown[0]}'.", remedy)
+            remedy = f"Its parts are: {', '.join(named_parts)}."
+        raise CongraspError(
+            f"--material names the part '{unknown[0]}', which the object does not have.", remedy
+        )
     materials = []
     for part in parts:
         if part not in by_part and "" not in by_part:
-            raise CongraspError(f"--material leaves out the part '{part}'.", f"Add {part}=NAME.")
+            raise CongraspError(
+                f"--material has no material for the part '{part}'.", f"Add {part}=NAME."
+            )
         materials.append(by_part.get(part) or by_part[""])
     return tuple(materials)
 
@@ -81,5 +85,7 @@ def _entry(text: str) -> tuple[str, Material]:
     if not part:
         name = text.strip()  # of '=wood' too, which names no part
     if name not in MATERIALS:
-        raise CongraspError(f"--material is '{name}'.", f"Materials: {', '.join(MATERIALS)}.")
+        raise CongraspError(
+            f"--material is '{name}'.", f"Choose from the materials {', '.join(MATERIALS)}."
+        )
     return part, MATERIALS[name]

@@ -66,7 +66,7 @@ def read_mesh(
     if not len(getattr(mesh, "faces", ())):
         raise _no_triangles(path, kind, data, len(getattr(mesh, "vertices", ())))
     if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
-        raise CongraspError(f"{path} has points that are not of three numbers.", _EXPORT_AGAIN)
+        raise CongraspError(f"{path} has points without three coordinates.", _EXPORT_AGAIN)
     check_triangles(path, mesh)
     vertices, faces = _finite(path, mesh, notes)
     _check_coordinates(path, vertices)
@@ -74,7 +74,8 @@ def read_mesh(
     mesh = repair.merged(upright(vertices, axis), faces, notes)
     if len(mesh.faces) < _MIN_TRIANGLES:
         raise CongraspError(
-            f"{path} has no volume: only {len(mesh.faces)} proper triangles.",
+            f"{path} has no volume: it has {len(mesh.faces)} triangles with an area, and "
+            f"{_MIN_TRIANGLES} are the minimum.",
             "Export a closed mesh.",
         )
     mesh.metadata["kind"] = geometry.metadata["kind"]
@@ -89,7 +90,10 @@ def check_triangles(path: pathlib.Path, mesh: trimesh.Trimesh) -> None:
     """
     too_many = len(mesh.faces) > MAX_FACES
     if too_many or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise CongraspError(f"{path} has triangles without vertices, or too many.", _EXPORT_AGAIN)
+        raise CongraspError(
+            f"{path} has too many triangles, or triangles whose vertices do not exist.",
+            _EXPORT_AGAIN,
+        )
 
 
 def up_of(geometry: Any, up: Up = "auto") -> Literal["y", "z"]:
@@ -204,14 +208,14 @@ class _NeighbouringFiles(trimesh.resolvers.FilePathResolver):
 
 
 def _no_triangles(path: pathlib.Path, kind: str, data: bytes, points: int) -> CongraspError:
-    """The error of a file of some points, but without triangles."""
+    """The error of a file without triangles, which may have points."""
     if b"property float f_dc_0" in data[:START_BYTES]:
         fault = f"{path} is a Gaussian splat of {points} points: it has no triangles."
         return CongraspError(fault, RECONSTRUCT)
     if points:
-        fault = f"{path} has no triangles: it holds only {points} points."
+        fault = f"{path} has no triangles: it contains only {points} points."
         return CongraspError(fault, RECONSTRUCT)
-    fault = f"{path} has no triangles: it holds nothing that can be read as a mesh."
+    fault = f"{path} has no triangles: it contains nothing that can be read as a mesh."
     return CongraspError(fault, f"Export it as a triangle mesh ({kind.upper()}).")
 
 
@@ -227,8 +231,8 @@ def _finite(
     if finite is None:
         count = int((~np.isfinite(mesh.vertices)).any(-1).sum())
         raise CongraspError(
-            f"{path} has {count} vertices that are not finite numbers.",
-            "Repair or export it again.",
+            f"{path} has {count} vertices whose coordinates are not finite numbers.",
+            "Repair it, or export it again.",
         )
     return finite
 
@@ -242,7 +246,7 @@ def _check_coordinates(path: pathlib.Path, vertices: np.ndarray) -> None:
     if farthest > _MAX_COORDINATE:
         raise CongraspError(
             f"{path} has a coordinate of {farthest:.3g}.",
-            f"{_MAX_COORDINATE:g} is the most, in any unit.",
+            f"Move it to the origin, or scale it: {_MAX_COORDINATE:g} is the limit in any unit.",
         )
     rounding = float(np.spacing(np.float32(farthest)))
     size = np.ptp(vertices, axis=0).max(initial=0.0)

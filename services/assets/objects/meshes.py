@@ -97,7 +97,7 @@ def import_sources(
             yield i, result
     except queue.Empty:
         raise CongraspError(
-            f"No import has ended for {patience:.0f} s.", "Import fewer objects at once."
+            f"No import has finished for {patience:.0f} s.", "Import fewer objects at once."
         ) from None
     finally:
         todo.clear()

@@ -160,7 +160,7 @@ def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> G
     """
     entries = objects_at(path)
     if len(entries) > 1:
-        raise CongraspError(f"{path} holds {len(entries)} objects.", "Name one of them.")
+        raise CongraspError(f"{path} contains {len(entries)} objects.", "Pass one of them.")
     return entries[0].load(options)
 
 
@@ -195,7 +195,7 @@ def located(text: str, folder: str = "objects") -> pathlib.Path:
         return path
     raise CongraspError(
         f"There is no object '{text}' in {folder}, and no file or folder of that name.",
-        "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
+        "Pass an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
     )
 
 
@@ -209,7 +209,7 @@ def _check_unambiguous(path: pathlib.Path, stored: pathlib.Path, folder: str) ->
         has_objects = path.exists()
     if has_objects:
         raise CongraspError(
-            f"'{path}' is a {kind} here, and an object in {folder}.",
+            f"'{path}' is ambiguous: it is a {kind}, and the name of an object in {folder}.",
             f"Pass ./{path} or {stored}.",
         )
 
@@ -236,7 +236,8 @@ def _generated_objects(path: pathlib.Path) -> list[ObjectAt]:
     last = int(match[3] or match[2])
     if last < first:
         raise CongraspError(
-            f"'{path}' ends before it begins.", f"Write {family_or_group}:{last}-{first}."
+            f"The last seed of '{path}' is below the first.",
+            f"Write {family_or_group}:{last}-{first}.",
         )
     seeds = range(first, last + 1)
     families = family_turns(len(seeds), first, (family_or_group,))

@@ -30,21 +30,22 @@ class ImportOptions:
     """
 
     unit: Unit = "auto"
-    """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks
-    otherwise; guess then takes the unit that fits, if only one does."""
+    """Unit of the files' coordinates. auto: metres if the object is then 1 to 60 cm long, else an
+    error that proposes a unit. guess: as auto, but if exactly one unit gives a likely size, that
+    unit."""
     scale: float = 1.0
-    """Factor on the size, after the unit."""
+    """Factor on the size, in addition to the unit."""
     material: str = ""
     """Material for the mass: aluminium, cardboard, ceramic, cork, glass, paper, plastic, rubber,
-    steel or wood; or PART=NAME for parts, such as head=steel,handle=wood. Objects too thick for
-    their material are hollow."""
+    steel or wood; or PART=NAME for parts, such as head=steel,handle=wood. A body thicker than is
+    usual for its material is taken as hollow."""
     density: float | None = None
-    """Density in kg/m^3, instead of a material. Without both, the mass is 4 kg per m^2 of surface,
-    within 500 to 2500 kg/m^3, and at most 0.5 kg."""
+    """Density in kg/m^3, instead of a material. Without density and material, the mass is 4 kg per
+    m^2 of surface, limited to 500 to 2500 kg/m^3 and to 0.5 kg."""
     mass: float | None = None
-    """Mass in kg; a material or a density then only distributes it."""
+    """Mass in kg. A material or a density then only determines its distribution."""
     max_pieces: int = MAX_MESH_PIECES
-    """Largest number of convex pieces of an object; more are merged."""
+    """Maximum number of convex pieces of an object; further pieces are merged."""
     # And so not in the seed of surface points
     up: Up = dataclasses.field(default="auto", repr=False)
     """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes,

@@ -102,9 +102,9 @@ def _nothing_found(folder: pathlib.Path) -> CongraspError:
     for depth in ("*/*/*", "*/*/*/*"):
         for file in sorted(folder.glob(depth)):
             if _is_visible_mesh(file.relative_to(folder)) and file.is_file():
-                fault = f"The folder {folder} holds meshes deeper inside alone, such as {file}."
-                return CongraspError(fault, "Name the folders in which they are.")
-    return CongraspError(f"The folder {folder} holds no STL, OBJ, PLY or GLB file.", CONVERT)
+                fault = f"The folder {folder} has meshes only in deeper subfolders, such as {file}."
+                return CongraspError(fault, "Pass the folders that contain the meshes.")
+    return CongraspError(f"The folder {folder} contains no STL, OBJ, PLY or GLB file.", CONVERT)
 
 
 def _meshes_in(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -168,9 +168,10 @@ def _is_named_part(main: pathlib.Path, file: pathlib.Path) -> bool:
 def _no_main_mesh(folder: pathlib.Path, name: str, suffix: str) -> CongraspError:
     """The error of a folder of convex pieces and of several other meshes."""
     return CongraspError(
-        f"The folder {folder} has contact pieces, but it is not clear which mesh shows the "
+        f"The folder {folder} has contact pieces, but it is not clear which mesh is the "
         f"whole object.",
-        f"Name it {name}{suffix} and its parts {name}_<part>{suffix}.",
+        f"Name the file of the whole object {name}{suffix}, and those of its parts "
+        f"{name}_<part>{suffix}.",
     )
 
 

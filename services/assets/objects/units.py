@@ -54,7 +54,7 @@ def metres_per_unit(
     longest = max(sides) * scale
     if not longest:
         raise CongraspError(
-            f"{path} is a point: all of its corners coincide.", "Check the scales of its nodes."
+            f"{path} is a point: all of its vertices coincide.", "Check the scales of its nodes."
         )
     is_open = unit in ("auto", "guess")
     assumed: str = "m" if is_open else unit
@@ -99,8 +99,8 @@ def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
     is_possible = any(_POSSIBLE.contains(longest * metres) for metres in METRES.values())
     if not fitting and not is_possible:
         raise CongraspError(
-            f"{path} is {longest:.4g} units long: in none of {', '.join(METRES)} is that an object "
-            f"for a hand.",
+            f"{path} is {longest:.4g} units long, which is not a size for a hand in any of the "
+            f"units {', '.join(METRES)}.",
             "Scale it in a modelling program.",
         )
     return ""
@@ -148,7 +148,7 @@ def _wrong_size(
         where = "options of 'objects import' and 'grasp'"
         remedy = f"If they are {'; if '.join(proposals)}; or set --scale ({where})."
     elif too_large:
-        remedy = f"If the file also shows a table or other things, delete them there. {remedy}"
+        remedy = f"If the file also contains a table or other things, delete these. {remedy}"
     fault = "large" if too_large else "small"
     size = length(longest * METRES[unit])
     return CongraspError(

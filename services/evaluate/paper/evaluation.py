@@ -189,7 +189,8 @@ def _experiment(
     if data.hand != entrant.hand:
         raise CongraspError(
             f"The constraint sets in {part.data} are for the hand '{data.hand}', not "
-            f"'{entrant.hand}'."
+            f"'{entrant.hand}'.",
+            f"Import sets with 'congrasp constraints import … --hand {entrant.hand}'.",
         )
     experiment = dataclasses.replace(
         experiment, objects=data.objects, constraints=data.bank, paper=data.paper

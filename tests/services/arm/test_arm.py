@@ -206,7 +206,7 @@ def test_unnamed_sites_are_not_the_flange(tmp_path):
     (tmp_path / "marked.xml").write_text(marked)
     arm = load_arm(tmp_path / "marked.xml")
     assert arm.flange == "tool" and arm.joints == tuple(f"j{i}" for i in range(1, 8))
-    with pytest.raises(CongraspError, match=r"no chain of hinges and slides .* --flange"):
+    with pytest.raises(CongraspError, match=r"no chain of hinge and slide joints .* --flange"):
         load_arm(tmp_path / "marked.xml", flange="world")
 
 

@@ -95,7 +95,7 @@ def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
         (["graspxl={ours}"], "has the method 'ours', not 'graspxl'"),
         (["levitate={ours}"], "no method 'levitate'"),
         (["{ours}", "{other}"], "Two policies have the hand 'human' and the method 'ours'"),
-        (["{empty}"], "holds no policy.safetensors"),
+        (["{empty}"], "contains no policy.safetensors"),
         (["/nonexistent/policy.safetensors"], "cannot be read"),
     ],
 )
@@ -156,6 +156,6 @@ def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, t
     command = ["--hand", "allegro", "--objects", str(tmp_path), "--constraints", str(tmp_path)]
     with pytest.raises(
         CongraspError,
-        match=r"sets are for the hand 'human', the policy for 'allegro'.*--hand allegro",
+        match=r"sets are for the hand 'human', but the policy is for 'allegro'.*--hand allegro",
     ):
         load("evaluate")(command)()

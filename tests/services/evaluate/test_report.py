@@ -132,7 +132,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         "episodes"
     ] == 8
     (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
-    with pytest.raises(CongraspError, match=r"check\.json holds no self-check"):
+    with pytest.raises(CongraspError, match=r"check\.json is not a self-check"):
         main.run([*command, "--check", str(tmp_path / "check.json")])
 
 

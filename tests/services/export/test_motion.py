@@ -538,7 +538,7 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
     np.testing.assert_allclose(
         [changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5
     )
-    with pytest.raises(CongraspError, match="A glb file holds no video"):
+    with pytest.raises(CongraspError, match="A glb file cannot contain a video"):
         formats.export_motions([near], "glb", tmp_path / "motion.glb", camera=True)
 
 
@@ -596,7 +596,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
     capsys.readouterr()
     for arguments, words in (
-        (["mug.npz", "logs", "--to", "glb"], "one motion, but 2 were given"),
+        (["mug.npz", "logs", "--to", "glb"], "contains a single motion, but there are 2"),
         (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
         (["mug.npz", "--to", "usd", "--out", "x.usd"], "does not. Use --out x.usda"),
@@ -615,6 +615,6 @@ def test_a_motions_file_has_no_other_number(human: Episode, tmp_path: pathlib.Pa
     save_motion(path, human)
     assert pick_motion(path, 0).object == pick_motion(path).object == human.object
     with pytest.raises(
-        CongraspError, match=r"grasp\.npz is one motion and has no number 99. Remove --index"
+        CongraspError, match=r"grasp\.npz holds a single motion, .* 99. Remove --index"
     ):
         pick_motion(path, 99)

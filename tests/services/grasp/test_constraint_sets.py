@@ -105,7 +105,7 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
     assert load("constraints")(["generate", *arguments, *folder])() == 0
     assert made == ["box_0", "mug_7", "crate", "ball_0"]
-    with pytest.raises(CongraspError, match="no object for which to generate constraints"):
+    with pytest.raises(CongraspError, match="no objects for which to generate constraints"):
         load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):
         load("constraints")(["generate", "nothing", *folder])()
@@ -117,7 +117,7 @@ def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file
         request.given("pose", "q"), constraint_sets[2].arrays["pose/q"][0, 3]
     )
     with pytest.raises(
-        CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"
+        CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*set of this"
     ):
         read_request(BOX, HAND, 15, trajectory=str(file))
     larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})

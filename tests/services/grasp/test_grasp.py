@@ -221,7 +221,7 @@ def test_impossible_requests(block, grasper):
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
     with pytest.raises(
-        CongraspError, match=f'come through the table.* straight down is --heading "{words}"'
+        CongraspError, match=f'approach through the table.* straight down is --heading "{words}"'
     ):
         grasper.grasp(lying, GraspRequest({"heading": {"direction": -down}}))
     below = {"q": grasper.hand.q_open, "position": down, "quaternion": np.array([1.0, 0, 0, 0])}
@@ -295,7 +295,7 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
     size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
     assert (
-        f"{size}; held, also against pushes of 1 N; best of 4 attempts, 3 of which hold it" in line
+        f"{size}; held, also against pushes of 1 N; best of 4 attempts (3 hold the object)" in line
     )
     assert f"b: {size}; held; best of" in captured.out
     assert "2 of 3 objects are held; 1 could not be used" in captured.out

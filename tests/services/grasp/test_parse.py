@@ -55,7 +55,7 @@ def test_headings_are_numbers_or_a_word(block):
         assert given.above is False and given.given("force", "limit") == 2
     above = asked(block, heading="above")
     assert above.above and above.given("heading", "direction") is None
-    with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
+    with pytest.raises(CongraspError, match=r"--at is 39.* m away from 'block'"):
         asked(block, at="0 0 40")
     uneven = [np.zeros((2, 3)), np.zeros((2, 2))]
     bad = (
@@ -94,7 +94,7 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
         asked(block, affordance="near half", avoid="near half")
     with pytest.raises(
         CongraspError,
-        match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid",
+        match=r"no constraint option 'colour'\. Choose from: heading, at, affordance, avoid",
     ):
         asked(block, colour="red")
     with pytest.raises(
@@ -104,9 +104,7 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     with pytest.raises(CongraspError, match=r"there is no file .*none\.ply"):
         asked(block, affordance=str(tmp_path / "none.ply"))
     trimesh.creation.box(SIDES).export(tmp_path / "metres.ply")
-    with pytest.raises(
-        CongraspError, match=r"Nothing of .*metres\.ply' lies on the surface of 'block'"
-    ):
+    with pytest.raises(CongraspError, match=r"metres\.ply' does not touch the surface of 'block'"):
         asked(block, affordance=str(tmp_path / "metres.ply"))
 
 
@@ -193,11 +191,11 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
         ),
         (
             '{"joints": {}, "position": [0,0,500], "quaternion": [1,0,0,0]}',
-            "the wrist of .* lies 5.* m from 'block'",
+            "the wrist of .* is 5.* m away from 'block'",
         ),
         (
             '{"joints": {"index_pip": 45}, "position": [0,0,0], "quaternion": [1,0,0,0]}',
-            "is at 45. Angles are in rad",
+            "is 45. Write joint angles in rad",
         ),
         (
             '{"joints": {}, "position": [0,0,0], "quaternion": [0,0,0,0]}',
@@ -226,7 +224,9 @@ def test_errors_name_the_fault_of_a_trajectory(block, tmp_path):
     with pytest.raises(CongraspError, match="wrist does not move"):
         asked(block, trajectory=str(path))
     path.write_text("0,0,300,1,0,0,0\n0,0,200,1,0,0,0\n")
-    with pytest.raises(CongraspError, match=r"the end of .* lies 2.* m from 'block'. Give metres"):
+    with pytest.raises(
+        CongraspError, match=r"the end of .* is 2.* m away from 'block'. Pass metres"
+    ):
         asked(block, trajectory=str(path))
     for text, line in (
         ("0,0,0\n0,0,1\n", 1),
@@ -260,7 +260,7 @@ def test_errors_name_the_fault_of_a_trajectory(block, tmp_path):
 def test_huge_numbers_are_valid_directions_but_not_places(block):
     direction = asked(block, heading="1e308 -1e308 0").given("heading", "direction")
     np.testing.assert_allclose(direction, np.array([1, -1, 0]) / np.sqrt(2))
-    with pytest.raises(CongraspError, match="--at lies inf m from 'block'"):
+    with pytest.raises(CongraspError, match="--at is inf m away from 'block'"):
         asked(block, at="1e300 0 0")
 
 
@@ -268,7 +268,7 @@ def test_a_motion_takes_no_number(block):
     for name in ("pose", "trajectory"):
         with pytest.raises(
             CongraspError,
-            match=r"grasp\.npz is one motion and has no number 3. Leave the number out",
+            match=r"grasp\.npz holds a single motion, without the number 3. Remove ':3'",
         ):
             asked(block, **{name: "grasp.npz:3"})
 

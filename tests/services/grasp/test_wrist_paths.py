@@ -176,7 +176,7 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
         ";",
     )
     save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
-    with pytest.raises(CongraspError, match="quaternions that are not of length one"):
+    with pytest.raises(CongraspError, match="quaternions whose length is not one"):
         save("turned.csv", "X,Y,Z,W,X,Y,Z", [row[3:] + row[:3] for row in rows])
 
 
@@ -316,7 +316,7 @@ def test_a_clock_that_runs_back_is_refused_however_long_the_file_is(tmp_path, cl
     (tmp_path / "a.csv").write_text(
         "\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)])
     )
-    with pytest.raises(CongraspError, match="is earlier than one before"):
+    with pytest.raises(CongraspError, match="is earlier than a line above"):
         read_wrist_path(tmp_path / "a.csv")
 
 
@@ -363,14 +363,14 @@ def test_unreadable_files_are_errors(tmp_path):
     with pytest.raises(CongraspError, match="There is no file"):
         read_wrist_path(tmp_path / "absent.bvh")
     (tmp_path / "a.fbx").write_text("")
-    with pytest.raises(CongraspError, match="neither CSV, NPZ nor BVH"):
+    with pytest.raises(CongraspError, match="not a CSV, NPZ or BVH file"):
         read_wrist_path(tmp_path / "a.fbx")
     np.savez(tmp_path / "a.npz", position=POSITION, quaternion=2 * ROTATION.as_quat())
-    with pytest.raises(CongraspError, match="length one"):
+    with pytest.raises(CongraspError, match="length is not one"):
         read_wrist_path(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", position=POSITION)
     with pytest.raises(CongraspError, match="needs 'position' and 'quaternion'"):
         read_wrist_path(tmp_path / "b.npz")
-    with pytest.raises(CongraspError, match="do not fit"):
+    with pytest.raises(CongraspError, match="not perpendicular"):
         np.savez(tmp_path / "c.npz", position=POSITION, quaternion=ROTATION.as_quat())
         read_wrist_path(tmp_path / "c.npz", fingers="+x", back="-x")

@@ -85,7 +85,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
     for key in (folder / "ca.key", made / "tls.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(CongraspError, match=r"already holds an authority.*--force"):
+    with pytest.raises(CongraspError, match=r"already contains a certificate authority.*--force"):
         create_authority(folder)
     with pytest.raises(CongraspError, match=r"exists already.*--force"):
         issue(folder, "actor", number=0)

@@ -84,7 +84,7 @@ def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
     ):
         with pytest.raises(
             CongraspError,
-            match=r"run is in place of --connect.*\. Give either the folder or these\.",
+            match=r"run cannot be combined with --connect",
         ):
             command(folder, **named)()
 

@@ -248,5 +248,5 @@ def test_limits_that_are_none_are_refused(wrong):
         LIMITS.upper[0] = np.nan
     with pytest.raises(CongraspError, match="finite"):
         Limiter(LIMITS, np.full(9, math.inf))
-    with pytest.raises(CongraspError, match="six joints of the wrist"):
+    with pytest.raises(CongraspError, match="six wrist joints"):
         JointLimits(**{name: np.array(value) for name, value in fields.items()})

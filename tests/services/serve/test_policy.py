@@ -148,7 +148,7 @@ BAD_STATES = [
     ({"u": np.zeros(5)}, r"shape \(5,\)"),
     ({"weight": np.zeros(1)}, "unknown field 'weight'"),
     ({"u": np.full(6, np.inf)}, "'u' is not finite"),
-    ({"u": "still"}, "no array of numbers"),
+    ({"u": "still"}, "not a numeric array"),
     ({"q": None}, "lacks the field 'q'"),
 ]
 

@@ -176,7 +176,7 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(
     # Where there is none, the nearest are found.
     reach, rows = recordings.around(when - 90, 3.0)
     assert reach == 15.0 and [row["actor"] for row in rows] == ["a001"]
-    with pytest.raises(CongraspError, match="not among those"):
+    with pytest.raises(CongraspError, match="not in the current list"):
         recordings.episode("nothing")
 
 

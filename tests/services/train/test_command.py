@@ -257,9 +257,9 @@ def test_a_training_that_others_may_join_has_all_certificates_before_it_starts(t
         issue(tmp_path, role)
     Launch(listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
     Launch(listen="tcp/0.0.0.0:7447", learner=LearnerOptions(insecure=True)).planned(CONFIG)
-    with pytest.raises(CongraspError, match="belongs to one role"):
+    with pytest.raises(CongraspError, match="the certificate of a single role"):
         Launch(listen="tls/0.0.0.0:7447", certs=tmp_path / "learner.0").planned(CONFIG)
-    with pytest.raises(CongraspError, match="With --actors 0 nothing listens"):
+    with pytest.raises(CongraspError, match="With --actors 0 the learner opens no endpoint"):
         Launch(actors=0, listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
     (tmp_path / "observer.0" / "tls.key").unlink()
     with pytest.raises(CongraspError, match=r"observer.0/tls.key is missing.*--role observer"):

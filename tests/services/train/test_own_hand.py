@@ -135,7 +135,7 @@ def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, claw,
     mended = dataclasses.replace(claw, object_scale=0.8)
     train_hand(request(mended, tmp_path / "out"), lambda text: None)
     assert ran[1] == "check" and len(ran) == 4
-    with pytest.raises(CongraspError, match="another hand, or of an earlier version of this one"):
+    with pytest.raises(CongraspError, match="another hand, or of an earlier version of this hand"):
         train_hand(request(claw, tmp_path / "out"), lambda text: None)
     does["findings"] = BAD
     train_hand(request(claw, tmp_path / "other", anyway=True), lambda text: None)
@@ -180,7 +180,7 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     file = tmp_path / "hands" / "claw.json"
     made = file.read_text()
     assert main.run(command) == 0 and len(ran) == 3 and file.read_text() == made
-    assert f"The hand 'claw' is {file}" in capsys.readouterr().out
+    assert f"Using the existing hand 'claw' ({file})" in capsys.readouterr().out
     assert main.run(["hands", "list"]) == 0
     (row,) = [
         line for line in capsys.readouterr().out.splitlines() if "claw" in line and "own" in line

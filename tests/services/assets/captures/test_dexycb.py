@@ -104,5 +104,5 @@ def test_what_is_wrong_with_a_session_is_said(run_import, tmp_path, mano):
 
 
 def test_the_mano_file_is_asked_for(run_import, tmp_path):
-    with pytest.raises(CongraspError, match="need your copy of MANO_RIGHT"):
+    with pytest.raises(CongraspError, match="require the file MANO_RIGHT"):
         run_import("dexycb", tmp_path)

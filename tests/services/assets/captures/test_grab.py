@@ -130,6 +130,6 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
 
 def test_a_folder_of_another_kind_is_refused(run_import, tmp_path):
     with pytest.raises(
-        CongraspError, match=r"holds no sequence of grab\. Pass the folder with s1/"
+        CongraspError, match=r"contains no sequence of grab\. Pass the folder with s1/"
     ):
         run_import("grab", tmp_path)

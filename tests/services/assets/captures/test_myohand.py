@@ -137,9 +137,9 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     }
     for name, rule, words in (
         ("nokey", "wrong layout", "no 'object'"),
-        ("back", "wrong layout", "time runs back"),
+        ("back", "wrong layout", "time decreases"),
         ("shape", "wrong layout", "(90, 28)"),
-        ("words", "wrong layout", "'object' of the file holds no numbers"),
+        ("words", "wrong layout", "'object' of the file is not a numeric array"),
         ("degrees", "wrong units", "radians"),
         ("millimetres", "wrong units", "in metres"),
         ("gone", "frames missing", "no frame"),

@@ -54,11 +54,11 @@ def test_settings_that_are_none_are_dropped(tmp_path, text):
 
 
 def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
-    with pytest.raises(CongraspError, match="holds no STL"):
+    with pytest.raises(CongraspError, match="contains no STL"):
         build.source_of(tmp_path)
     for name in "ab":
         (tmp_path / f"{name}.stl").write_bytes(b"")
-    with pytest.raises(CongraspError, match="holds 2 objects"):
+    with pytest.raises(CongraspError, match="contains 2 objects"):
         build.source_of(tmp_path)
 
 

@@ -199,6 +199,6 @@ def test_a_list_of_other_rows_is_refused(tmp_path, text):
     (tmp_path / "anno").mkdir()
     (tmp_path / "anno" / "seq_all.json").write_text(text)
     with pytest.raises(
-        CongraspError, match=r"holds other rows than \[sequence, subject, frame, camera\]"
+        CongraspError, match=r"rows that are not \[sequence, subject, frame, camera\]"
     ):
         list(read(tmp_path, Meshes(()), None))

@@ -33,7 +33,7 @@ def test_an_importer_from_outside_needs_a_file_and_a_row(run_import, tmp_path, m
     assert [(row["sequence"], row["rule"]) for row in report.dropped] == [("cup_lift", "no mesh")]
     (tmp_path / "empty").mkdir()
     with pytest.raises(
-        CongraspError, match=r"holds no sequence of own.*folder with \*\.capture\.npz"
+        CongraspError, match=r"contains no sequence of own.*folder with \*\.capture\.npz"
     ):
         load("constraints")(["import", "own", str(tmp_path / "empty")])()
 

@@ -152,7 +152,7 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
             load_meshes(path, driven.hand)
         assert "\n" not in str(raised.value)
 
-    refused("holds no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
+    refused("contains no mesh of 'palm'", {"palm": (vertices, faces + len(vertices))})
     # A point of no face has no normal of its own: any will do, but none of no length.
     loose = skin_of_meshes(driven.hand, {"palm": (np.vstack([vertices, [[1.0, 0.0, 0.0]]]), faces)})
     still = loose.posed(loose.origins, np.broadcast_to(np.eye(3), (len(loose.origins), 3, 3)))

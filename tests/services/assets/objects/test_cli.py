@@ -145,10 +145,10 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(
 @pytest.mark.parametrize(
     ("material", "fault"),
     [
-        ("adamantium", r"--material is 'adamantium'\. Materials: aluminium,"),
-        ("handle=wood", r"--material names the part 'handle'\. Name the material alone"),
+        ("adamantium", r"--material is 'adamantium'\. Choose from the materials aluminium,"),
+        ("handle=wood", r"--material names the part 'handle', which the object does not have"),
         ("wood,steel", "'wood,steel'"),
-        ("=wood", r"--material is '=wood'\. Materials: aluminium,"),
+        ("=wood", r"--material is '=wood'\. Choose from the materials aluminium,"),
     ],
 )
 def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsys, material, fault):

@@ -428,7 +428,7 @@ def _fallback(tree):
         ),
         pytest.param("a.ply", _POINTS, "only 4 points. Make a surface", id="PLY without faces"),
         pytest.param(
-            "a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "only 0 proper triangles", id="STL"
+            "a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "has 0 triangles with an area", id="STL"
         ),
         pytest.param(
             "a.glb",

@@ -40,7 +40,7 @@ def test_meshes_deeper_inside_are_named_without_hidden_ones(tmp_path):
     (folder / "syn" / "a" / "folder.obj").mkdir()
     with pytest.raises(
         CongraspError,
-        match=r"deeper inside alone, such as \S+/syn/id/models/model_normalized\.obj\. ",
+        match=r"deeper subfolders, such as \S+/syn/id/models/model_normalized\.obj\. ",
     ):
         objects_at(folder)
 
@@ -90,7 +90,7 @@ def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_im
     (tmp_path / "mug_7" / "grasp.npz").touch()
     assert find_object("mug_7").name == "mug_7"  # which a folder of grasps leaves alone
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
-    said = r"'mug_7' is a folder here, and an object in objects\. Pass \./mug_7 or objects/mug_7\.safetensors"
+    said = r"'mug_7' is ambiguous: .* Pass \./mug_7 or objects/mug_7\.safetensors"
     for find in (find_object, lambda name: constraints.Generate((name,))()):
         with pytest.raises(CongraspError, match=said):
             find("mug_7")
