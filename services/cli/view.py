@@ -51,8 +51,8 @@ class View:
     recordings: pathlib.Path | None = None
     """Folder with recordings (*.mcap) of a live or finished run."""
     host: str = "127.0.0.1"
-    """Interface at which the page is offered. There is no password: whoever reaches this interface
-    can use the page."""
+    """Interface at which the page is offered. There is no password: everyone with access to this
+    interface can use the page."""
     port: int = 7480
     """Port of the page; 0 takes a free port."""
     allow_host: tuple[str, ...] = ()

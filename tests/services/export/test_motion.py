@@ -602,7 +602,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         (["mug.npz", "--to", "usd", "--out", "x.usd"], "does not. Use --out x.usda"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no file nothing.npz"),
-        (["logs", "--index", "4"], "holds 1 episodes"),
+        (["logs", "--index", "4"], "contains 1 episodes"),
         ([], "No motion was given"),
     ):
         assert run(*arguments) == 2

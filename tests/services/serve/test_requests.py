@@ -134,7 +134,11 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
             {},
             "no constraint that guides the wrist. Add one of: heading, pose, trajectory",
         ),
-        (["heading", "affordance"], {"surface_avoid": np.zeros(8, bool)}, "both sides"),
+        (
+            ["heading", "affordance"],
+            {"surface_avoid": np.zeros(8, bool)},
+            "some points, and to False for others",
+        ),
         (["heading", "affordance"], {"surface_avoid": None}, "lacks the field 'surface_avoid'"),
         (["heading"], {"q": None}, "lacks the field 'q'"),
         (["heading"], {"q": np.zeros(22)}, r"'q' has shape \(22,\); it must be \(20,\)"),

@@ -197,7 +197,7 @@ def test_bad_lists_of_states_are_refused(served):
         episode.state,
         {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])},
     )
-    with PolicyClient(endpoint) as client:
+    with PolicyClient(endpoint, timeout=60.0) as client:
         client.reset(episode.request)
         with pytest.raises(
             RefusedError, match=r"'object_quaternion' of state 2 has length 2\.000, not 1"

@@ -412,7 +412,7 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
     assert pick_episode(tmp_path / "run", -1, success=True).steps == 4
     for index, success in ((3, False), (-4, False), (1, True)):
         with pytest.raises(
-            CongraspError, match=r"holds \d .*none with index .*Choose from -\d to "
+            CongraspError, match=r"contains \d .*none with index .*Choose from -\d to "
         ):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
