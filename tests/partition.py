@@ -18,6 +18,8 @@ _CONNECT_SECONDS = 5.0
 _SEGMENT = 1448
 """Bytes of a TCP segment."""
 _MAX_CHUNKS_IN_TRANSIT = 4096
+_LATE_S = 0.05
+"""Time that is made up for if a thread of the link wakes up late."""
 _PERIODIC_LOSS = math.sqrt(1.5)
 """Factor of the throughput of a TCP connection that loses segments (Mathis et al., 1997)."""
 
@@ -54,7 +56,7 @@ class _Rate:
 
     def sent_at(self, count: int, earliest: float) -> float:
         with self._lock:
-            self._free_at = max(self._free_at, earliest) + count / self._bytes_per_s
+            self._free_at = max(self._free_at, earliest - _LATE_S) + count / self._bytes_per_s
             return self._free_at
 
 

@@ -71,6 +71,9 @@ def wide_area(
         Case("200 ms, 1 % loss", Medium(delay_s=0.1, loss=0.01), 0.5, 1, 25_000),
         Case("direct, 1.5 s a rollout", Medium(), 1.5, 64),
         Case("10 Mbit/s, 20 ms", Medium(delay_s=0.01, bytes_per_s=1.25e6), 1.5, 64),
+        Case(
+            "10 Mbit/s, 20 ms, 0.2 s a rollout", Medium(delay_s=0.01, bytes_per_s=1.25e6), 0.2, 64
+        ),
         Case("10 Mbit/s, 200 ms", Medium(delay_s=0.1, bytes_per_s=1.25e6), 1.5, 64),
     ]
     rows = []
