@@ -19,7 +19,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any, NamedTuple, TypeVar
 
 from congrasp.actors.pace import Pace, UploadWindow
@@ -130,7 +130,7 @@ class ActorLink(Closing):
         self._pace = Pace()
         self._rollout_began = time.monotonic()
         self._passed_updates = collections.deque[int](maxlen=_MEASURED_ROLLOUTS)
-        self._tickets_ahead: collections.deque[Future[Ticket | None]] = collections.deque()
+        self._tickets_ahead: list[Future[Ticket | None]] = []
         self._held_version = -1
         self._weights_lock = threading.Lock()
         self._weights_ahead: Future[_Weights | None] | None = None
@@ -222,16 +222,18 @@ class ActorLink(Closing):
             self._tickets_ahead.append(_in_background(request))
 
     def _ticket_ahead(self, timeout: float) -> Ticket | None:
-        """Returns the ticket that was requested first; None if it is not granted within `timeout`
+        """Returns a ticket that was requested ahead; None if none is granted within `timeout`
         seconds.
+
+        It need not be the one that was requested first: the learner may grant them in any order.
         """
-        first = self._tickets_ahead[0]
-        wait([first], timeout)
+        done, _ = wait(self._tickets_ahead, timeout, return_when=FIRST_COMPLETED)
         self._check()
-        if not first.done():
+        if not done:
             return None
-        self._tickets_ahead.popleft()
-        return first.result()
+        granted = done.pop()
+        self._tickets_ahead.remove(granted)
+        return granted.result()
 
     def _request_ticket(self, ticket_id: str, timeout: float) -> Ticket | None:
         """Requests a ticket until it is granted; None if that takes longer than `timeout` seconds,
@@ -376,9 +378,9 @@ class ActorLink(Closing):
         self._check()
         if self._info is None:
             raise CongraspError("The link has no configuration yet.", "Call 'config' first.")
-        self._pace.record("rollout", time.monotonic() - self._rollout_began)
         while not self._uploads.window.enter(_POLL_S):
             self._check()
+        self._pace.record("rollout", time.monotonic() - self._rollout_began)
         self._check()
         meta = {
             **rollout.meta,

@@ -32,7 +32,7 @@ class Learner:
         self.transport.serve(
             KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"])
         )
-        self.transport.serve(KEYS.tickets, self.on_ticket)
+        self.transport.serve(KEYS.tickets, lambda key, message: self.on_ticket(key, message))
         self.transport.serve(below(KEYS.weights), self.on_weights)
         self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
 
@@ -375,6 +375,21 @@ def test_a_ticket_ahead_that_is_not_granted_is_waited_for_as_long_as_asked(far):
         pass
     learner.granted = True
     assert link.acquire_ticket(60) is not None
+
+
+def test_a_ticket_that_is_granted_before_an_earlier_one_is_used_first(far):
+    learner, link, _ = far
+    refused = []
+
+    def grant_all_but_the_first(key, message):
+        refused.append(message.meta["ticket"])
+        return learner.reply(granted=message.meta["ticket"] != refused[0])
+
+    assert link.acquire_ticket(60) is not None
+    eventually(lambda: len(learner.tickets) >= 6)
+    learner.on_ticket = grant_all_but_the_first
+    for _ in range(8):
+        assert link.acquire_ticket(20) is not None
 
 
 def test_a_policy_on_its_way_is_waited_for_only_if_the_ticket_requires_it(far):
