@@ -1,11 +1,31 @@
 """Fixtures of the services' tests."""
 
 import contextlib
-from collections.abc import Iterator
+import logging
+import os
+from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+
+
+@pytest.fixture
+def exit_code_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], Any]:
+    """Runs the command line in this process, and returns the code with which it would end: starting
+    a process and importing JAX takes seconds.
+    """
+    from congrasp.services.cli import main as cli
+
+    def run(arguments: list[str]) -> Any:
+        # Roles add a handler that stays
+        monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
+        with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
+            cli.main(arguments)
+        return end.value.code
+
+    return run
 
 
 @pytest.fixture(scope="session")
