@@ -4,6 +4,7 @@ goes on.
 
 import contextlib
 import dataclasses
+import functools
 import types
 
 import numpy as np
@@ -23,7 +24,11 @@ from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, proced
 from tests.task import TASK, policy
 
 OBJECTS = procedural.generate_many(5, 1_000_000)
-EXPERIMENT = Experiment(policy(), [])
+
+
+@functools.cache
+def experiment_without_objects():
+    return Experiment(policy(), [])
 
 
 @pytest.fixture
@@ -65,7 +70,11 @@ def simulated(monkeypatch):
 def evaluated(pools, episodes, kept=None, *, seed=0, track=lambda label, total: lambda done: None):
     """Rows of the test's policy."""
     return evaluate_pools(
-        dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, kept
+        dataclasses.replace(
+            experiment_without_objects(), episodes=episodes, seed=seed, track=track
+        ),
+        pools,
+        kept,
     )
 
 
