@@ -47,10 +47,12 @@ def constraint_sets() -> Any:
 
 @contextlib.contextmanager
 def quick_imports() -> Iterator[None]:
-    """Imports a mesh as its hull and two plain halves; the pieces' errors count as zero.
+    """Imports a mesh as its hull and two plain halves, whose errors count as zero, and a hand after
+    a shorter search for its poses.
 
-    Decomposition, errors and halves that a hand can hold take most of an import's time.
+    Decomposition, errors, halves that a hand can hold and poses take most of an import's time.
     """
+    from congrasp.services.assets.hands import poses
     from congrasp.services.assets.objects import assembly, collision
     from congrasp.services.assets.objects.decompose import Decomposition
     from congrasp.services.assets.objects.fidelity import Fidelity
@@ -62,6 +64,7 @@ def quick_imports() -> Iterator[None]:
         patch.setattr(collision, "decompose", hull)
         patch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
         patch.setattr(assembly, "cut_to_hold", lambda obj: obj)
+        patch.setattr(poses, "RANDOM_STARTS", 0)
         yield
 
 
