@@ -40,9 +40,10 @@ def example() -> Any:
 def constraint_sets() -> Any:
     """Constraint sets of the suite's objects."""
     from congrasp.common.task.sampling.sets import make_sets
-    from tests.task import HAND, OBJECTS, TASK
+    from tests.task import HAND, OBJECTS, TASK, kept_banks
 
-    return make_sets(HAND, TASK, OBJECTS, 0)
+    with kept_banks():
+        return make_sets(HAND, TASK, OBJECTS, 0)
 
 
 @contextlib.contextmanager
