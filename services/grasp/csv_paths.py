@@ -1,4 +1,4 @@
-"""Wrist paths in CSV files, with or without a header that names the columns."""
+"""Wrist paths in CSV files, with the header of a known recorder or without one."""
 
 import csv
 import pathlib
@@ -9,29 +9,20 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.arrays import runs_back
 from congrasp.common.io.inputs import read_file
-from congrasp.services.grasp.csv_header import (
-    Columns,
-    clock_columns,
-    header_names,
-    number_in,
-    pose_columns,
-)
+from congrasp.services.grasp.csv_recorders import HEADER, PLAIN, Columns, columns_of
 
 UNIT_LENGTH = 0.01
 """Tolerance of a quaternion's length: positions in its place differ more."""
 HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
-_NANOSECONDS_PER_SECOND = 1e9
 _WRITE_ROWS = "Write x, y, z, qw, qx, qy, qz in every line."
-_NAME_COLUMNS = "Name them x, y, z, qw, qx, qy, qz."
-_PLAIN = Columns(pose=list(range(7)), width=7, metres=1.0)
-"""Columns of a file without a header."""
+_NAME_COLUMNS = f"Name the columns {HEADER} (positions in m), or as a recorder in docs/grasp.md."
 
 
 class _Refusal(Exception):
     """Fault of a line as text, and its remedy."""
 
-    def __init__(self, fault: str, remedy: str):
+    def __init__(self, fault: str, remedy: str = _WRITE_ROWS):
         super().__init__(fault)
         self.remedy = remedy
 
@@ -42,24 +33,22 @@ class _Line(NamedTuple):
     number: int
     """In the file, from 1 on."""
     pose: list[float]
-    """Position in the file's unit, and quaternion w, x, y, z."""
-    stamp: list[float | None]
-    """Time, in the columns of the clock."""
+    """Position in m, and quaternion w, x, y, z."""
+    time: float | None
+    """In the unit of the file; None without a number."""
 
 
 class _Reader:
     """Reads lines from first to last; a header determines the meaning of the lines after it."""
 
     def __init__(self) -> None:
-        """Expects the columns of a file without a header."""
-        self.columns = _PLAIN
+        """Expects a header, or the columns of a file without one."""
         self.lines: list[_Line] = []
-        self._clock: list[int] = []
-        self._is_named = False
-        """A header names the columns."""
-        self._has_title = False
-        """A line of words precedes."""
+        self._columns: Columns | None = None
         self._separator = ""
+        """That of the header, then that of the numbers."""
+        self._comment_cells: list[str] = []
+        """Cells of the comment before the numbers, which may be a header that is not known."""
 
     def read(self, number: int, line: str) -> None:
         """Reads a line.
@@ -69,9 +58,11 @@ class _Reader:
         """
         is_comment = line.lstrip().startswith("#")
         text = self._text_of(line, is_comment)
-        if not self.lines and not self._is_named and self._read_header(text, is_comment):
+        if not text.strip(" ,;\t"):
             return
-        if is_comment or not text.strip(" ,;\t"):
+        if self._columns is None and self._read_header(text, is_comment):
+            return
+        if is_comment:
             return
         self.lines.append(self._numbers(number, text))
 
@@ -79,69 +70,66 @@ class _Reader:
         """A line's text: that of a comment, or what precedes one; under a header all is text."""
         if is_comment:
             return line.strip(" #")
-        if self._is_named:
-            return line
-        return line.partition("#")[0]
+        if self._columns in (None, PLAIN):
+            return line.partition("#")[0]
+        return line
 
     def _read_header(self, text: str, is_comment: bool) -> bool:
         """Reads a line before the first numbers; returns False for numbers."""
         if "length units" in text.lower():
-            fault = (
+            raise _Refusal(
                 "is of Motive, whose y axis may point up: export z up, in m, a header of one line"
             )
-            raise _Refusal(fault, _WRITE_ROWS)
         separator = separator_of(text)
+        names = cells_of(text, separator)
+        while names and not names[-1]:
+            names.pop()
         try:
-            names = cells_of(header_names(text), separator)
-        except csv.Error as error:
-            raise _Refusal(f"cannot be read: {error}", _WRITE_ROWS) from None
-        if not is_comment and any(number_in(name) is not None for name in names):
-            return False
-        try:
-            columns = pose_columns(names, titled=self._has_title)
+            columns = columns_of(names)
         except ValueError as error:
             raise _Refusal(str(error), _NAME_COLUMNS) from None
         if columns is not None:
-            self.columns = columns
-            self._is_named = True
+            self._columns = columns
             self._separator = separator
-            self._clock = clock_columns(names)
-        if any(names) and not is_comment:
-            self._has_title = True
-        return True
+            return True
+        if is_comment:
+            self._comment_cells = names
+            return True
+        if all(_number(name) is None for name in names):
+            raise _Refusal("is a header of no known recorder", _NAME_COLUMNS)
+        if len(names) == len(self._comment_cells):
+            raise _Refusal("follows a header of no known recorder", _NAME_COLUMNS)
+        self._columns = PLAIN
+        return False
 
     def _numbers(self, number: int, text: str) -> _Line:
         """The numbers of a line."""
+        columns = self._columns or PLAIN
         if not self.lines and not (self._separator and self._separator in text):
             self._separator = separator_of(text)
-        try:
-            cells = cells_of(text, self._separator)
-        except csv.Error as error:
-            raise _Refusal(f"cannot be read: {error}", _WRITE_ROWS) from None
+        cells = cells_of(text, self._separator)
         pose = []
-        for column in self.columns.pose:
-            value = number_in(cells[column]) if column < len(cells) else None
+        for column in columns.pose:
+            value = _number(cells[column]) if column < len(cells) else None
             if value is not None and abs(value) < HUGE:
                 pose.append(value)
-        width = self.columns.width
-        if len(cells) < width or any(cells[width:]) or len(pose) < len(self.columns.pose):
-            raise _Refusal(f"is not {width} finite numbers", _WRITE_ROWS)
-        stamp = []
-        for column in self._clock:
-            stamp.append(number_in(cells[column]))
-        return _Line(number, pose, stamp)
+        width = columns.width
+        if len(cells) < width or any(cells[width:]) or len(pose) < len(columns.pose):
+            raise _Refusal(f"is not {width} finite numbers")
+        time = None if columns.time is None else _number(cells[columns.time])
+        return _Line(number, pose, time)
 
 
 def read_csv(path: pathlib.Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) in m and quaternions (T, 4) of a CSV file's lines.
 
-    A header, also in a comment, may name them in any order and among other columns, such as t, qx,
-    qy, qz, qw, vx, vy, vz, px, py, pz, and positions in mm or cm: "x [mm]".
+    A header, also in a comment, names the columns as one of `csv_recorders.RECORDERS` does, in any
+    order and among others. Without one, a line is x, y, z and the quaternion w, x, y, z.
 
     Raises:
       CongraspError: the file has more than `max_bytes` bytes or cannot be read, a line is not seven
-        finite numbers, a header names no position or quaternion, or several, quaternions are not of
-        length one, or its time runs back.
+        finite numbers, the header is unknown or ambiguous, quaternions are not of length one, or
+        its time runs back.
     """
     try:
         text = read_file(path, max_bytes, _WRITE_ROWS).decode("utf-8-sig")
@@ -159,7 +147,7 @@ def read_csv(path: pathlib.Path, max_bytes: int) -> tuple[np.ndarray, np.ndarray
     table = np.array([line.pose for line in reader.lines])
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > UNIT_LENGTH:
         raise CongraspError(f"{path} has quaternions whose length is not one.", _WRITE_ROWS)
-    return reader.columns.metres * table[:, :3], table[:, 3:]
+    return table[:, :3], table[:, 3:]
 
 
 def separator_of(line: str) -> str:
@@ -168,30 +156,37 @@ def separator_of(line: str) -> str:
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """The cells of a line; with semicolons between them, decimal commas become points."""
-    if separator:
+    """The cells of a line; with semicolons between them, decimal commas become points.
+
+    Raises:
+      _Refusal: a cell is too long.
+    """
+    if not separator:
+        return line.split()
+    try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-    else:
-        cells = line.split()
+    except csv.Error as error:
+        raise _Refusal(f"cannot be read: {error}") from None
     decimal_comma = "." if separator == ";" else ","
     return [cell.strip(" '\"").replace(",", decimal_comma) for cell in cells]
+
+
+def _number(word: str) -> float | None:
+    """The number in a word, also one that is not finite; None for other text."""
+    try:
+        return float(word)
+    except ValueError:
+        return None
 
 
 def _check_clock(path: pathlib.Path, lines: list[_Line]) -> None:
     """Raises a `CongraspError` for the first of these lines whose time runs back by more than
     jitter.
     """
-    clock = np.array([line.stamp for line in lines], float)
-    if not clock.size:
-        return
-    finite = np.isfinite(clock).all(-1)
-    numbers = np.array([line.number for line in lines])[finite]
-    clock = clock[finite]
-    seconds = clock[:, 0]
-    # A second column with as many nanoseconds is a whole time, not the rest of a second.
-    if clock.shape[1] == 2 and clock[:, 1].max(initial=0.0) < _NANOSECONDS_PER_SECOND:
-        seconds = seconds + clock[:, 1] / _NANOSECONDS_PER_SECOND
-    late = runs_back(seconds)
+    times = np.array([line.time for line in lines], float)
+    is_finite = np.isfinite(times)
+    numbers = np.array([line.number for line in lines])[is_finite]
+    late = runs_back(times[is_finite])
     if late.any():
         fault = f"line {numbers[late.argmax()]} of {path} is earlier than a line above it."
         raise CongraspError(fault, "Sort the lines by time, and keep only one motion in the file.")

@@ -16,7 +16,7 @@ from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import objects_at, one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.units import UNIT_NAMES, Unit, guessed_unit, sizes_by_unit
-from congrasp.services.studio.server import BadRequest, Picture
+from congrasp.services.studio.routes import BadRequest, Picture
 from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of
 

@@ -34,7 +34,7 @@ from congrasp.services.export.formats import FORMATS, export_motions
 from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.episode_file import save_episode
 from congrasp.services.studio.drawing import vector
-from congrasp.services.studio.server import Download
+from congrasp.services.studio.routes import Download
 from congrasp.services.studio.state import Studio, tool_of
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.film import Film, save_episode_video

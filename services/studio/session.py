@@ -21,6 +21,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.masses import with_mass
 from congrasp.services.assets.objects.materials import MATERIALS
 from congrasp.services.assets.objects.units import METRES
+from congrasp.services.studio.browser_sessions import Sessions
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
 from congrasp.services.studio.grasping import Loaders, PolicyGrasping, Progress
 from congrasp.services.studio.jobs import Jobs
@@ -34,15 +35,8 @@ from congrasp.services.studio.page import (
     for_page,
     hand_message,
 )
-from congrasp.services.studio.server import (
-    BadRequest,
-    Download,
-    Get,
-    PageServer,
-    Picture,
-    Routes,
-    Sessions,
-)
+from congrasp.services.studio.routes import BadRequest, Download, Get, Picture, Routes
+from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow
 

@@ -365,7 +365,7 @@ def _files(folder):
     save_motion(folder / "motion", episode().normalised())
     (folder / "config").write_text(to_json(RunConfig()))
     (folder / "x.bvh").write_text(BVH)
-    (folder / "x.csv").write_text("x,y,z,w,x,y,z\n" + "0,0,0,1,0,0,0\n" * 3)
+    (folder / "x.csv").write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 3)
     np.savez(
         folder / "x.npz", position=np.zeros((2, 3)), quaternion=np.tile([1.0, 0, 0, 0], (2, 1))
     )

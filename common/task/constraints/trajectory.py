@@ -108,8 +108,8 @@ class Trajectory(Constraint):
         Option(
             "trajectory",
             "Wrist path: a grasp.npz, a constraint set (FILE:NUMBER), a JSON file with position "
-            "and quaternion, a CSV file (x y z, and the quaternion w x y z), or a BVH file (cm, y "
-            "up; FILE:JOINT names the joint, RightHand by default).",
+            "and quaternion, a CSV file (x,y,z,qw,qx,qy,qz), or a BVH file (cm, y up; FILE:JOINT "
+            "names the joint, RightHand by default).",
             "path",
         ),
     )

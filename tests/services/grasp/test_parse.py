@@ -159,7 +159,7 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     assert pose["q"][3] == pytest.approx(0.3) and not pose["q"][:3].any()
 
     (tmp_path / "path.csv").write_text(
-        "x,y,z,w,x,y,z\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n"
+        "x,y,z,qw,qx,qy,qz\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n"
     )
     path, turns = (
         asked(block, trajectory=str(tmp_path / "path.csv")).constraints["trajectory"].values()
@@ -168,7 +168,7 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     np.testing.assert_allclose(np.abs(turns[:, 0]), 1)
     assert (turns[:, 0] > 0).all() or (turns[:, 0] < 0).all()
     for written in (";", "\t", " ", " , "):  # as spreadsheets write it, with a byte order mark
-        text = "x,y,z,w,x,y,z\r\n0.1,-0.2,0.7,1,0,0,0\r\n0.1,-0.2,0.5,-1,0,0,0\r\n".replace(
+        text = "x,y,z,qw,qx,qy,qz\r\n0.1,-0.2,0.7,1,0,0,0\r\n0.1,-0.2,0.5,-1,0,0,0\r\n".replace(
             ",", written
         )
         (tmp_path / "sheet.csv").write_text(text, "utf-8-sig")

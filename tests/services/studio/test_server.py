@@ -2,7 +2,6 @@
 
 import contextlib
 import http.client
-import http.server
 import io
 import itertools
 import json
@@ -24,14 +23,18 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
 from congrasp.services.record.reader import read_episodes
+from congrasp.services.studio import application, browser_sessions, connections
 from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
+from congrasp.services.studio.application import STATIC
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
+from congrasp.services.studio.routes import Picture, Routes
+from congrasp.services.studio.server import PageServer, listening_socket
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
+from tests.waits import eventually
 
 
 class Page:
@@ -123,14 +126,14 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
     """A cookie identifies it, edits and undo are separate, and beyond the limit the least recent
     idle one ends.
     """
-    monkeypatch.setattr(server_module, "MOST", 2)
+    monkeypatch.setattr(browser_sessions, "MOST", 2)
     made: list[Session] = []
 
     def new() -> Session:
         made.append(fake.session(fake.FakePolicy()))
         return made[-1]
 
-    sessions = server_module.Sessions(new)
+    sessions = browser_sessions.Sessions(new)
     server = PageServer(sessions.routes, "127.0.0.1", 0)
     page = Page(server.port)
 
@@ -160,7 +163,7 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
                 page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1]
             )
             assert "2 browsers, the maximum, use" in refused["error"] and len(made) == 2
-        monkeypatch.setattr(server_module, "IDLE", 0.0)
+        monkeypatch.setattr(browser_sessions, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
         assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
     finally:
@@ -169,12 +172,9 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_hundred_simultaneous_connections_are_accepted() -> None:
-    with (
-        _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server,
-        contextlib.ExitStack() as stack,
-    ):
+    with listening_socket("127.0.0.1", 0) as listener, contextlib.ExitStack() as stack:
         for _ in range(100):  # none is accepted yet
-            stack.enter_context(socket.create_connection(server.server_address[:2], 10.0))
+            stack.enter_context(socket.create_connection(listener.getsockname(), 10.0))
 
 
 def test_browser_of_another_address_is_served_when_full() -> None:
@@ -199,7 +199,7 @@ def test_browser_of_another_address_is_served_when_full() -> None:
 
 def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its bytes come too often for the limit of silence."""
-    monkeypatch.setattr(server_module, "_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(connections, "TIMEOUT_S", 0.5)
     with (
         contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
         socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as slow,
@@ -207,6 +207,65 @@ def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> N
     ):
         for byte in itertools.chain(b"GET / HTTP/1.1\r\nHost: ", itertools.repeat(65, 1000)):
             slow.sendall(bytes([byte]))
+            time.sleep(0.02)
+
+
+def test_a_client_that_does_not_read_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(server_module, "_CONNECTIONS", 1)
+    large = Routes({"/api/large": lambda query: Picture(bytes(64 << 20))}, {})
+    with (
+        contextlib.closing(PageServer(lambda browser: large, "127.0.0.1", 0)) as server,
+        socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client,
+    ):
+        client.sendall(b"GET /api/large HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert client.recv(1, socket.MSG_PEEK)
+
+        def code_of_another() -> int:
+            other = http.client.HTTPConnection(
+                "127.0.0.1", server.port, timeout=10, source_address=("127.0.0.2", 0)
+            )
+            with contextlib.closing(other):
+                other.request("GET", "/")
+                return other.getresponse().status
+
+        assert code_of_another() == 503
+        eventually(lambda: code_of_another() == 200, 0.1)
+
+
+def _posted(server: PageServer, path: str) -> socket.socket:
+    """A connection that has sent the head of a request whose body is 1 MB long."""
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=10.0)
+    head = (
+        f"POST {path} HTTP/1.1",
+        "Host: 127.0.0.1",
+        "Content-Type: application/json",
+        "Content-Length: 1000000",
+    )
+    connection.sendall("\r\n".join([*head, "", ""]).encode())
+    return connection
+
+
+def test_silence_within_a_body_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(application, "_SILENCE_S", 0.2)
+    routes = Routes({}, {"/api/do": lambda query, body: {}})
+    with (
+        contextlib.closing(PageServer(lambda browser: routes, "127.0.0.1", 0)) as server,
+        _posted(server, "/api/do") as connection,
+    ):
+        connection.sendall(b"{")
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 408 ")
+
+
+def test_rest_of_a_refused_body_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "_REST_S", 0.2)
+    with (
+        contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
+        _posted(server, "/api/none") as connection,
+        pytest.raises((BrokenPipeError, ConnectionResetError)),
+    ):
+        for _ in range(1000):
+            connection.sendall(b" ")
             time.sleep(0.02)
 
 
@@ -292,6 +351,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         ),
         (b'{"action": "set_heading", "surface": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
         (b'{"action": "explode"}', "no action 'explode'"),
+        (b'{"action": "\\ud800"}', "no action"),
         (b'{"action": "set_roll", "turns": 2}', "Invalid value"),
         (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
         (b'{"action": "unit", "unit": "cm"}', "Open a mesh"),
@@ -304,8 +364,14 @@ def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, say
 
 
 def test_a_body_without_length_or_beyond_the_limit_is_refused_unread(page: Page) -> None:
-    for length in (str(1 << 40), "-5", "many", "9" * 5000):
-        assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
+    for length, code in ((str(1 << 40), 413), ("-5", 400), ("many", 400), ("9" * 5000, 400)):
+        assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == code
+
+
+def test_chunked_body_is_refused_with_and_without_length(page: Page) -> None:
+    chunked = {"Transfer_Encoding": "chunked"}
+    for length in ({}, {"Content_Length": "3"}):
+        assert page.ask("POST", "/api/upload?name=a.stl", b"", **chunked, **length)[0] == 413
 
 
 @pytest.mark.parametrize(
@@ -332,13 +398,13 @@ def test_a_refused_request_is_answered_before_its_body_arrives(
         assert connection.recv(1 << 16).startswith(f"HTTP/1.1 {code} ".encode())
 
 
-@pytest.mark.parametrize("host", ["", "Host:\r\n", "Host:  \r\n"])
-def test_a_request_for_no_host_is_refused_on_every_interface(host: str) -> None:
+@pytest.mark.parametrize(("host", "code"), [("", 400), ("Host:\r\n", 403), ("Host:  \r\n", 403)])
+def test_a_request_for_no_host_is_refused_on_every_interface(host: str, code: int) -> None:
     server = PageServer(lambda browser: Routes({"/api/state": lambda query: {}}, {}), "0.0.0.0", 0)
     try:
         with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
             connection.sendall(f"GET /api/state HTTP/1.1\r\n{host}\r\n".encode())
-            assert connection.recv(1 << 16).startswith(b"HTTP/1.1 403 ")
+            assert connection.recv(1 << 16).startswith(f"HTTP/1.1 {code} ".encode())
     finally:
         server.close()
 

@@ -275,14 +275,24 @@ def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
         assert load_geometry(tmp_path / "a.obj", "").area == pytest.approx(area)
 
 
+def _star(corners):
+    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    radius = np.where(np.arange(corners) % 2, 1, 0.4)
+    return _flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
+
+
+def test_star_of_many_corners_is_cut(tmp_path):
+    (tmp_path / "a.obj").write_text(_star(1000))
+    notes = list[str]()
+    mesh = load_geometry(tmp_path / "a.obj", "", notes=notes)
+    assert mesh.area == pytest.approx(500 * 0.4 * np.sin(np.pi / 500))
+    assert not notes
+
+
 def test_many_corners_are_left_with_a_note(tmp_path):
-    angle = np.linspace(0, 2 * np.pi, 66, endpoint=False)
-    radius = np.where(np.arange(66) % 2, 1, 0.4)
-    (tmp_path / "a.obj").write_text(
-        _flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
-    )
+    (tmp_path / "a.obj").write_text(_star(1002))
     said = list[str]()
-    assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 64
+    assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 1000
     assert said == [
         "1 of its dented polygons could not be cut and may be filled (export it as triangles)"
     ]
