@@ -18,6 +18,7 @@ import multiprocessing
 import os
 import pathlib
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -222,7 +223,7 @@ def _check_open(path, flags) -> None:
     if text.startswith(("/proc/", "/sys/", "/dev/")) and text != os.devnull:
         _note(text)
         raise FileNotFoundError(2, "No such file or directory", text)
-    if os.path.isdir(text):
+    if os.path.isdir(text) and _is_ours(sys._getframe(2).f_globals):
         _note(f"open {text}")
         raise PermissionError(13, "Permission denied", text)
     if flags & os.O_CREAT:
@@ -264,6 +265,7 @@ def _audit(event: str, arguments: tuple) -> None:
 
 
 _replaced = _stand_ins()
+shutil._use_fd_functions = False  # folders are removed without opening them
 builtins.__import__ = _lacking_import
 sys.addaudithook(_audit)
 if sys.flags.warn_default_encoding:

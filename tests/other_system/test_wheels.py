@@ -1,5 +1,6 @@
 """Wheels of all dependencies for the systems that the README names."""
 
+import json
 import pathlib
 import subprocess
 import sys
@@ -14,6 +15,17 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 GLIBC = ("2014", "_2_17", "_2_24", "_2_27", "_2_28", "_2_31", "_2_34")
 PYTHON = "3.12"
+PIP = """
+import json, sys
+from pip._internal.cli.main import main
+from pip._vendor.packaging import markers
+
+of_this_system = markers.default_environment
+changes = json.loads(sys.argv.pop(1))
+markers.default_environment = lambda: {**of_this_system(), **changes}
+sys.exit(main(sys.argv[1:]))
+"""
+"""pip with the markers of another system: its options choose the wheels of that system alone."""
 
 
 class System(NamedTuple):
@@ -25,16 +37,19 @@ class System(NamedTuple):
 
 def _linux(machine: str) -> System:
     tags = tuple(f"manylinux{version}_{machine}" for version in GLIBC)
-    return System(tags, {"sys_platform": "linux", "platform_machine": machine})
+    return System(tags, _markers("linux", "Linux", "posix", machine))
+
+
+def _markers(platform: str, system: str, name: str, machine: str) -> dict[str, str]:
+    values = {"sys_platform": platform, "platform_system": system, "os_name": name}
+    return {**values, "platform_machine": machine, "python_full_version": f"{PYTHON}.0"}
 
 
 SYSTEMS = {
     "linux": _linux("x86_64"),
     "linux-arm": _linux("aarch64"),
-    "macos": System(
-        ("macosx_14_0_arm64",), {"sys_platform": "darwin", "platform_machine": "arm64"}
-    ),
-    "windows": System(("win_amd64",), {"sys_platform": "win32", "platform_machine": "AMD64"}),
+    "macos": System(("macosx_14_0_arm64",), _markers("darwin", "Darwin", "posix", "arm64")),
+    "windows": System(("win_amd64",), _markers("win32", "Windows", "nt", "AMD64")),
 }
 ABSENT = {("linux-arm", "physx"): ["sapien"]}
 """Packages without a wheel, by system and extra."""
@@ -59,8 +74,16 @@ def requirements(extra: str, system: System) -> list[str]:
 
 def lacking(packages: list[str], system: System, folder: pathlib.Path) -> list[str]:
     """Requirements that cannot be installed from wheels on a system, with all that they need."""
-    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed"]
-    command += ["--only-binary=:all:", "--python-version", PYTHON, "--target", str(folder)]
+    command = [sys.executable, "-c", PIP, json.dumps(system.markers), "install", "--dry-run"]
+    command += [
+        "--quiet",
+        "--ignore-installed",
+        "--only-binary=:all:",
+        "--python-version",
+        PYTHON,
+        "--target",
+        str(folder),
+    ]
     command += ["--constraint", str(ROOT / "constraints.txt")]
     for tag in system.tags:
         command += ["--platform", tag]
@@ -77,9 +100,7 @@ def lacking(packages: list[str], system: System, folder: pathlib.Path) -> list[s
 @pytest.mark.parametrize("extra", ["", *EXTRAS])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_an_extra_has_wheels(name, extra, tmp_path):
-    """In the pinned versions. Where a package needs another one on some systems alone, pip asks
-    the system that runs it.
-    """
+    """In the pinned versions."""
     system = SYSTEMS[name]
     packages = lacking(requirements(extra, system), system, tmp_path)
     expected = ABSENT.get((name, extra), [])
