@@ -69,9 +69,12 @@ def run_confined(
     Raises:
       TimeoutError: it did not end within `patience_s`.
     """
-    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, stream: subprocess.PIPE}
+    stdout = subprocess.PIPE if stream == "stdout" else subprocess.DEVNULL
+    stderr = subprocess.PIPE if stream == "stderr" else subprocess.DEVNULL
     excess: list[Excess] = []
-    with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment, **streams) as child:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, env=environment
+    ) as child:
         if not platforms.enforces_limits():
             _report_watching()
             _watch(child, limits, excess)

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.reduction import ForkingPickler
-from typing import IO, Any, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import psutil
 
@@ -138,6 +138,14 @@ def _workers(calls: int) -> int:
     return workers if workers > 1 else 0
 
 
+class _Running(NamedTuple):
+    """The helper's process and its standard streams."""
+
+    process: subprocess.Popen[bytes]
+    calls: IO[bytes]
+    answers: IO[bytes]
+
+
 class _Helper:
     """A process that starts workers: forking this one could deadlock if it has started JAX.
 
@@ -148,7 +156,7 @@ class _Helper:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._running: subprocess.Popen[bytes] | None = None
+        self._running: _Running | None = None
 
     def start(self) -> None:
         """Starts the process if it is not running."""
@@ -162,8 +170,8 @@ class _Helper:
         with self._lock:
             try:
                 helper = self._started()
-                _send(helper.stdin, (os.getpid(), os.getcwd(), workers, function, rows))
-                return _receive(helper.stdout) or [None] * len(rows)
+                _send(helper.calls, (os.getpid(), os.getcwd(), workers, function, rows))
+                return _receive(helper.answers) or [None] * len(rows)
             except (OSError, EOFError):  # it cannot start here, or was killed
                 self._stop()
                 return [None] * len(rows)
@@ -171,31 +179,33 @@ class _Helper:
                 self._stop()
                 raise
 
-    def _started(self) -> subprocess.Popen[bytes]:
+    def _started(self) -> _Running:
         """The process, which starts if necessary."""
         if self._running is None:
             paths = [str(path) for path in sys.path]
             code = f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve()"
             environment = child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore")
-            self._running = subprocess.Popen(
+            process = subprocess.Popen(
                 [multiprocessing.spawn.get_executable(), "-P", "-c", code],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env={**_ONE_THREAD, **environment},
                 **platforms.separate_session(),  # Ctrl-C on a terminal reaches only the caller
             )
+            assert process.stdin is not None and process.stdout is not None
+            self._running = _Running(process, process.stdin, process.stdout)
         return self._running
 
     def _stop(self) -> None:
         """Ends the process; its workers end with it."""
         if self._running:
-            process = self._running
+            helper = self._running
             self._running = None
-            process.kill()
-            for pipe in (process.stdin, process.stdout):
+            helper.process.kill()
+            for pipe in (helper.calls, helper.answers):
                 with contextlib.suppress(OSError):  # the rest of a message
                     pipe.close()
-            process.wait()
+            helper.process.wait()
 
 
 def _send(pipe: IO[bytes], message: Any) -> None:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 try:
@@ -80,7 +80,7 @@ def separate_session() -> dict[str, Any]:
     return {"creationflags": new_group}
 
 
-def replace_process(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
+def replace_process(command: list[str], environment: Mapping[str, str]) -> NoReturn:
     """Runs a command in place of this process.
 
     Windows has no such call: there the command is a child, and its exit code that of this process.

@@ -269,4 +269,5 @@ shutil._use_fd_functions = False  # folders are removed without opening them
 builtins.__import__ = _lacking_import
 sys.addaudithook(_audit)
 if sys.flags.warn_default_encoding:
+    warnings.filterwarnings("ignore", category=EncodingWarning)
     warnings.filterwarnings("error", category=EncodingWarning, module=r"congrasp\b")

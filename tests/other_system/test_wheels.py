@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-GLIBC = ("2014", "_2_17", "_2_24", "_2_27", "_2_28", "_2_31", "_2_34")
+GLIBC = ("1", "2010", "2014", *(f"_2_{minor}" for minor in range(5, 36)))
 PYTHON = "3.12"
 PIP = """
 import json, sys
