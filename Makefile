@@ -30,7 +30,7 @@ quickstart:
 # Three workers on two cores: many tests wait for processes that they start or kill.
 test test-all: install
 	@tests/install_browser.sh $(VENV)/bin/python
-	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not gpu$(if $(filter test,$@), and not slow)" $(ARGS)
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not gpu and not index$(if $(filter test,$@), and not slow)" $(ARGS)
 
 newest:
 	$(MAKE) test VENV=.venv-newest CONSTRAINTS=/dev/null

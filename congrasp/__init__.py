@@ -141,4 +141,5 @@ def _before_fork() -> None:
         importlib.import_module("congrasp.common.runtime.forks").detect_jax()
 
 
-os.register_at_fork(before=_before_fork)
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no forks
+    os.register_at_fork(before=_before_fork)

@@ -90,7 +90,7 @@ def main(folder: pathlib.Path = pathlib.Path(__file__).parent) -> None:
         text = trimesh.exchange.obj.export_obj(
             mesh, include_normals=False, header="Made by examples/make_mug.py", digits=5
         )
-        (folder / f"{name}.obj").write_text(text)
+        (folder / f"{name}.obj").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.io.inputs import open_file
 from congrasp.common.io.opening import random_name
+from congrasp.common.runtime import platforms
 from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.wire.codec import Message, decode, encode
 
@@ -74,7 +75,7 @@ class Checkpoints:
         link = self._directory / random_name(_LATEST)
         try:
             link.symlink_to(path.name)
-            link.replace(latest)
+            platforms.replace(link, latest)
             sync_directory(self._directory)
         except OSError:
             with contextlib.suppress(OSError):
@@ -154,7 +155,7 @@ def set_aside(path: pathlib.Path) -> pathlib.Path:
     others = (path.with_name(f"{path.name}{_ASIDE}{number or ''}") for number in itertools.count())
     target = next(other for other in others if not os.path.lexists(other))
     with os_errors_as(f"{path} cannot be renamed to {target.name}"):
-        return path.rename(target)
+        return platforms.replace(path, target)
 
 
 def _update(path: pathlib.Path) -> int:

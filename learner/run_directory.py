@@ -27,7 +27,7 @@ from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.claims import Claim
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
-from congrasp.common.io.locks import NoLocksError, try_lock
+from congrasp.common.io.locks import FIRST_READABLE, NoLocksError, try_lock
 from congrasp.common.io.opening import open_to_update
 from congrasp.common.io.spelling import check_spelling
 from congrasp.common.runtime.lazy_module import LazyModule
@@ -252,12 +252,13 @@ def _locked(path: pathlib.Path) -> BinaryIO:
     with contextlib.ExitStack() as stack:
         stack.enter_context(file)
         if not try_lock(file):
-            raise _in_use(path.parent, file.read(32).decode(errors="replace"))
+            file.seek(FIRST_READABLE)
+            raise _in_use(path.parent, file.read(32).decode(errors="replace").strip())
         stack.pop_all()
     # A full disk only removes the number from another process's error.
     with contextlib.suppress(OSError):
         file.truncate(0)
-        file.write(f"{os.getpid()}".encode())
+        file.write(f"{' ' * FIRST_READABLE}{os.getpid()}".encode())
     return file
 
 

@@ -2,6 +2,7 @@
 
 import pathlib
 import shutil
+import stat
 import subprocess
 import sys
 import zipfile
@@ -37,7 +38,9 @@ def wheel(tmp_path_factory) -> pathlib.Path:
 
 
 def test_a_wheel_installs_one_name_and_all_its_files(wheel):
-    names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
+    files = zipfile.ZipFile(wheel).infolist()
+    assert not [file for file in files if stat.S_ISLNK(file.external_attr >> 16)]
+    names = [file.filename for file in files if ".dist-info/" not in file.filename]
     assert {name.partition("/")[0] for name in names} == {"congrasp"}
     for folder in FOLDERS:
         tracked = subprocess.run(

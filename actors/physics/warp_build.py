@@ -109,22 +109,25 @@ def one_builder(variants: Sequence[Variant]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(open_to_append(path))
-            _wait_for_lock(file)
+            if not _wait_for_lock(file):
+                file.close()
         except (OSError, CongraspError) as error:
             _log.info("Kernels are built without waiting for other processes: %s.", error)
         yield
 
 
-def _wait_for_lock(file: BinaryIO) -> None:
-    """Waits for the lock of the first builder, or that of all others, for `_PATIENCE_S` seconds."""
+def _wait_for_lock(file: BinaryIO) -> bool:
+    """Takes the lock, or waits until the first builder is done, for `_PATIENCE_S` seconds.
+
+    Returns:
+      True if this process is the first builder, which keeps the lock.
+    """
     start = time.monotonic()
     is_reported = False
-    shared = False
     waited = 0.0
     while waited < _PATIENCE_S:
-        if try_lock(file, shared=shared):
-            return
-        shared = True  # together, once the first is done
+        if try_lock(file):
+            return waited == 0.0
         if waited > _SILENT_S and not is_reported:
             is_reported = True
             _log.info(
@@ -132,3 +135,4 @@ def _wait_for_lock(file: BinaryIO) -> None:
             )
         time.sleep(0.1)
         waited = time.monotonic() - start
+    return False

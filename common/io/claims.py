@@ -10,6 +10,7 @@ import psutil
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import parse_json, read_file
 from congrasp.common.io.opening import create_new, random_name
+from congrasp.common.runtime import platforms
 
 _LARGEST = 1 << 12
 _CLOCK = 2.0  # seconds by which two readings of a process's start may differ
@@ -95,11 +96,11 @@ class Claim:
         """Removes the file if it still has this text: another process may replace it meanwhile."""
         aside = self._path.with_name(random_name(self._path.name))
         try:
-            self._path.rename(aside)
+            platforms.replace(self._path, aside)
             if read_file(aside, _LARGEST) == text:
                 aside.unlink()
             else:
-                aside.rename(self._path)
+                platforms.replace(aside, self._path)
         except (OSError, CongraspError):
             raise self._in_use("another process") from None
 

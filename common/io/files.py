@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.opening import temporary_file
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.runtime import platforms
 
 if TYPE_CHECKING:  # commands that read no message start without NumPy
     from congrasp.common.wire.codec import Message
@@ -70,7 +71,7 @@ def replacement(path: pathlib.Path) -> Iterator[BinaryIO]:
             file.flush()
             sync_file(file.fileno())
             file.close()
-            temporary.replace(path)
+            platforms.replace(temporary, path)
     except OSError as error:
         raise _unwritten(path, error) from None
     try:
@@ -179,6 +180,8 @@ def sync_directory(path: pathlib.Path) -> None:
     Raises:
       OSError: the disk failed.
     """
+    if not platforms.HAS_FOLDER_FLUSH:
+        return
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError as error:

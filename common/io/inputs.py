@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import pathlib
+import re
 import stat
 import unicodedata
 from collections.abc import Callable, Iterable
@@ -11,10 +12,13 @@ from typing import Any, BinaryIO
 
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.spelling import folded
+from congrasp.common.runtime.platforms import BYTES, NO_WAIT
 
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
 _MAX_NAME_BYTES = 200  # in UTF-8; file systems take 255, with suffixes
+_RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*\.", re.IGNORECASE)
+"""Names of devices on Windows, and those whose last dot it drops."""
 _DIGEST_CHARACTERS = 20  # left at the end of a cut name for the digits of its digest
 
 
@@ -26,13 +30,19 @@ def file_name(text: object, what: str) -> str:
       what: the thing it names, for the error.
 
     Raises:
-      CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special
-        character.
+      CongraspError: it is empty or too long, begins or ends with a dot, holds a slash or another
+        special character, or is the name of a device on Windows, such as `aux`.
     """
     if isinstance(text, str) and text and (text[0].isalnum() or text[0] == "_"):
         encoded = text.encode(errors="replace")
         fits = len(text) <= LONGEST_NAME and len(encoded) <= _MAX_NAME_BYTES
-        if fits and all(_is_letter(c) or c in "_ .+()-" for c in text):
+        is_plain = all(_is_letter(c) or c in "_ .+()-" for c in text)
+        if fits and is_plain and _RESERVED.fullmatch(text):
+            raise CongraspError(
+                f"'{text}' cannot name {what} on Windows.",
+                "Choose another name, without a dot at its end.",
+            )
+        if fits and is_plain:
             return text
     raise CongraspError(
         f"'{ascii(text)[1:61].rstrip(chr(39))}' cannot name {what}.",
@@ -45,7 +55,7 @@ def safe_name(text: str) -> str:
     underscores.
 
     A name that is too long is cut, and ends with eight hex digits of the whole. A text without
-    letters becomes "object".
+    letters becomes "object". One that Windows reserves gets an underscore at its end.
     """
     text = unicodedata.normalize("NFC", text)
     safe = "".join(c if _is_letter(c) or c in "._-" else "_" for c in text)
@@ -56,6 +66,9 @@ def safe_name(text: str) -> str:
         beginning = safe[: LONGEST_NAME - _DIGEST_CHARACTERS].encode()
         beginning = beginning[: _MAX_NAME_BYTES - _DIGEST_CHARACTERS]
         safe = f"{beginning.decode(errors='ignore')}-{digits}"
+    if _RESERVED.fullmatch(safe):
+        stem, dot, ending = safe.partition(".")
+        safe = f"{stem}_{dot}{ending}".rstrip(".")
     return safe or "object"
 
 
@@ -109,7 +122,7 @@ def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:
       CongraspError: it is not a regular file.
       OSError: it cannot be opened.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(path, os.O_RDONLY | NO_WAIT | BYTES)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)

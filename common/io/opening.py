@@ -16,12 +16,10 @@ from typing import BinaryIO, cast
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.runtime.platforms import BYTES, NO_FOLLOW, NO_WAIT
 
 _ATTEMPTS = 100
-# Systems without one of these flags also lack what it prevents.
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-_COMMON = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0) | _NO_LINK
-_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+_COMMON = BYTES | NO_FOLLOW
 
 
 def create_new(path: pathlib.Path, mode: int = 0o666) -> BinaryIO:
@@ -63,7 +61,7 @@ def _open_existing(path: pathlib.Path, flags: int) -> BinaryIO:
     """Opens or creates a regular file that has one name."""
     check_spelling(path)
     try:
-        descriptor = os.open(path, flags | _COMMON | _NO_WAIT, 0o666)
+        descriptor = os.open(path, flags | _COMMON | NO_WAIT, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise CongraspError(f"{path} is a symbolic link.", "Remove it.") from None

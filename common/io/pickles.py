@@ -6,7 +6,6 @@ file.
 """
 
 import pathlib
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -17,6 +16,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.arrays import read_npz
 from congrasp.common.io.inputs import read_file
+from congrasp.common.runtime.confinement import Limits, run_confined
 from congrasp.common.runtime.environment import child_environment
 
 MAX_BYTES = 512 << 20
@@ -122,24 +122,26 @@ def _write_pickles(source: pathlib.Path, pickles: Iterable[tuple[str, bytes]]) -
 
 def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> None:
     """Runs the child process; a CongraspError names the pickle at which it ended."""
-    limits = map(str, (_MAX_MEMORY_BYTES, _MAX_PROCESSOR_S, MAX_BYTES))
+    words = (_CHILD, source, answer, _MAX_MEMORY_BYTES, _MAX_PROCESSOR_S, MAX_BYTES)
+    limits = Limits(
+        memory=_MAX_MEMORY_BYTES,
+        processor_s=_MAX_PROCESSOR_S,
+        patience_s=_TIMEOUT_S,
+        file=answer,
+        file_bytes=MAX_BYTES,
+    )
+    environment = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     try:
-        child = subprocess.run(
-            [sys.executable, "-P", _CHILD, source, answer, *limits],
-            timeout=_TIMEOUT_S,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"),
-            check=False,
+        child = run_confined(
+            [sys.executable, "-P", *map(str, words)], limits, environment, "stdout"
         )
-    except subprocess.TimeoutExpired:
+    except TimeoutError:
         raise CongraspError(
             f"{names[0]} was not read within {_TIMEOUT_S:.0f} s.",
             "Stop other programs and try again.",
         ) from None
-    if child.returncode:
-        raise _refusal(child.stdout.decode(errors="replace"), names)
+    if child.code:
+        raise _refusal(child.output.decode(errors="replace"), names)
 
 
 def _refusal(output: str, names: list[str]) -> CongraspError:

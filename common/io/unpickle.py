@@ -4,8 +4,8 @@ with arrays.
     python unpickle.py PICKLES ANSWER MEMORY SECONDS BYTES
 
 PICKLES is a ZIP archive whose members are pickles, ANSWER the NPZ file to write. Each pickle's
-number is printed before it is read, followed by the reason if it is refused. Only NumPy is
-imported, so that the process starts fast.
+number is printed before it is read, followed by the reason if it is refused. Only NumPy and
+the limits are imported, so that the process starts fast.
 
 Every class that a pickle may name is a stand-in. NumPy's own `dtype.__setstate__` takes its flags
 from the file, which turns bytes into pointers.
@@ -15,13 +15,14 @@ import contextlib
 import io
 import pickle
 import re
-import resource
 import sys
 import zipfile
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
+
+from congrasp.common.runtime.platforms import limit_this_process
 
 _NUMBER = re.compile(r"[<>=|]?(\?|[biuf]\d{1,2})")
 _TORCH_MAGIC = 0x1950A86A20F9469CFC6C
@@ -256,20 +257,9 @@ def _rows(value: Any) -> Any:
     return value
 
 
-def _limit(kind: int, limit: int) -> None:
-    """Lowers a limit of this process."""
-    hard = resource.getrlimit(kind)[1]
-    if hard != resource.RLIM_INFINITY:
-        limit = min(limit, hard)
-    resource.setrlimit(kind, (limit, limit))
-
-
 def main(pickles: str, answer: str, memory: str, seconds: str, size: str) -> None:
     """Writes the arrays of all pickles, under names that begin with the pickle's number."""
-    _limit(resource.RLIMIT_AS, int(memory))
-    _limit(resource.RLIMIT_CPU, int(seconds))
-    _limit(resource.RLIMIT_FSIZE, int(size))
-    _limit(resource.RLIMIT_CORE, 0)
+    limit_this_process(int(memory), float(seconds), int(size))
     arrays: dict[str, np.ndarray] = {}
     try:
         with zipfile.ZipFile(pickles) as archive:

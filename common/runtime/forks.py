@@ -5,10 +5,10 @@ code that knows no deadline, so calls are refused before they reach it.
 """
 
 import ctypes
-import os
 import sys
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.platforms import after_fork
 
 _REMEDY = "Start processes with the start method spawn: multiprocessing.get_context('spawn')."
 _generation = 0
@@ -83,4 +83,4 @@ def _jax_clients() -> list[object]:
     return list(getattr(bridge, "_backends", {}).values())
 
 
-os.register_at_fork(after_in_child=_in_child)
+after_fork(_in_child)

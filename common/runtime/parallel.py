@@ -11,15 +11,16 @@ import multiprocessing.spawn
 import os
 import pathlib
 import re
-import select
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from multiprocessing.reduction import ForkingPickler
+from typing import IO, Any, NamedTuple, TypeVar
 
 import psutil
 
+from congrasp.common.runtime import platforms
 from congrasp.common.runtime.environment import child_environment
 
 Result = TypeVar("Result")
@@ -28,12 +29,14 @@ _MIN_CALLS_PER_WORKER = 16
 _MAX_WORKERS = 16
 _CALLS_PER_CHUNK = 4  # sent to a worker at a time
 _PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constraints")
-"""Modules imported once, before the workers fork; workers import anything else their functions
+"""Modules imported once, before workers fork; workers import anything else their functions
 need.
 """
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """Environment of processes that share the cores: each would otherwise start a thread for every
 core, for products so small that the threads cost several times the work."""
+_LENGTH_BYTES = 8
+"""Size of the length before each message."""
 _GROUPS = pathlib.Path("/sys/fs/cgroup")
 """Folder of the kernel's control groups."""
 _MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
@@ -84,7 +87,7 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
       separate: its files in version 1, whose texts are joined.
     """
     with contextlib.suppress(OSError):
-        for line in _MEMBERSHIP.read_text().splitlines():
+        for line in _MEMBERSHIP.read_text(encoding="utf-8").splitlines():
             _, controllers, group = line.split(":", 2)
             if controllers and controller not in controllers.split(","):
                 continue
@@ -94,7 +97,10 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
             path = pathlib.PurePath(group.lstrip("/"))
             for folder in (path, *path.parents):
                 with contextlib.suppress(OSError):
-                    yield " ".join((mount / folder / file).read_text().strip() for file in files)
+                    yield " ".join(
+                        (mount / folder / file).read_text(encoding="utf-8").strip()
+                        for file in files
+                    )
 
 
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
@@ -132,23 +138,30 @@ def _workers(calls: int) -> int:
     return workers if workers > 1 else 0
 
 
-class _Helper:
-    """A process that forks workers, since forking this one could deadlock if it has started JAX.
+class _Running(NamedTuple):
+    """The helper's process and its standard streams."""
 
-    Python's fork server would import the caller's `__main__` in each worker, and is shared with the
-    caller's own use.
+    process: subprocess.Popen[bytes]
+    calls: IO[bytes]
+    answers: IO[bytes]
+
+
+class _Helper:
+    """A process that starts workers: forking this one could deadlock if it has started JAX.
+
+    Other ways of Python to start workers would import the caller's `__main__` in each of them, and
+    its fork server is shared with the caller's own use. Messages pass through the helper's standard
+    input and output.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._running: (
-            tuple[subprocess.Popen[bytes], multiprocessing.connection.Connection] | None
-        ) = None
+        self._running: _Running | None = None
 
     def start(self) -> None:
         """Starts the process if it is not running."""
         with self._lock:
-            self._connected()
+            self._started()
 
     def results(
         self, workers: int, function: Callable[..., Result], rows: list[Any]
@@ -156,9 +169,9 @@ class _Helper:
         """Returns the result of each call, None for those that failed."""
         with self._lock:
             try:
-                connection = self._connected()
-                connection.send((os.getcwd(), workers, function, rows))
-                return connection.recv() or [None] * len(rows)
+                helper = self._started()
+                _send(helper.calls, (os.getpid(), os.getcwd(), workers, function, rows))
+                return _receive(helper.answers) or [None] * len(rows)
             except (OSError, EOFError):  # it cannot start here, or was killed
                 self._stop()
                 return [None] * len(rows)
@@ -166,36 +179,63 @@ class _Helper:
                 self._stop()
                 raise
 
-    def _connected(self) -> multiprocessing.connection.Connection:
-        """The connection to the process, which starts if necessary."""
+    def _started(self) -> _Running:
+        """The process, which starts if necessary."""
         if self._running is None:
-            connection, helper_connection = multiprocessing.connection.Pipe()
             paths = [str(path) for path in sys.path]
-            descriptor = helper_connection.fileno()
-            code = (
-                f"import sys; sys.path[:] = {paths}; from {__name__} import serve; "
-                f"serve({descriptor})"
-            )
+            code = f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve()"
             environment = child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore")
-            with helper_connection:
-                process = subprocess.Popen(
-                    [multiprocessing.spawn.get_executable(), "-P", "-c", code],
-                    stdin=subprocess.DEVNULL,
-                    pass_fds=[descriptor],
-                    start_new_session=True,  # Ctrl-C on a terminal reaches only the caller
-                    env={**_ONE_THREAD, **environment},
-                )
-            self._running = (process, connection)
-        return self._running[1]
+            process = subprocess.Popen(
+                [multiprocessing.spawn.get_executable(), "-P", "-c", code],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**_ONE_THREAD, **environment},
+                **platforms.separate_session(),  # Ctrl-C on a terminal reaches only the caller
+            )
+            assert process.stdin is not None and process.stdout is not None
+            self._running = _Running(process, process.stdin, process.stdout)
+        return self._running
 
     def _stop(self) -> None:
-        """Ends the process; its workers end because the connection closes."""
+        """Ends the process; its workers end with it."""
         if self._running:
-            process, connection = self._running
+            helper = self._running
             self._running = None
-            connection.close()
-            process.kill()
-            process.wait()
+            helper.process.kill()
+            for pipe in (helper.calls, helper.answers):
+                with contextlib.suppress(OSError):  # the rest of a message
+                    pipe.close()
+            helper.process.wait()
+
+
+def _send(pipe: IO[bytes], message: Any) -> None:
+    """Writes a message.
+
+    Raises:
+      OSError: the process at the other end is gone.
+    """
+    data = ForkingPickler.dumps(message)
+    pipe.write(len(data).to_bytes(_LENGTH_BYTES, "little"))
+    pipe.write(data)
+    pipe.flush()
+
+
+def _receive(pipe: IO[bytes]) -> Any:
+    """Reads a message.
+
+    Raises:
+      EOFError: the process at the other end is gone.
+    """
+    length = int.from_bytes(_read(pipe, _LENGTH_BYTES), "little")
+    return ForkingPickler.loads(_read(pipe, length))
+
+
+def _read(pipe: IO[bytes], count: int) -> bytes:
+    """Reads bytes; raises an EOFError if there are fewer."""
+    data = pipe.read(count)
+    if len(data) < count:
+        raise EOFError
+    return data
 
 
 _helpers: dict[int, _Helper] = {}
@@ -206,42 +246,47 @@ def _helper() -> _Helper:
     return _helpers.setdefault(os.getpid(), _Helper())
 
 
-def serve(descriptor: int) -> None:
-    """Makes the calls of the process at the other end of a socket, until that ends.
+def serve() -> None:
+    """Makes the calls of the process at the other end of the standard streams, until that ends.
 
-    Args:
-      descriptor: file descriptor of the socket.
+    What the calls print goes to the standard error.
     """
-    for module in _PRELOADED:
-        importlib.import_module(module)
-    connection = multiprocessing.connection.Connection(descriptor)
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            _answer(connection, descriptor)
+    calls = sys.stdin.buffer
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        for module in _PRELOADED:
+            importlib.import_module(module)
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                _answer(calls, answers)
 
 
-def _answer(connection: multiprocessing.connection.Connection, descriptor: int) -> None:
+def _answer(calls: IO[bytes], answers: IO[bytes]) -> None:
     """Makes the calls of one message; sends no results if they cannot be made.
 
     Raises:
       EOFError, OSError: the process at the other end is gone.
     """
     try:
-        results = _results(descriptor, *connection.recv())
+        results = _results(*_receive(calls))
     except (EOFError, OSError):
         raise
     except Exception:  # for instance, a class of the caller's `__main__`
         results = []
-    connection.send(results)
+    _send(answers, results)
 
 
 def _results(
-    descriptor: int, folder: str, workers: int, function: Callable[..., Result], rows: list[Any]
+    caller: int, folder: str, workers: int, function: Callable[..., Result], rows: list[Any]
 ) -> list[tuple[Result] | None]:
-    """The result of each call, None for those that failed, by workers that end with the socket."""
+    """The result of each call, None for those that failed, by workers that end with the caller and
+    with this process.
+    """
     os.chdir(folder)
-    context = multiprocessing.get_context("fork")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _end_with, (descriptor,)) as pool:
+    context = multiprocessing.get_context(platforms.start_method())
+    with concurrent.futures.ProcessPoolExecutor(
+        workers, context, platforms.end_with, (caller, os.getpid())
+    ) as pool:
         calls = [(function, row) for row in rows]
         return list(pool.map(_call, calls, chunksize=_CALLS_PER_CHUNK))
 
@@ -253,16 +298,3 @@ def _call(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> tuple[Result] 
         return (function(*row),)
     except Exception:
         return None
-
-
-def _end_with(descriptor: int) -> None:
-    """Ends this process as soon as the other end of the socket closes."""
-    poll = select.poll()
-    poll.register(descriptor, 0)  # a hang-up alone
-
-    def wait() -> None:
-        """Waits for the end of the process that this one works for."""
-        poll.poll()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()

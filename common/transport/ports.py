@@ -2,18 +2,12 @@
 
 import contextlib
 import errno
-import functools
-import logging
-import os
-import pathlib
 import re
 import secrets
 import socket
-import tempfile
-import threading
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.locks import NoLocksError, try_lock
+from congrasp.common.runtime.platforms import reserve_for_listener
 from congrasp.common.transport.keys import FLOWS
 
 LEARNER_URL = "tcp/127.0.0.1:7447"
@@ -28,9 +22,8 @@ _FREE_PORTS = 15000
 Linux), which cannot take these ports."""
 _MAX_ATTEMPTS = 1000
 _LAST_PORT = 65535
-_lock = threading.Lock()
-_reserved: set[int] = set()
-_log = logging.getLogger(__name__)
+_reservations: list[socket.socket] = []
+"""Sockets that reserve ports, see `free_port`."""
 
 
 def shifted(url: str, offset: int) -> str:
@@ -84,7 +77,7 @@ def check_ports(url: str, count: int = len(FLOWS)) -> None:
     for port in range(first, first + count):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            reserve_for_listener(probe)
             try:
                 probe.bind((host, port))
             except OSError as error:
@@ -133,68 +126,39 @@ def reachable_url(url: str) -> str:
 def free_port(count: int = len(FLOWS)) -> int:
     """Returns a free loopback port such that the `count` - 1 following ones are free as well.
 
-    While this process lives, none of them is returned again, neither here nor in another process of
-    this user.
+    While this process runs, none of them is returned again, neither here nor in another process:
+    each is reserved by a UDP socket of the same number, which the system closes with the process.
 
     Raises:
       OSError: no such ports are free.
     """
-    file = _reservations()
     for _ in range(_MAX_ATTEMPTS):
         start = _FIRST_FREE_PORT + secrets.randbelow(_FREE_PORTS - count)
         ports = range(start, start + count)
-        with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
+        with contextlib.ExitStack() as probes, contextlib.suppress(OSError):
             for port in ports:
-                stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
-            _reserve(file, ports)
+                probes.enter_context(socket.socket()).bind(_loopback(port))
+            _reserve(ports)
             return start
     raise OSError(f"No {count} neighbouring TCP ports are free on the loopback interface.")
 
 
-def _reserve(file: int, ports: range) -> None:
-    """Locks a byte of the file for each port; the system releases the locks when the process ends.
+def _reserve(ports: range) -> None:
+    """Reserves ports until this process ends.
 
     Raises:
       OSError: a port is already reserved.
     """
-    with _lock:
-        if not _reserved.isdisjoint(ports):
-            raise OSError("A port is reserved by this process.")
-        try:
-            if not try_lock(file, ports):
-                raise OSError("A port is reserved by another process.")
-        except NoLocksError:
-            _report_no_locks()
-        _reserved.update(ports)
+    with contextlib.ExitStack() as sockets:
+        reservations: list[socket.socket] = []
+        for port in ports:
+            reservation = sockets.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+            reservation.bind(_loopback(port))
+            reservations.append(reservation)
+        _reservations.extend(reservations)
+        sockets.pop_all()
 
 
-@functools.cache
-def _report_no_locks() -> None:
-    """Logs once that other processes do not see which ports this one will use.
-
-    If two choose the same port at the same moment, one of them gets the error of a port in use.
-    """
-    _log.warning(
-        "%s is on a file system without locks: ports are not reserved. Set TMPDIR to a local one.",
-        tempfile.gettempdir(),
-    )
-
-
-@functools.cache
-def _reservations() -> int:
-    """Descriptor of this user's lock file, open until the process ends: closing it would release
-    every lock.
-
-    Where no such file can be opened, it is that of a file that only this process has.
-    """
-    for folder in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()):
-        if not folder:
-            continue
-        path = pathlib.Path(folder) / f"congrasp-ports-{os.getuid()}"
-        with contextlib.suppress(OSError):
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-            if os.fstat(file).st_uid == os.getuid():
-                return file
-            os.close(file)  # of another user, who could lock all of it
-    with tempfile.TemporaryFile() as private_file:
-        return os.dup(private_file.fileno())
+def _loopback(port: int) -> tuple[str, int]:
+    """Address of a port on the loopback interface."""
+    return "127.0.0.1", port

@@ -126,7 +126,7 @@ class Credentials:
           CongraspError: the list cannot be read; no peer may be admitted without it.
         """
         try:
-            return frozenset((self.folder / REVOKED_FILE).read_text().split())
+            return frozenset((self.folder / REVOKED_FILE).read_text(encoding="utf-8").split())
         except FileNotFoundError:
             return frozenset()
         except (OSError, UnicodeDecodeError):

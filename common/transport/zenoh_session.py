@@ -16,7 +16,6 @@ import json
 import logging
 import os
 import re
-import resource
 import socket
 import struct
 import threading
@@ -28,7 +27,7 @@ from typing import Any
 import zenoh
 
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.runtime import forks
+from congrasp.common.runtime import forks, platforms
 from congrasp.common.transport.base import Subscription, join
 from congrasp.common.transport.keys import Flow
 from congrasp.common.transport.ports import host_of, port_in_use
@@ -151,10 +150,7 @@ def _open_files() -> int:
     """Files that this process may have open; raises the limit to `_MAX_FILES` where the system
     allows it, else warns.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    limit = _MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, _MAX_FILES)
-    if soft != resource.RLIM_INFINITY and soft < limit:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+    limit = platforms.raise_open_files(_MAX_FILES)
     if limit < _MAX_FILES:
         _log.warning(
             "This process may open %d files: above %d idle connections, new peers cannot connect. "
@@ -511,7 +507,7 @@ def _abandon_all() -> None:
     _closing.clear()
 
 
-os.register_at_fork(after_in_child=_abandon_all)
+platforms.after_fork(_abandon_all)
 
 
 def follow_revocations(

@@ -21,6 +21,7 @@ from typing import NamedTuple
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 from congrasp.common.io.opening import temporary_file
+from congrasp.common.runtime import platforms
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
 from congrasp.learner.checkpoint import set_aside
@@ -124,7 +125,7 @@ class WriteAheadLog:
                 with temporary_file(path, PART) as (part, file):
                     file.write(encode(message))
                     file.close()
-                    part.rename(path)
+                    platforms.replace(part, path)
             except OSError as error:
                 is_new = not self._full
                 self._full = True

@@ -103,7 +103,7 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
     """
     with confined(write_arm, path, {"flange": flange, "speed": speed}) as (names, folder):
         arrays = read_npz(folder / _ARRAYS_FILE, "")
-        spec = mujoco.MjSpec.from_string((folder / _BODIES_FILE).read_text())
+        spec = mujoco.MjSpec.from_string((folder / _BODIES_FILE).read_text(encoding="utf-8"))
     name = path.parent.name if path.stem in ("robot", "scene") else path.stem
     return Arm(
         name=name,
@@ -147,7 +147,7 @@ def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[
         quaternion=mount.quaternion,
         postures=model.key_qpos[:, model.jnt_qposadr[joints]],
     )
-    (folder / _BODIES_FILE).write_text(spec.to_xml())
+    (folder / _BODIES_FILE).write_text(spec.to_xml(), encoding="utf-8")
     return {"joints": names, "flange": flange_name}
 
 

@@ -3,31 +3,26 @@
 They read strangers' files, or call native code.
 
 Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources.
-`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS` is that process:
+`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS PARENT` is that process:
 FUNCTION ("module:name") is called with FOLDER and the options from the standard input; what it
-returns goes to FOLDER/answer.json.
+returns goes to FOLDER/answer.json. It ends with the process whose id is PARENT.
 """
 
 import importlib
 import json
 import os
 import pathlib
-import resource
-import signal
-import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.confinement import Limits, run_confined
 from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.platforms import end_with, limit_this_process
 
 _ANSWER = "answer.json"
 _MODULE = "congrasp.services.assets.confined"
-_PARENT_CHECK_S = 0.5
-"""Time between two checks whether the parent is still there."""
 
 
 class OutOfResources(ChildProcessError):
@@ -64,28 +59,26 @@ def call_confined(
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
-    command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
-    try:
-        child = subprocess.run(
-            command,
-            input=json.dumps(options).encode(),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            timeout=patience,
-            env=env,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise TimeoutError from None
-    if child.returncode == -signal.SIGPROF:
+    arguments = [called, str(folder), str(memory), str(seconds), str(os.getpid())]
+    limits = Limits(memory=memory, processor_s=seconds, patience_s=patience)
+    child = run_confined(
+        [sys.executable, "-P", "-m", _MODULE, *arguments],
+        limits,
+        env,
+        "stderr",
+        json.dumps(options).encode(),
+    )
+    if child.excess == "time":
         raise OutOfResources(f"took longer than {seconds:g} s of processor time")
-    if child.returncode == -signal.SIGKILL:
+    if child.excess == "memory":
+        raise OutOfResources(f"took more than {memory / 1e9:g} GB of memory")
+    if child.excess == "killed":
         raise OutOfResources("was killed by the system, which may be out of memory")
     try:
-        answer = json.loads((folder / _ANSWER).read_text())
+        answer = json.loads((folder / _ANSWER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        reason = f"exit code {child.returncode}"
-        lines = child.stderr.decode(errors="replace").strip().splitlines()
+        reason = f"exit code {child.code}"
+        lines = child.output.decode(errors="replace").strip().splitlines()
         if lines:
             reason = lines[-1]
         raise ChildProcessError(f"failed ({reason})") from None
@@ -94,27 +87,18 @@ def call_confined(
     return answer["result"]
 
 
-def _child(called: str, folder: str, memory: str, seconds: str) -> None:
+def _child(called: str, folder: str, memory: str, seconds: str, parent: str) -> None:
     """Calls the function; ends at a limit, or when the parent is gone."""
     module, _, name = called.partition(":")
     function = getattr(importlib.import_module(module), name)
     options = json.load(sys.stdin)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    signal.setitimer(signal.ITIMER_PROF, float(seconds))  # its signal ends the process
-    resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    end_with(int(parent))
+    limit_this_process(int(memory), float(seconds))
     try:
         answer = {"result": function(pathlib.Path(folder), **options)}
     except CongraspError as error:
         answer = {"error": str(error)}
-    pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer))
-
-
-def _end_with(parent: int) -> None:
-    """Ends this process after its parent, whose id is given."""
-    while os.getppid() == parent:
-        time.sleep(_PARENT_CHECK_S)
-    os._exit(1)
+    pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -226,7 +226,7 @@ def _measure(
 def _print_logs(console: Console, folder: pathlib.Path) -> None:
     """Prints the last lines of each log of a failed run."""
     for log in sorted(folder.glob("*.log")):
-        lines = log.read_text(errors="replace").splitlines()
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         console.print(f"{log}", *lines[-_LOG_LINES:], sep="\n", markup=False)
 
 
@@ -243,7 +243,7 @@ def _write(out: pathlib.Path, config: RunConfig, plan: Plan, stages: Sequence[St
         "actors": plan.actors,
         "stages": [dataclasses.asdict(stage) for stage in stages],
     }
-    out.write_text(json.dumps(result, indent=2))
+    out.write_text(json.dumps(result, indent=2), encoding="utf-8")
 
 
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:

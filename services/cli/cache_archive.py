@@ -46,7 +46,7 @@ def _add_folder(archive: tarfile.TarFile, name: str, folder: pathlib.Path) -> No
             continue
         # Another process may remove it meanwhile
         with contextlib.suppress(FileNotFoundError):
-            archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
+            archive.add(file, f"{name}/{file.relative_to(folder).as_posix()}", recursive=False)
 
 
 def import_caches(path: pathlib.Path) -> int:

@@ -5,7 +5,6 @@ exit code.
 import importlib
 import inspect
 import os
-import signal
 import sys
 import traceback
 import warnings
@@ -16,6 +15,7 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder, can_cache
 from congrasp.common.runtime.environment import own_environment
+from congrasp.common.runtime.platforms import BROKEN_PIPE_CODE
 from congrasp.services.cli import suggestions
 from congrasp.services.cli.checks import check_inputs, check_outputs
 from congrasp.services.cli.errors import failure_of
@@ -72,7 +72,7 @@ _NUMPY_WARNINGS = (
     "Degrees of freedom <= 0",
 )
 """Warnings of NumPy that tell a user nothing: commands check their results themselves."""
-UNREAD = 128 + signal.SIGPIPE
+UNREAD = BROKEN_PIPE_CODE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 _REPORT_THEIR_END = ("train", "learner", "actor", "serve", "record", "view")
 """Commands that print or log themselves that a signal stopped them, once they have started."""

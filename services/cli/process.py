@@ -9,6 +9,7 @@ import warnings
 from typing import NoReturn, TextIO
 
 from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.platforms import replace_process
 from congrasp.services.ops.lifetime import SIGNALS
 
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -22,7 +23,7 @@ def prepare_streams() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
@@ -33,7 +34,7 @@ def undo_interpreter_options() -> None:
     """
     if sys.flags.optimize > 1:
         command = [sys.executable, "-m", "congrasp", *sys.argv[1:]]
-        os.execve(sys.executable, command, child_environment())
+        replace_process(command, child_environment())
     if sys.warnoptions:
         sys.warnoptions.clear()
         warnings.resetwarnings()

@@ -204,7 +204,7 @@ def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
     """Yields every page whose tables differ from the results, and its corrected text."""
     results = recorded(root)
     for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         corrected = filled(text, results, path.name)
         if corrected != text:
             yield path, corrected

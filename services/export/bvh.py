@@ -72,7 +72,7 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
         quaternion=f"none: angles, intrinsic {_ORDER}",
     )
     about["frames"] = {name: body.name for name, body in zip(names, motion_bodies, strict=True)}
-    path.with_name(f"{path.name}.json").write_text(json.dumps(about, indent=1))
+    path.with_name(f"{path.name}.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
 
 
 def _angles(rotation: Rotation) -> np.ndarray:

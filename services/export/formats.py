@@ -10,6 +10,7 @@ from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import check_free
 from congrasp.common.io.inputs import file_name
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.runtime import platforms
 
 FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": ""}
 """Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are
@@ -103,7 +104,7 @@ def _move_files(folder: pathlib.Path, path: pathlib.Path, *, force: bool) -> Non
         check_spelling(target)
         check_free(target, force=force)
     for file, target in targets.items():
-        file.replace(target)
+        platforms.replace(file, target)
 
 
 def default_name(motion: Episode, kind: str) -> pathlib.Path:

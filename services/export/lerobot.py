@@ -93,9 +93,9 @@ def write(path: pathlib.Path, motions: Sequence[Episode], *, camera: bool = Fals
     _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
     _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(dataset.tasks))
     urdf = "robot.urdf" if motions[0].arm else "hand.urdf"
-    (path / "meta" / urdf).write_text(robot_urdf(motions[0]))
+    (path / "meta" / urdf).write_text(robot_urdf(motions[0]), encoding="utf-8")
     for name, content in described.items():
-        (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1))
+        (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _dataset(motions: Sequence[Episode]) -> _Dataset:

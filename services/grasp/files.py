@@ -86,7 +86,7 @@ def save_grasp(
 def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
     """The stored result of an earlier grasp with the same key; None if there is none."""
     try:
-        result = json.loads((folder / RESULT).read_text())
+        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     if not isinstance(result, dict) or result.get("key") != key:

@@ -7,11 +7,11 @@ that does not start. The first fatal error in the log is the cause, later ones a
 import os
 import pathlib
 import re
-import resource
 import signal
 from typing import NamedTuple
 
 from congrasp.common.errors import printable
+from congrasp.common.runtime import platforms
 
 _READ = 1 << 20
 """Bytes at the end of a log in which a cause is looked for."""
@@ -29,7 +29,7 @@ _CONSEQUENCES = re.compile(
 )
 """Exceptions of a process that lost another one, or was asked to end."""
 _CRASH = re.compile(r"Fatal Python error|terminate called|panicked at|Check failed|LLVM ERROR")
-_ABORTS = (signal.SIGABRT, signal.SIGSEGV, signal.SIGBUS, signal.SIGTRAP, signal.SIGILL)
+_ABORTS = platforms.signals_named("SIGABRT", "SIGSEGV", "SIGBUS", "SIGTRAP", "SIGILL")
 """Signals by which native code ends a process, for instance when it gets no memory."""
 
 
@@ -129,9 +129,9 @@ def end_of(name: str, code: int, log: str, *, kernel_killed: bool = False) -> st
         reason = cause or last_line(log) or "its log is empty"
         return f"The {name} died (exit code {code}): {reason.rstrip('. ')}.{_limit(cause)}"
     number = signal.Signals(-code)
-    if not cause and number == signal.SIGKILL and kernel_killed:
+    if not cause and number.name == "SIGKILL" and kernel_killed:
         cause = "out of memory (killed by the kernel)"
-    if not cause and number in _ABORTS and _address_space():
+    if not cause and number in _ABORTS and platforms.address_space_limit():
         cause = "probably out of memory"
     if not cause:
         return f"The {name} was killed by {number.name}."
@@ -179,13 +179,7 @@ def _quoted(line: str) -> str:
 
 def _limit(cause: str) -> str:
     """A sentence about the limit of the address space, if there is one and memory is the cause."""
-    limit = _address_space()
+    limit = platforms.address_space_limit()
     if "memory" not in cause or not limit:
         return ""
     return f" Its address space is limited to {limit / 1e9:.1f} GB (ulimit -v)."
-
-
-def _address_space() -> int:
-    """Limit of the address space of this process and its children in bytes; 0 for none."""
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return 0 if soft == resource.RLIM_INFINITY else soft

@@ -3,7 +3,6 @@ end with it.
 """
 
 import contextlib
-import ctypes
 import dataclasses
 import os
 import pathlib
@@ -18,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.opening import open_to_append
+from congrasp.common.runtime import platforms
 from congrasp.common.runtime.environment import child_environment
 from congrasp.services.ops import causes
 
@@ -88,7 +88,7 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
         if interrupt:
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handle) for number in platforms.STOP_SIGNALS}
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     watch = threading.Thread(
         target=_watch_signals, args=(reader, stop, grace, interrupt), daemon=True, name=SIGNALS
@@ -122,7 +122,7 @@ def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, inter
     signals = reader.recv(1)
     if not signals:
         return
-    stop.signal = signals[0]
+    stop.signal = platforms.stop_signal(signals[0])
     stop.set()
     seconds = grace or _default_grace(interrupt)
     deadline = time.monotonic() + seconds
@@ -156,16 +156,10 @@ def _end(code: int) -> None:
 
 
 def follow_parent() -> None:
-    """Makes the kernel send SIGTERM when the parent dies, if the parent requested it (Linux
-    only).
-    """
+    """Makes this process receive SIGTERM when its parent has ended, if that requested it."""
     parent = os.environ.pop(_PARENT, None)
-    if parent is None or not sys.platform.startswith("linux"):
-        return
-    pr_set_pdeathsig = 1
-    ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
-    if os.getppid() != int(parent):
-        os.kill(os.getpid(), signal.SIGTERM)
+    if parent is not None:
+        platforms.terminate_with(int(parent))
 
 
 def command(*words: object, **options: object) -> list[str]:
@@ -231,7 +225,7 @@ class Child:
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 env=environment,
-                start_new_session=True,
+                **platforms.separate_session(),
             )
         _children.add(self.process)  # which a forced end of this process kills as well
         return self.process.pid
@@ -282,7 +276,7 @@ def end_all(children: Sequence[Child]) -> None:
     """
     running = [child.process for child in children if child.process and child.code is None]
     for process in running:
-        process.terminate()
+        platforms.request_end(process)
     wait_for(running, CHILD_GRACE)
     for process in running:
         if process.poll() is None:

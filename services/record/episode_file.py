@@ -6,6 +6,7 @@ import time
 from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.runtime import platforms
 from congrasp.services.record.episode_entries import raw_entry, scene_entries
 from congrasp.services.record.writer import JsonChannels, LogWriter
 
@@ -23,4 +24,4 @@ def save_episode(path: pathlib.Path, actor: str, episode: Episode) -> None:
         raw = raw_entry(actor, episode.to_message(), start)
         writer.write(raw, *scene_entries(actor, episode, start, 0, JsonChannels()))
         writer.close()
-        writer.files[-1].rename(path)
+        platforms.replace(writer.files[-1], path)

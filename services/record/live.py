@@ -6,12 +6,12 @@ import itertools
 import queue
 import secrets
 import socket
-import sys
 import threading
 import time
 from typing import Any
 
 from congrasp.common.errors import PORT_ERRORS, need_package, os_errors_as
+from congrasp.common.runtime import platforms
 from congrasp.common.transport.base import Closing
 from congrasp.services.record.live_gate import LOCAL_HOST, LiveGate
 from congrasp.services.record.writer import Channel, Entry
@@ -182,7 +182,7 @@ def _inside_host() -> str:
     """Address for the server of the SDK, behind the gate: on Linux one of the loopback interface
     that other sites in a browser do not know.
     """
-    if sys.platform != "linux":
+    if not platforms.HAS_LOOPBACK_NETWORK:
         return LOCAL_HOST
     second = secrets.randbelow(254) + 1
     third = secrets.randbelow(256)

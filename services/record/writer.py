@@ -22,6 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.opening import create_new
+from congrasp.common.runtime import platforms
 from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
@@ -346,7 +347,7 @@ class LogWriter:
         with file:
             self._writer.finish()
         final = self._path.with_suffix("")
-        self._path.rename(final)
+        platforms.replace(self._path, final)
         self.files[-1] = final
 
     def abandon(self) -> None:

@@ -14,6 +14,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.pool import load_pool
 from congrasp.common.policy.bundle import policy_spec
+from congrasp.common.runtime import platforms
 from congrasp.common.task.sampling.set_file import SUFFIX as SET_SUFFIX
 from congrasp.common.task.sampling.set_file import load
 from congrasp.common.transport.keys import Keys
@@ -101,7 +102,7 @@ def kept_log(run_dir: pathlib.Path, log: pathlib.Path) -> pathlib.Path:
     if log.parent != run_dir / LOGS:
         return log
     with contextlib.suppress(OSError):
-        return log.replace(target)
+        return platforms.replace(log, target)
     return log
 
 

@@ -12,6 +12,7 @@ from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.opening import temporary_file
 from congrasp.common.io.spelling import check_spelling
+from congrasp.common.runtime import platforms
 from congrasp.services.appearance.palette import INK
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.camera_path import following_cameras
@@ -170,8 +171,9 @@ def save_episode_video(
 
     with (
         os_errors_as(f"{path} could not be written"),
-        temporary_file(path, path.suffix) as (unfinished, _),
+        temporary_file(path, path.suffix) as (unfinished, file),
     ):
         check_spelling(path)
+        file.close()
         save_video(unfinished, frames(), film.size, film.fps)
-        unfinished.replace(path)
+        platforms.replace(unfinished, path)

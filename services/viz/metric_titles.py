@@ -37,7 +37,7 @@ def _titles_of_constraints() -> Iterator[tuple[str, tuple[str, str]]]:
 
 
 TITLES = {
-    **json.loads(pathlib.Path(__file__).with_name("titles.json").read_text()),
+    **json.loads(pathlib.Path(__file__).with_name("titles.json").read_text(encoding="utf-8")),
     f"episode/{DIVERGED}": ("Diverged physics", "share of episodes"),
     **dict(_titles_of_constraints()),
 }

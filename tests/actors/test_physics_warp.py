@@ -197,7 +197,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
     from congrasp.actors.physics.warp_build import one_builder
 
     program = (
-        "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); "
+        "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); "
         "print(flush=True); input()"
     )
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.runtime import platforms
 from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
@@ -553,10 +554,8 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
 ):
     """Zenoh panics in a process that has no file left."""
     limits = [(1024, hard)]
-    monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: limits[-1])
-    monkeypatch.setattr(
-        zenoh_session.resource, "setrlimit", lambda kind, limit: limits.append(limit)
-    )
+    monkeypatch.setattr(platforms.resource, "getrlimit", lambda kind: limits[-1])
+    monkeypatch.setattr(platforms.resource, "setrlimit", lambda kind, limit: limits.append(limit))
     monkeypatch.setattr(
         zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__)
     )
@@ -571,21 +570,3 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
     assert taken == [files // 4, min(1000, files // 4)]
     assert limits[-1] == (files, hard)
     assert [record.args for record in caplog.records] == [(files, files // 4, 16_384)] * warnings
-
-
-def test_another_user_s_file_in_the_temporary_folder_takes_no_port_away(tmp_path):
-    (
-        tmp_path / f"congrasp-ports-{os.getuid()}"
-    ).mkdir()  # what cannot be opened, as another user's file
-    script = (
-        "from congrasp.common.transport.ports import free_port; print(free_port(), free_port())"
-    )
-    environment = {name: text for name, text in os.environ.items() if name != "XDG_RUNTIME_DIR"}
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**environment, "TMPDIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-    )
-    first, second = done.stdout.split()
-    assert first != second, done.stderr

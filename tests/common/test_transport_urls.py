@@ -183,15 +183,10 @@ for line in sys.stdin:
 """
 
 
-def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
+def test_no_port_is_given_twice_while_its_process_lives():
     # Above those that other tests take
     script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))
-    # And locks of its own
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "TMPDIR": str(tmp_path),
-    }
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
     def taker():
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -161,7 +161,7 @@ def test_one_learner_at_a_time_until_it_dies(run):
         assert other.wait() == -signal.SIGKILL
     continue_run(folder, dataclasses.replace(config, updates=9))
     with exclusive(folder) as check:
-        assert (folder / "lock").read_text() == str(os.getpid())
+        assert (folder / "lock").read_text().strip() == str(os.getpid())
         (folder / "lock").unlink()
         check()  # reading the file here would release its lock
         with subprocess.Popen(

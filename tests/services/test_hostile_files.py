@@ -128,6 +128,9 @@ def test_names_are_names(name):
         "a\n",
         "a\0",
         "x" * 101,
+        "aux",
+        "Com1.obj",
+        "mug.",
         None,
         3,
         ["a"],
@@ -144,6 +147,9 @@ def test_letters_of_any_script_stay_in_names_and_equal_names_become_distinct():
         ("e\u0301", "é"),
         ("..\x1b[1m", "1m"),
         ("☕", "object"),
+        ("con", "con_"),
+        ("Aux.v1", "Aux_.v1"),
+        ("mug..", "mug_"),
     ):
         assert safe_name(text) == name
         file_name(name, "an object")

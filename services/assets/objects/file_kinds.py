@@ -101,7 +101,7 @@ def _foreign_kind(text: bytes, data: bytes) -> tuple[str, str] | None:
         except (OSError, zipfile.BadZipFile):
             return "a zip archive that is damaged", "Download it again."
         searched = "".join(f"{name}\n" for name in archived).lower().encode()
-    for group in tomllib.loads(_SIGNATURES.read_text())["group"]:
+    for group in tomllib.loads(_SIGNATURES.read_text(encoding="utf-8"))["group"]:
         for signature in group["files"]:
             if _matches(signature, text, searched):
                 return signature["what"], group["remedy"]

@@ -90,7 +90,7 @@ TABLES = {
 def paper_lines() -> tuple[PaperLine, ...]:
     """Returns every line of the paper's tables, in its order."""
     lines = []
-    for row in json.loads(pathlib.Path(__file__).with_suffix(".json").read_text()):
+    for row in json.loads(pathlib.Path(__file__).with_suffix(".json").read_text(encoding="utf-8")):
         figures = PaperRow(row.pop("success"), row.pop("errors"))
         lines.append(PaperLine(figures=figures, **row))
     return tuple(lines)
