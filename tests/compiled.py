@@ -18,7 +18,8 @@ class Compiled:
     """
 
     def __init__(self, module: types.ModuleType, *given: Any):
-        self._module, self._given = module, given
+        self._module = module
+        self._given = given
 
     def __getattr__(self, name: str) -> Any:
         found = jax.jit(functools.partial(getattr(self._module, name), *self._given))

@@ -41,7 +41,8 @@ def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:
     reach = np.repeat([3.0, 150.0], count // 2)[:, None]
     drawn = np.asarray(known.mean) + reach * spread * rng.normal(size=(count, len(spread)))
     names = gated(bundle.spec.layout)
-    start, mask = 0, rng.integers(0, 2, (count, len(names)))
+    start = 0
+    mask = rng.integers(0, 2, (count, len(names)))
     for name, size in bundle.spec.layout:
         block = slice(start, start + size)
         start += size

@@ -24,7 +24,10 @@ class Reduced:
     """An object of a name, its arguments and its state."""
 
     def __init__(self, name: str, arguments: tuple = (), state: Any = None, *, new: bool = False):
-        self.name, self.arguments, self.state, self.new = Global(name), arguments, state, new
+        self.name = Global(name)
+        self.arguments = arguments
+        self.state = state
+        self.new = new
 
 
 def dumps(value: Any) -> bytes:
@@ -93,7 +96,8 @@ def skeleton() -> tuple[np.ndarray, np.ndarray]:
     """
     hand = get_hand("human")
     links = {link.name: link for link in hand.links}
-    joints, tips = [np.zeros(3)], []
+    joints = [np.zeros(3)]
+    tips = []
     for finger in MANO_FINGERS:
         names = (
             ("metacarpal", "proximal", "distal")
@@ -114,7 +118,8 @@ def content(seed: int = 0) -> dict[str, Any]:
     vertices = rng.normal(0.0, 0.03, (778, 3))
     joints, tips = skeleton()
     free = [i for i in range(778) if i not in TIP_VERTICES.values()][:16]
-    vertices[free], vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]] = joints, tips
+    vertices[free] = joints
+    vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]] = tips
     regressor = np.zeros((16, 778))
     regressor[np.arange(16), free] = 1.0
     directions = rng.normal(0.0, 1e-3, (778, 3, 20))

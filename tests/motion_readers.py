@@ -44,8 +44,10 @@ def read_glb(path: pathlib.Path) -> list[Track]:
     """
     content = path.read_bytes()
     size = int.from_bytes(content[12:16], "little")
-    document, blob = json.loads(content[20 : 20 + size]), content[28 + size :]
-    nodes, (animation,) = document["nodes"], document["animations"]
+    document = json.loads(content[20 : 20 + size])
+    blob = content[28 + size :]
+    nodes = document["nodes"]
+    (animation,) = document["animations"]
 
     def values(index: int) -> np.ndarray:
         accessor = document["accessors"][index]
@@ -87,10 +89,8 @@ def read_glb(path: pathlib.Path) -> list[Track]:
 def read_usd(path: pathlib.Path) -> list[Track]:
     """Transforms and meshes as Pixar's library composes them."""
     stage = Usd.Stage.Open(str(path))
-    assert (
-        UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-        and UsdGeom.GetStageMetersPerUnit(stage) == 1
-    )
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     codes = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
     caches = [UsdGeom.XformCache(code) for code in codes]
     poses: dict[str, np.ndarray] = {}
@@ -154,7 +154,8 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
 
     for name in trees[0]:
         visit(name)
-    (trajectory,), (wrist,) = messages["/joint_trajectory"], messages["/wrist_trajectory"]
+    (trajectory,) = messages["/joint_trajectory"]
+    (wrist,) = messages["/wrist_trajectory"]
     angles = dict(
         zip(
             trajectory.joint_names,
@@ -162,10 +163,8 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
             strict=True,
         )
     )
-    palm, urdf = (
-        _transforms([p.transforms[0] for p in wrist.points]),
-        messages["/robot_description"][0].data,
-    )
+    palm = _transforms([p.transforms[0] for p in wrist.points])
+    urdf = messages["/robot_description"][0].data
     root = ET.fromstring(urdf)[0].attrib["name"]
     described = forward_kinematics(urdf, angles, palm, wrist.joint_names[0], tf[root])
     poses = {name: described.get(name, tf[name]) for name in tf}

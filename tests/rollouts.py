@@ -15,7 +15,8 @@ from congrasp.learner.hub.queue import RolloutContract, RolloutQueue
 from congrasp.learner.hub.staleness import StalenessManager
 
 FORM = RolloutForm(steps=20, worlds=16, observation=32, action=4, half=True)
-RUN_ID, SCHEMA = "e", "s"
+RUN_ID = "e"
+SCHEMA = "s"
 
 
 def rollout(value: float = 0.0, form: RolloutForm = FORM, **meta: Any) -> Message:

@@ -27,7 +27,10 @@ from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")
-F, L, N, K = len(HAND.joints), len(HAND.links), 64, 15
+F = len(HAND.joints)
+L = len(HAND.links)
+N = 64
+K = 15
 
 
 def quaternions(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -148,7 +151,8 @@ def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
         quaternions = np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
         return points.astype(np.float32), quaternions.astype(np.float32)
 
-    (pose, pose_turn), (way, way_turn) = near(1), near(K)
+    pose, pose_turn = near(1)
+    way, way_turn = near(K)
     goal = goal.replace("heading", position=pose[:, 0])
     goal = goal.replace("pose", position=pose[:, 0], quaternion=pose_turn[:, 0])
     return goal.replace("trajectory", position=way, quaternion=way_turn)

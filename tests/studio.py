@@ -28,7 +28,8 @@ from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode, episode_message
 
-STEPS, REMOVAL = 60, 40
+STEPS = 60
+REMOVAL = 40
 DIP = 30
 """The update at which the fake curve dips."""
 BEGIN = 1_700_000_000.0
@@ -39,7 +40,8 @@ class FakePolicy:
     """Answers every request with the fake episode, after a report of progress."""
 
     def __init__(self) -> None:
-        self.hand, self.task = get_hand("human"), TaskConfig()
+        self.hand = get_hand("human")
+        self.task = TaskConfig()
         self.asked: list[tuple[GraspObject, GraspRequest, Phases]] = []
         self.fails = ""
 
@@ -136,7 +138,9 @@ def metrics(update: int) -> Message:
 
 def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
     """Training window of a run with many actors after some updates."""
-    made, keys, now = TrainingWindow("fake"), Keys("fake"), time.time()
+    made = TrainingWindow("fake")
+    keys = Keys("fake")
+    now = time.time()
     for update in range(updates):
         made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
     made.take_status(status(actors), now)
@@ -151,9 +155,12 @@ def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
 
 def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     """Recordings of episodes: times (s since 1970) and numbers of actors."""
-    writer, channels = LogWriter(folder, "log", run="fake"), JsonChannels()
+    writer = LogWriter(folder, "log", run="fake")
+    channels = JsonChannels()
     for when, number in moments:
-        actor, message, start = f"a{number:03d}", actor_episode(number), int(1e9 * when)
+        actor = f"a{number:03d}"
+        message = actor_episode(number)
+        start = int(1e9 * when)
         shown = scene_entries(actor, Episode.from_message(message), start, 0, channels)
         writer.write(raw_entry(actor, message, start), *shown)
     writer.close()

@@ -32,7 +32,8 @@ from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import Array
 from congrasp.services.train.command import untrained
 
-HAND, TASK = get_hand("human"), TaskConfig()
+HAND = get_hand("human")
+TASK = TaskConfig()
 OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
 BATCH = 8
 CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
@@ -79,7 +80,8 @@ def warp_engine(objects: Sequence[GraspObject], **options: Any) -> Physics:
 def start_of(**fields: Any) -> ResetState:
     """An environment that starts with what is given: else a free object of its own mass at the
     origin, and the open hand at the world's pose."""
-    level, place = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), np.zeros((1, 3), np.float32)
+    level = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
+    place = np.zeros((1, 3), np.float32)
     neutral = {
         **dict.fromkeys(("mass_scale", "friction", "gain_scale"), np.ones(1, np.float32)),
         **dict.fromkeys(("base_position", "object_position"), place),
@@ -103,7 +105,9 @@ def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.n
     the noise.
     """
     mean = np.zeros(len(HAND.motors) + 7, np.float32)
-    mean[: len(HAND.motors)], mean[len(HAND.motors) + 2], mean[-1] = fingers, lift, noise
+    mean[: len(HAND.motors)] = fingers
+    mean[len(HAND.motors) + 2] = lift
+    mean[-1] = noise
     return mean
 
 

@@ -53,7 +53,8 @@ def test_every_public_name_is_there_and_documented():
     assert dir(congrasp) == sorted(congrasp.__all__)
     for name in congrasp.__all__:
         found = getattr(congrasp, name)
-        assert found.__name__ == name and inspect.getdoc(found)
+        assert found.__name__ == name
+        assert inspect.getdoc(found)
     with pytest.raises(AttributeError, match="no attribute 'grab'"):
         congrasp.grab  # noqa: B018
 
@@ -97,7 +98,9 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     mesh = tmp_path / "block.stl"
     trimesh.creation.box((0.05, 0.06, 0.14)).export(mesh)
     found = congrasp.grasp(mesh, heading=(0, 0, -1), attempts=4)
-    assert isinstance(found, congrasp.Grasp) and 1 <= found.held <= found.attempts and found.success
+    assert isinstance(found, congrasp.Grasp)
+    assert 1 <= found.held <= found.attempts
+    assert found.success
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     congrasp.save_motion(str(tmp_path / "block.npz"), found.motion)
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"

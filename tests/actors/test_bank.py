@@ -67,7 +67,8 @@ def test_normals_belong_to_the_points_of_their_object(bank):
 
 def test_references_with_fingers_in_the_table_are_not_valid():
     """From above, the lowest finger a centimetre over the table and a centimetre in it."""
-    q, down = jnp.zeros((1, F)), pointing(-1.0)
+    q = jnp.zeros((1, F))
+    down = pointing(-1.0)
     ends = ends_of(q)
     height = rotations.rotate(jnp.broadcast_to(down, (len(ends), 4)), ends)[:, 2]
     reach = float(jnp.max(np.repeat(HAND.capsule_radii, 2) - height))
@@ -103,8 +104,10 @@ def test_a_task_that_draws_no_references_gets_none_and_the_same_headings():
     )
     assert not np.any(own.pose_valid)
     for name in SHARED:
-        got, whole = np.asarray(getattr(own, name)), np.asarray(getattr(suite.bank(), name))
-        assert (got.shape, got.dtype) == (whole.shape, whole.dtype), name
+        got = np.asarray(getattr(own, name))
+        whole = np.asarray(getattr(suite.bank(), name))
+        assert got.shape == whole.shape, name
+        assert got.dtype == whole.dtype, name
         if not name.startswith(("pose", "trajectory")):
             np.testing.assert_array_equal(got, whole, err_msg=name)
 
@@ -120,7 +123,8 @@ def _grasps(angle: float, count: int = 4) -> Grasps:
     """Grasps of the graspable region of the second object from straight above, of which `count`
     were found.
     """
-    second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
+    second = jnp.ones(4, int)
+    above = jnp.array([[0.0, 0.0, 0.2]] * 4)
     return Grasps(
         jnp.arange(4) < count,
         second,
@@ -132,14 +136,16 @@ def _grasps(angle: float, count: int = 4) -> Grasps:
 
 
 def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
-    grasp, key = _grasps(0.123, 1), jax.random.key(1)
+    grasp = _grasps(0.123, 1)
+    key = jax.random.key(1)
     used = lying._replace(pose_valid=lying.pose_valid.at[1, 1, :, 7].set(False))
     new = renew(HAND, TASK, used, grasp, key)
     # Where there was none to use
     assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]
     new = renew(HAND, TASK, lying, grasp, key)
     changed = np.asarray((new.pose_q != lying.pose_q).any(-1))
-    assert changed[1, 1].sum() == 1 and changed.sum() == 1
+    assert changed[1, 1].sum() == 1
+    assert changed.sum() == 1
     (slot,) = np.flatnonzero(changed[1, 1])
     np.testing.assert_allclose(new.pose_q[1, 1, slot], 0.123)
     np.testing.assert_allclose(new.trajectory_position[1, 1, slot, -1], [0, 0, 0.2], atol=2e-3)
@@ -163,7 +169,8 @@ def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(lying)
     np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
     assert np.asarray(now.grasps).tolist() == [[0, 0], [0, 256]]
     ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
-    assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
+    assert np.ptp(ages) > 24
+    assert 1 <= (ages < 32).sum() <= 9
 
 
 def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):

@@ -31,7 +31,8 @@ from tests.task import HAND
 
 TASK = dataclasses.replace(suite.TASK, surface_points=16)
 """Surfaces of two points each, in which most of the time would go."""
-BATCH, M = 2000, 6
+BATCH = 2000
+M = 6
 
 
 def _bank(valid: np.ndarray) -> ConstraintBank:
@@ -130,7 +131,8 @@ def _drawn(
 
 def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside_an_affordance():
     active, _, trajectory = _drawn(TASK)
-    both, alone = active["trajectory"] & active["region"], active["trajectory"] & ~active["region"]
+    both = active["trajectory"] & active["region"]
+    alone = active["trajectory"] & ~active["region"]
     assert set(trajectory[both]) == {3, 4, 5}
     assert set(trajectory[alone]) == set(range(M))
     assert 0.2 < both.mean() < 0.3
@@ -142,15 +144,18 @@ def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
     """
     task = dataclasses.replace(TASK, disturbed_references=1.0)
     drawn = jax.device_get(_sample(task, _bank(np.ones(M, bool)), 0.0))
-    region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
+    region = np.asarray(drawn.region) == 1
+    on = np.asarray(drawn.goal.active["trajectory"])
     end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
     both = region & on
     assert (end[both, 0] > 0).all()
     # Those that would have contradicted it are as they were; the rest, and those without
     # affordance, are disturbed.
     exact = np.isclose(end[:, 0], 0.005, atol=1e-6) & np.isclose(end[:, 1], 0.0, atol=1e-9)
-    assert 0.02 < exact[both].mean() < 0.2 and not exact[on & ~region].any()
-    assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
+    assert 0.02 < exact[both].mean() < 0.2
+    assert not exact[on & ~region].any()
+    assert end[both, 1].std() > 0.003
+    assert (end[on & ~region, 0] < 0).any()
 
 
 @pytest.mark.parametrize("share", [0.6, 1.0])
@@ -173,7 +178,8 @@ def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
 @pytest.mark.parametrize("together", [0.0, 1.0])
 def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn(together):
     active, pose, trajectory = _drawn(TASK, (0, 1, 2), together=together)
-    assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
+    assert not (active["trajectory"] & active["region"]).any()
+    assert active["affordance"].any()
     assert set(pose[active["pose_finger"] & active["region"]]) == {0, 1, 2}
     assert set(trajectory[active["trajectory"]]) == {0, 1, 2}
 

@@ -22,7 +22,8 @@ class Learner:
     """Answers as told, and remembers what it was asked."""
 
     def __init__(self, hub, *, run_id="e", session_id="1"):
-        self.hub, self.transport = hub, MemoryTransport(hub)
+        self.hub = hub
+        self.transport = MemoryTransport(hub)
         self.state = {"version": 0, "run_id": run_id, "session_id": session_id, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
@@ -98,7 +99,8 @@ def joined(ends):
     hub, make = ends
 
     def join(**options):
-        learner, link = Learner(hub), make(**options)
+        learner = Learner(hub)
+        link = make(**options)
         link.config(60)
         return learner, link
 
@@ -120,7 +122,8 @@ def test_config_waits_for_a_learner(ends):
 
 def test_identity_is_added_and_counts(ends):
     hub, make = ends
-    learner, link = Learner(hub), make()
+    learner = Learner(hub)
+    link = make()
     with pytest.raises(CongraspError, match="no configuration"):
         link.upload(rollout(), TICKET)
     link.config(60)
@@ -146,8 +149,10 @@ def test_tickets_are_waited_for_and_asked_for_under_one_id(joined):
     assert len(learner.tickets) >= 2
     learner.granted = True
     learner.state["version"] = 7
-    first, second = link.acquire_ticket(60), link.acquire_ticket(5)
-    assert first.version == 7 and first.id != second.id
+    first = link.acquire_ticket(60)
+    second = link.acquire_ticket(5)
+    assert first.version == 7
+    assert first.id != second.id
     assert {meta["ticket"] for meta in learner.tickets} == {first.id, second.id}
     link.give_back(second)
     assert learner.tickets[-1] == {
@@ -179,7 +184,8 @@ def test_weights_are_pulled_only_when_there_are_others(joined):
     assert learner.pulls == 1
     learner.announce(version=1)
     assert eventually(lambda: link.weights(0)).meta["version"] == 1
-    assert link.weights(1) is None and learner.pulls == 2
+    assert link.weights(1) is None
+    assert learner.pulls == 2
     learner.state["version"] = 2  # its announcement is lost; a ticket tells as well
     assert link.weights(1) is None
     link.acquire_ticket(60)
@@ -195,7 +201,8 @@ def test_rollout_is_sent_under_one_identity_until_it_is_answered(joined):
     learner, link = joined()
     learner.outcomes = ["retry", RuntimeError("bug"), "retry", "duplicate"]
     assert link.upload(rollout(), TICKET).result(60) == "duplicate"
-    assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
+    assert len({id(message) for message in learner.received}) == 1
+    assert len(learner.received) == 4
 
 
 @pytest.mark.parametrize("by", ["ticket", "weights", "announcement"])
@@ -225,7 +232,8 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(joined):
     )
     third.start()
     third.join(0.3)
-    assert third.is_alive() and len(learner.received) == 2
+    assert third.is_alive()
+    assert len(learner.received) == 2
     assert link.flush(0.05) is False
     gate.set()
     third.join(5)
@@ -277,7 +285,8 @@ def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch,
     for _ in range(3):
         assert link.acquire_ticket(0.3) is None
     Learner(learner.hub, session_id="2")
-    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
+    assert outcome.result(60) == "accepted"
+    assert link.acquire_ticket(60)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
 
@@ -293,7 +302,8 @@ def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joine
     assert link.acquire_ticket(0.2) is None
     assert not outcome.done()
     Learner(learner.hub, session_id="2")
-    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
+    assert outcome.result(60) == "accepted"
+    assert link.acquire_ticket(60)
 
 
 def test_learner_that_talks_nonsense_ends_the_link(joined):

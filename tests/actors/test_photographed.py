@@ -58,7 +58,8 @@ def running():
 
 def test_the_true_pose_changes_neither_observation_nor_targets(running):
     worker, _ = running
-    env, state = worker.env, worker.state
+    env = worker.env
+    state = worker.state
     physics_state = worker.physics.read(None)
     moved = physics_state._replace(
         object_position=physics_state.object_position + 0.3,
@@ -79,7 +80,8 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
             scene, TASK.control, jnp.ones((BATCH, len(HAND.motors) + 6))
         )
 
-    (before, targets), (after, others) = shown(state, physics_state), shown(away, moved)
+    before, targets = shown(state, physics_state)
+    after, others = shown(away, moved)
     np.testing.assert_array_equal(before, after)
     for one, other in zip(targets, others, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -91,11 +93,10 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
 
 def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     worker, rollout = running
-    state, trace = worker.state, rollout.trace
-    points, turn = (
-        np.asarray(state.sensing.sensor.cloud.points),
-        np.asarray(trace.object_quaternion),
-    )
+    state = worker.state
+    trace = rollout.trace
+    points = np.asarray(state.sensing.sensor.cloud.points)
+    turn = np.asarray(trace.object_quaternion)
     surface = np.asarray(state.surface.points)
     ages = []
     for age in range(5):  # an image is at most 5 control steps old
@@ -121,7 +122,8 @@ def test_teacher_and_critic_see_the_true_state(running):
     full = dataclasses.replace(TASK, observation="full")
     size = sum(size for _, size in observation.layout(HAND, full))
     names = [name for name, _ in observation.layout(HAND, full)]
-    assert "cloud" not in names and rollout.teacher_observation.shape[-1] > size
+    assert "cloud" not in names
+    assert rollout.teacher_observation.shape[-1] > size
     assert rollout.privileged.shape[-1] == sum(size for _, size in privileged.layout(HAND, TASK))
     described = {field.name for block in observation.fields(HAND, TASK).values() for field in block}
     assert (

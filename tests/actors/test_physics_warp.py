@@ -131,8 +131,11 @@ def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(s
     """One control step by JAX and three repeats are four control steps with the same targets; and
     nobody notices.
     """
-    physics, batch = warp_engine(OBJECTS), len(OBJECTS)
-    target, table, step = jnp.asarray(grasp(start, 5)), jnp.ones(batch, bool), jax.jit(physics.step)
+    physics = warp_engine(OBJECTS)
+    batch = len(OBJECTS)
+    target = jnp.asarray(grasp(start, 5))
+    table = jnp.ones(batch, bool)
+    step = jax.jit(physics.step)
     first, _ = step(physics.start(start), target, table)
     before = jax.tree.map(np.array, first)
     physics.repeat(batch, 3)
@@ -150,7 +153,9 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
     """Of those that MuJoCo Warp launches; JAX's call is a module without kernels."""
     import warp as wp  # takes seconds in every worker
 
-    physics, loaded, load = warp_engine(OBJECTS), set(), wp._src.context.Module.load
+    physics = warp_engine(OBJECTS)
+    loaded = set()
+    load = wp._src.context.Module.load
 
     def noted(module, device, block_dim=None, **options):
         loaded.add((module.name, block_dim))
@@ -184,9 +189,8 @@ def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends
     few, many = (
         [module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1)
     )
-    assert len(many) > 40 and many[0].startswith("_nxn_broadphase"), (
-        "the first are those that are queried"
-    )
+    assert len(many) > 40, "the first are those that are queried"
+    assert many[0].startswith("_nxn_broadphase"), "the first are those that are queried"
     assert all(name.startswith("_nxn_broadphase") for name in {*few} ^ {*many})
 
 
@@ -268,7 +272,8 @@ def test_rows_are_what_mujoco_compiles():
 
 def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, start):
     warp = warp_engine(OBJECTS)
-    step, table = jax.jit(warp.step), jnp.ones(4, bool)
+    step = jax.jit(warp.step)
+    table = jnp.ones(4, bool)
     state = warp.start(start)
     for i in range(5):
         state, _ = step(state, jnp.asarray(grasp(start, i)), table)
@@ -288,7 +293,8 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
     *_, (x, y, _) = side_by_side(native(OBJECTS), step, mixed, started, targets)
     assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
     for name in ("contact_force", "object_position", "q"):
-        given, expected = getattr(y, name)[mask], getattr(x, name)[mask]
+        given = getattr(y, name)[mask]
+        expected = getattr(x, name)[mask]
         np.testing.assert_allclose(
             given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
         )
@@ -299,9 +305,13 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
 def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     native, start, others
 ):
-    warp, untouched = warp_engine(OBJECTS), warp_engine(OBJECTS)
-    step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
-    state, expected = warp.start(start), untouched.start(start)
+    warp = warp_engine(OBJECTS)
+    untouched = warp_engine(OBJECTS)
+    step = jax.jit(warp.step)
+    step_untouched = jax.jit(untouched.step)
+    table = jnp.ones(4, bool)
+    state = warp.start(start)
+    expected = untouched.start(start)
     for i in range(30):
         target = jnp.asarray(grasp(start, i))
         if i in (10, 20):
@@ -327,7 +337,8 @@ def test_a_compiled_loop_is_the_same_as_single_steps(start):
     """Resets in a branch, two loops after one another, and states that are used twice."""
     warp = warp_engine(OBJECTS)
     targets = jnp.stack([jnp.asarray(grasp(start, i)) for i in range(8, 20)])
-    table, swapped = jnp.ones(4, bool), _picked(start, [2, 3, 0, 1])
+    table = jnp.ones(4, bool)
+    swapped = _picked(start, [2, 3, 0, 1])
 
     def advance(state, row):
         i, target = row
@@ -352,7 +363,8 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
     warp = warp_engine([sheet])
-    step, occupancy = jax.jit(warp.step), []
+    step = jax.jit(warp.step)
+    occupancy = []
     for batch in (1, 2):
         flat = _picked(start, [0] * batch)._replace(
             object_position=jnp.tile(jnp.array([0.0, 0.0, 0.0003]), (batch, 1)),
@@ -366,7 +378,8 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
 def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(start):
     warp = warp_engine(OBJECTS)
     first = warp.start(start)
-    target, table = jnp.asarray(grasp(start, 0)), jnp.ones(4, bool)
+    target = jnp.asarray(grasp(start, 0))
+    table = jnp.ones(4, bool)
     state, _ = warp.step(first, target, table)
     _, expected = warp.step(state, target, table)
     state, after = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
@@ -384,7 +397,8 @@ def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
         CONTACTS_PER_ENVIRONMENT,
     )
 
-    warp, engine = warp_engine(OBJECTS), native(OBJECTS)
+    warp = warp_engine(OBJECTS)
+    engine = native(OBJECTS)
     targets = [grasp(start, i) for i in range(5)]
     for _, after, _ in side_by_side(engine, warp.step, start, warp.start(start), targets):
         found = [
@@ -434,7 +448,8 @@ def test_more_pieces_than_slots_are_one_clear_line(start):
 @pytest.mark.slow
 def test_an_engine_uses_its_own_ranks_device():
     """Two processes of one job: JAX counts the devices of both."""
-    port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    port = free_port()
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "tests.actors.rank_engine"]
     ranks = [
         subprocess.Popen(

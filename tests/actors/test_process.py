@@ -36,7 +36,8 @@ from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.hub.staleness import StalenessManager
 from tests.rollouts import learner_hub
 
-T, B = 5, 3
+T = 5
+B = 3
 CONFIG = RunConfig(
     name="t",
     environments=B,
@@ -129,14 +130,16 @@ def heard(monkeypatch):
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
         invented = types.SimpleNamespace(weight=np.ones(len(objects)))
         found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
-        numbers, prepared = [], []
+        numbers = []
+        prepared = []
         monkeypatch.setattr(
             process, "prepare_physics", lambda *engine: prepared.append(len(numbers))
         )
         monkeypatch.setattr(
             process, "training_set", lambda hand, config, number: numbers.append(number) or found
         )
-        broker, stop = MemoryHub(), threading.Event()
+        broker = MemoryHub()
+        stop = threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
             hub, rollouts = learner_hub(
@@ -216,9 +219,8 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]
-    assert "heading_rad" not in episode and episode["heading_m"] == FIELDS.index(
-        "episode/heading_m"
-    )
+    assert "heading_rad" not in episode
+    assert episode["heading_m"] == FIELDS.index("episode/heading_m")
     for message in logs.values():
         # A number that JSON has not would be an error here, and the end of the actor
         encode(message)
@@ -250,7 +252,8 @@ def test_objects_that_fall_sometimes_are_drawn_more_often_where_the_run_says_so(
     )
     _, logs = heard(invented(episodes), config)
     box, mug = InventedWorker.weights[0]
-    assert 1.0 < box <= 2.0 and 0.5 <= mug < 1.0
+    assert 1.0 < box <= 2.0
+    assert 0.5 <= mug < 1.0
     values = logs["metrics"].meta["values"]
     # One of three fell, with the weight of five episodes beside those of each family.
     assert values["failure/box"] == pytest.approx((1 + 5 / 3) / 7)
@@ -283,7 +286,8 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     assert follower.add(rollout(8, 9, 0, ended=[1]), None, state("next", 3), due=True) is None
     assert follower.add(rollout(1, 2, 3), None, state("none"), due=False) is None
     found = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
-    assert (found.goal, found.object_index) == ("next", 3)
+    assert found.goal == "next"
+    assert found.object_index == 3
     assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
     # It follows nothing then, until one is due again.
     assert (
@@ -293,7 +297,9 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     found = follower.add(
         rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True
     )
-    assert (found.goal, found.object_index, len(found.trace.q)) == ("fresh", 2, 6)
+    assert found.goal == "fresh"
+    assert found.object_index == 2
+    assert len(found.trace.q) == 6
     # What a rollout says of its last episode is not said of another.
     assert (
         follower.add(rollout(0, 1, 0, 1, 2, ended=[1, 4]), state("fresh"), state("none"), due=True)

@@ -69,10 +69,10 @@ def test_the_lift_is_of_15_cm_at_30_cm_a_second():
 @given(st.floats(0.005, 0.5))
 def test_every_lift_is_smooth_and_ends_where_it_should(height):
     found = frames(height)
-    assert found.height[-1] == pytest.approx(height, abs=1e-5) and abs(found.speed[-1]) < 1e-4
-    assert (
-        found.speed.max() <= protocols.LIFT_SPEED + 1e-5 and (np.diff(found.height) > -1e-6).all()
-    )
+    assert found.height[-1] == pytest.approx(height, abs=1e-5)
+    assert abs(found.speed[-1]) < 1e-4
+    assert found.speed.max() <= protocols.LIFT_SPEED + 1e-5
+    assert (np.diff(found.height) > -1e-6).all()
     assert (
         np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
     )
@@ -88,8 +88,10 @@ _push = jax.jit(
 
 
 def test_pushes_follow_one_another_along_the_axes_of_the_world():
-    steps, first = protocols.push_steps(TASK), TASK.approach_steps + protocols.lift_steps(TASK)
-    index, scale = np.array([1]), np.array([1.5], np.float32)
+    steps = protocols.push_steps(TASK)
+    first = TASK.approach_steps + protocols.lift_steps(TASK)
+    index = np.array([1])
+    scale = np.array([1.5], np.float32)
     forces = [
         np.asarray(_push(protocol(masses=(0.2, 0.4)), np.float32([time]), index, scale))[0]
         for time in [
@@ -170,10 +172,8 @@ def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
 def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
     monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
-    physics, force = (
-        make_physics("jax", HAND, TASK, OBJECTS, threads=1),
-        np.random.default_rng(0).normal(size=(BATCH, 3)).astype(np.float32),
-    )
+    physics = make_physics("jax", HAND, TASK, OBJECTS, threads=1)
+    force = np.random.default_rng(0).normal(size=(BATCH, 3)).astype(np.float32)
     state = physics.start(start().reset_state)
     target = np.zeros((BATCH, 6 + len(HAND.joints)), np.float32)
     pushed, _ = jax.jit(physics.step)(state, target, np.zeros(BATCH, bool), force)
@@ -267,9 +267,11 @@ def test_pushes_reach_the_object_through_the_environment():
 
 def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypatch):
     monkeypatch.setattr(protocols, "PUSH_SECONDS", 0.05)
-    steps, after = TASK.approach_steps + TASK.hold_steps, protocols.stress_steps(TASK)
+    steps = TASK.approach_steps + TASK.hold_steps
+    after = protocols.stress_steps(TASK)
     plain = suite.worker(renewed=False)
-    conditions, acts = suite.episodes(BATCH), suite.command(fingers=0.5)
+    conditions = suite.episodes(BATCH)
+    acts = suite.command(fingers=0.5)
     plain.begin(conditions)
     ended, measured = (
         under(protocols.stress(TASK, OBJECTS, TASK.hold_steps), conditions) for _ in range(2)
@@ -277,7 +279,9 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypa
     measured.state = measured.state._replace(after=jnp.full_like(measured.state.after, after))
     bare, one, other = (each.collect(acts, steps) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.observation, other.observation)
-    assert one.has_episode.all() and one.terminal[-1].all() and other.has_episode.all()
+    assert one.has_episode.all()
+    assert one.terminal[-1].all()
+    assert other.has_episode.all()
     np.testing.assert_array_equal(one.episodes, other.episodes)
     # A program without the probe may round otherwise, and what is left of two lengths is as wrong
     # as these are.
@@ -285,16 +289,16 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypa
     assert not other.terminal.any()
     rest = measured.collect(acts, after)
     np.testing.assert_array_equal(rest.episodes, one.episodes)
-    assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
+    assert not rest.has_episode.any()
+    assert rest.terminal[-1].all()
+    assert not rest.terminal[:-1].any()
     samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed.sample, rest.probed.sample)
     found = protocols.assess(samples, np.ones(BATCH, bool), TASK, TASK.hold_steps)
-    assert set(found) == WITHOUT_MESHES and all(
-        np.isfinite(value).all() for value in found.values()
-    )
+    assert set(found) == WITHOUT_MESHES
+    assert all(np.isfinite(value).all() for value in found.values())
     short = protocols.assess(other.probed.sample, np.ones(BATCH, bool), TASK, TASK.hold_steps)
-    assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(
-        found["wrist_speed"]
-    )
+    assert np.isnan(short["push_survival"]).all()
+    assert short["wrist_speed"] == pytest.approx(found["wrist_speed"])
     for each in (plain, ended, measured):
         each.physics.close()
 
@@ -304,7 +308,8 @@ def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     the steps.
     """
     steps = protocols.stress_steps(TASK) + 1
-    position, angle = np.zeros((steps, 1, 3)), np.zeros(steps)
+    position = np.zeros((steps, 1, 3))
+    angle = np.zeros(steps)
     for step, (metres, degrees) in moves.items():
         position[int(step[1:]) :, 0, 1] += metres
         angle[int(step[1:]) :] += degrees
@@ -342,7 +347,9 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
 @pytest.mark.slow
 def test_attempts_with_a_lift_end_higher_in_the_world():
     """They have programs of their own: a lift off the table, and the policy of a bundle."""
-    obj, count, hold = OBJECTS[1], TASK.surface_points, TASK.hold_steps
+    obj = OBJECTS[1]
+    count = TASK.surface_points
+    hold = TASK.hold_steps
     drawn = suite.episodes(4 * BATCH)
     drawn = jax.tree.map(lambda rows: rows[drawn.reset_state.object_index == 1][:2], drawn)
     rest = np.concatenate(
@@ -355,7 +362,8 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     attempts = Attempts(HAND, TASK, suite.policy(), threads=1, phases=Phases(lift=0.06, hold=0.0))
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
-    approach, lift = TASK.approach_steps, protocols.lift_steps(TASK, 0.06)
+    approach = TASK.approach_steps
+    lift = protocols.lift_steps(TASK, 0.06)
     assert attempts.steps == approach + lift + hold == len(outcome.trace.q)
     dt = TASK.control_dt
     assert attempts.begins == {
@@ -366,12 +374,12 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     assert set(outcome.metrics) > WITHOUT_MESHES
     way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[approach - 1]
     slid = (outcome.trace.u[-1] - outcome.trace.u[approach - 1])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (
-        np.diff(outcome.trace.wrist_position[approach:, :, 2], axis=0).max() < 0.02
-    )
+    assert (way[:, 2] > 0.04).all()
+    assert np.diff(outcome.trace.wrist_position[approach:, :, 2], axis=0).max() < 0.02
     # The untrained hand leaves the object, and the table under it remains: it is where it was, and
     # not held.
-    assert outcome.trace.table.all() and not outcome.metrics["held"].any()
+    assert outcome.trace.table.all()
+    assert not outcome.metrics["held"].any()
     assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()
     np.testing.assert_allclose(
         np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5

@@ -57,7 +57,8 @@ def sets():
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, sets):
     """A folder of the suite's objects, and one of the mug's constraint set."""
-    folder, constraints = tmp_path_factory.mktemp("objects"), tmp_path_factory.mktemp("sets")
+    folder = tmp_path_factory.mktemp("objects")
+    constraints = tmp_path_factory.mktemp("sets")
     for obj in OBJECTS:
         Catalogue(folder).add(obj)
     save(sets[MUG.name], constraints)
@@ -81,7 +82,8 @@ def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, sca
     jax.tree.map(np.testing.assert_array_equal, made.bank, suite.bank())
     assert [obj.name for obj in scanned.objects] == sorted(obj.name for obj in OBJECTS)
     mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
-    assert len(mixed.objects) == 8 and len(mixed.bank.points) == 8
+    assert len(mixed.objects) == 8
+    assert len(mixed.bank.points) == 8
     np.testing.assert_allclose(mixed.bank.weight, [0.75 / 4] * 4 + [0.25 / 4] * 4)
 
 
@@ -91,7 +93,8 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
     """
     objects, constraints = folders
     mixed = training_set(HAND, _run(folder=objects, constraints=constraints, procedural=4), 0)
-    assert mixed.objects[0].name == MUG.name and len(mixed.objects) == 5
+    assert mixed.objects[0].name == MUG.name
+    assert len(mixed.objects) == 5
     assert np.asarray(mixed.bank.renewable).tolist() == [False, True, True, True, True]
     apart = [
         np.asarray(
@@ -101,7 +104,8 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
         )
         for split in ("training", "held-out", "all")
     ]
-    assert not (apart[0] & apart[1]).any() and np.array_equal(apart[0] | apart[1], apart[2])
+    assert not (apart[0] & apart[1]).any()
+    assert np.array_equal(apart[0] | apart[1], apart[2])
     index = np.array([0, 1], np.int32)
     q, position, quaternion = (
         np.asarray(getattr(mixed.bank, f"pose_{name}"))[:2, 0, 0]
@@ -131,7 +135,8 @@ def test_sets_without_normals_get_estimated_ones(tmp_path, sets):
     arrays = dict(sets[BOX.name].arrays)
     exact = arrays.pop("surface/normals")
     normals = load(save(Message(arrays, sets[BOX.name].meta), tmp_path)).arrays["surface/normals"]
-    assert normals.dtype == np.float32 and np.median(np.sum(normals * exact, -1)) > 0.99
+    assert normals.dtype == np.float32
+    assert np.median(np.sum(normals * exact, -1)) > 0.99
 
 
 @pytest.mark.parametrize(
@@ -175,7 +180,8 @@ def test_an_object_that_lies_too_flat_is_in_no_episode():
     board = procedural.generate(1_000_045, "board")
     assert np.ptp(board.points, axis=0).min() < 0.009
     row = headings_of(TASK, board, (0, 1), None, 1.0, outline(HAND))
-    assert row["weight"] == 0 and np.isfinite(row["heading_position"]).all()
+    assert row["weight"] == 0
+    assert np.isfinite(row["heading_position"]).all()
 
 
 def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
@@ -214,7 +220,8 @@ def test_weights_by_hand():
     found.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
     # Nothing was counted before, so that nothing is forgotten. All: 4/12. Mugs: (4 + 5/3) / (8 +
     # 5), boxes: (5/3) / 9.
-    mugs, boxes = 17 / 39, 5 / 27
+    mugs = 17 / 39
+    boxes = 5 / 27
     rates = np.array([(4 + 5 * mugs) / 9, 5 * mugs / 9, 5 * boxes / 9])
     variance = rates * (1 - rates)
     factors = (variance + variance.mean()) / (2 * variance.mean())
@@ -241,4 +248,5 @@ def test_weights_stay_within_a_factor_of_four_and_follow_uncertainty(episodes):
     success = np.array([s for _, s in episodes], float)
     found.add(index, success)
     weights = found.weights
-    assert weights.min() >= 0.5 and weights.max() <= 2.0
+    assert weights.min() >= 0.5
+    assert weights.max() <= 2.0

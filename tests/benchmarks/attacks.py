@@ -123,7 +123,8 @@ def _servers(
 def _latencies(client: PolicyClient, episode: Example, seconds: float) -> list[float]:
     """Seconds of the queries of a client that sends one in each `_PERIOD`."""
     client.reset(episode.request)
-    times, deadline = [], time.monotonic() + seconds
+    times = []
+    deadline = time.monotonic() + seconds
     while (began := time.monotonic()) < deadline:
         with contextlib.suppress(CongraspError):
             client.act(episode.state)

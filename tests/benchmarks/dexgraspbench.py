@@ -20,7 +20,8 @@ from congrasp.services.cli.console import tracked
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, read_grasps
 from tests.benchmarks.dexgraspbench_replay import replayed, save_replay, summary
 
-GRASPS, OBJECTS = "graspdata", "object"
+GRASPS = "graspdata"
+OBJECTS = "object"
 """Folders of the output."""
 
 
@@ -92,7 +93,10 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_atomically(folder / GRASPS / grasp.name / "congrasp" / "0.npz", buffer.getvalue())
-    obj, origin, scale, home = grasp.obj, grasp.origin, grasp.scale, folder / OBJECTS / grasp.name
+    obj = grasp.obj
+    origin = grasp.origin
+    scale = grasp.scale
+    home = folder / OBJECTS / grasp.name
     meshes = {"mesh/simplified.obj": (obj.visual_vertices, obj.visual_faces)}
     for number, piece in enumerate(obj.pieces):
         meshes[f"urdf/meshes/convex_piece_{number:03d}.obj"] = shapes.tessellate(piece)

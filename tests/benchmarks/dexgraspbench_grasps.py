@@ -135,7 +135,8 @@ def benchmark_grasp(name: str, motion: Episode) -> Grasp:
     Raises:
       CongraspError: the benchmark does not have the hand.
     """
-    match, hand = match_hand(motion), get_hand(motion.hand)
+    match = match_hand(motion)
+    hand = get_hand(motion.hand)
     obj = convex_object(motion)
     last = max(motion.grasp_span[1] - 1, 0)
     clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
@@ -200,7 +201,8 @@ def convex_object(motion: Episode) -> GraspObject:
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     """Convex pieces of one body; empty for a flat one."""
     volume = float(body.volume) if body.is_volume else None
-    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    vertices = np.asarray(body.vertices)
+    faces = np.asarray(body.faces)
     try:
         found = decompose(vertices, faces, volume=volume, max_pieces=most)
         hulls = [simplify(piece) for piece in found.pieces]
@@ -216,7 +218,8 @@ def _rotation(quaternion: np.ndarray) -> Rotation:
 
 def _state(motion: Episode, t: int) -> State:
     """The hand in a frame."""
-    position, q = motion.wrist_position[t].astype(float), motion.joint_position[t].astype(float)
+    position = motion.wrist_position[t].astype(float)
+    q = motion.joint_position[t].astype(float)
     return State(position, _rotation(motion.wrist_quaternion[t]), q)
 
 
@@ -245,12 +248,11 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
         g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]
     ]
     base = model.body("hand_base").id
-    best, farthest = 0, -np.inf
+    best = 0
+    farthest = -np.inf
     for t in range(last, -1, -1):
-        model.body_pos[base], model.body_quat[base] = (
-            motion.wrist_position[t],
-            motion.wrist_quaternion[t],
-        )
+        model.body_pos[base] = motion.wrist_position[t]
+        model.body_quat[base] = motion.wrist_quaternion[t]
         data.qpos[fingers] = motion.joint_position[t]
         data.qpos[free : free + 7] = *motion.object_position[t], *motion.object_quaternion[t]
         mujoco.mj_kinematics(model, data)
@@ -260,7 +262,8 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
             for b in mine
         )
         if gap > farthest:
-            best, farthest = t, gap
+            best = t
+            farthest = gap
         if gap >= CLEARANCE:
             break
     return best, float(farthest)

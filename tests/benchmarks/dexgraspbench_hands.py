@@ -204,7 +204,8 @@ def _chains(motion: Episode) -> list[np.ndarray]:
     """Joint indices of each finger, from the palm on; empty if the hand is not a palm with
     chains.
     """
-    parents, links = motion.link_parent, motion.joint_link
+    parents = motion.link_parent
+    links = motion.joint_link
     found = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
         chain: list[int] = []
@@ -222,12 +223,11 @@ def _laid_over(
     name: str, hand: BenchmarkHand, order: np.ndarray, motion: Episode
 ) -> tuple[float, Match | None]:
     """Error in mm of the farthest joint for this assignment of joints, and the match."""
-    theirs, anchors, axes = (
-        hand.rows,
-        motion.joint_anchor[order].astype(float),
-        motion.joint_axis[order].astype(float),
-    )
-    middle, center = theirs[:, 0].mean(0), anchors.mean(0)
+    theirs = hand.rows
+    anchors = motion.joint_anchor[order].astype(float)
+    axes = motion.joint_axis[order].astype(float)
+    middle = theirs[:, 0].mean(0)
+    center = anchors.mean(0)
     turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]
     off = (
         1e3 * np.linalg.norm(turn.apply(anchors - center) - (theirs[:, 0] - middle), axis=-1).max()

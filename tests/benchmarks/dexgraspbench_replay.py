@@ -29,17 +29,18 @@ from congrasp.common.task.config import TaskConfig
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State
 from tests.benchmarks.dexgraspbench_hands import benchmarked
 
-MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
+MASS = 0.1
+FRICTION = 0.6
+TORSION = 0.02
 """kg, and sliding and torsional (m) friction of every object."""
-_HAND, _OBJECT = ((0.005, 1.0), (0.5, 0.99, 1e-4)), ((0.02, 1.0), (0.9, 0.95, 1e-3))
+_HAND = ((0.005, 1.0), (0.5, 0.99, 1e-4))
+_OBJECT = ((0.02, 1.0), (0.9, 0.95, 1e-3))
 """`solref` and the first of `solimp`, of which a contact has the mean."""
 STARTS = ("grasp", "pregrasp")
 # Control steps: of a stage, of a push, and between two measurements of contacts
-_STAGE, _PUSH, _LOOK = (
-    40,
-    200,
-    10,
-)
+_STAGE = 40
+_PUSH = 200
+_LOOK = 10
 _TOGETHER = 32  # grasps in parallel
 _TASK = TaskConfig()
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -169,9 +170,12 @@ def _harden(model: mujoco.MjModel) -> None:
     model.opt.gravity[:] = 0.0
     model.opt.noslip_iterations = 2
     mine = model.geom_bodyid == model.body("object").id
-    model.geom_condim[mine], model.geom_friction[mine, 1], model.geom_solmix[:] = 4, TORSION, 1.0
+    model.geom_condim[mine] = 4
+    model.geom_friction[mine, 1] = TORSION
+    model.geom_solmix[:] = 1.0
     for geoms, (solref, solimp) in ((~mine, _HAND), (mine, _OBJECT)):
-        model.geom_solref[geoms], model.geom_solimp[geoms, :3] = solref, solimp
+        model.geom_solref[geoms] = solref
+        model.geom_solimp[geoms, :3] = solimp
 
 
 def _script(
@@ -223,7 +227,8 @@ def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
 
 def _depths(instance: EnvInstance) -> tuple[float, float]:
     """Deepest contact of hand and object, and of two links, mm."""
-    contact, model = instance.data.contact, instance.model
+    contact = instance.data.contact
+    model = instance.model
     touches = (model.geom_bodyid[contact.geom] == model.body("object").id).any(-1)
     depth = 1e3 * np.maximum(-contact.dist, 0.0)
     return float(depth[touches].max(initial=0.0)), float(depth[~touches].max(initial=0.0))

@@ -81,7 +81,10 @@ class Run:
         output: int = subprocess.DEVNULL,
     ):
         """Starts nothing yet; `output` takes what it prints."""
-        self.run_dir, self._count, self._options, self._output = run_dir, actors, options, output
+        self.run_dir = run_dir
+        self._count = actors
+        self._options = options
+        self._output = output
         self._transport: Transport | None = None
         self.process: psutil.Popen | None = None
 

@@ -25,7 +25,8 @@ from congrasp.services.viz.film import Film, film_frames
 from congrasp.services.viz.render import render_episode_frames
 from tests.pictures import provenance
 
-_SIZE, _QUALITY = (480, 360), 88  # pixels, of JPEG
+_SIZE = (480, 360)  # pixels
+_QUALITY = 88  # of JPEG
 _FILM_SIZE = (400, 300)  # pixels
 _FILM_FPS = 12.5
 _COLOURS = 256  # of a film

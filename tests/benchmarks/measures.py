@@ -53,7 +53,8 @@ def measures(
     steps = task.approach_steps + two_seconds(task)
     began = time.perf_counter()
     field = jax.block_until_ready(distance_field(objects))
-    seconds, size = time.perf_counter() - began, field.values.nbytes / 1e6
+    seconds = time.perf_counter() - began
+    size = field.values.nbytes / 1e6
     console.print(f"Grids of {len(objects)} objects: {seconds:.1f} s, {size:.0f} MB")
 
     def worker(probe: Probe) -> RolloutWorker:
@@ -101,6 +102,7 @@ def measures(
 
 def _timed(run: Callable[[], object]) -> tuple[float, float]:
     """Seconds of a call by the clock, and of the processor in all threads."""
-    began, busy = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    busy = time.process_time()
     run()
     return time.perf_counter() - began, time.process_time() - busy

@@ -69,7 +69,8 @@ def pieces(
       python -m tests.benchmarks pieces --objects my-objects
       python -m tests.benchmarks pieces --objects my-objects --counts 8 32 --vertices 32
     """
-    found, task = objects_of(objects), TaskConfig(hand=hand)
+    found = objects_of(objects)
+    task = TaskConfig(hand=hand)
     budgets = [(p, v) for p in counts for v in vertices]
     variants = [[coarser(obj, p, v) for obj in found] for p, v in budgets]
     held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
@@ -109,7 +110,8 @@ def _closed_around(
     palm and tips.
     """
     model = compile_scene(hand, task, obj)
-    where, data = addresses(model, hand), mujoco.MjData(model)
+    where = addresses(model, hand)
+    data = mujoco.MjData(model)
     model.body_pos[where.base_body] = 0.0
     data.qpos[where.finger_qpos] = hand.q_open
     data.mocap_pos[where.table_mocap] = TABLE_AWAY
@@ -120,7 +122,8 @@ def _closed_around(
     data.mocap_pos[where.anchor_mocap] = middle
     data.mocap_quat[where.anchor_mocap] = (1.0, 0.0, 0.0, 0.0)
     data.eq_active[where.weld] = 1
-    data.ctrl[:6], data.ctrl[6:] = 0.0, motor_positions(hand, hand.q_closed)
+    data.ctrl[:6] = 0.0
+    data.ctrl[6:] = motor_positions(hand, hand.q_closed)
     mujoco.mj_step(model, data, _CLOSING * task.substeps)
     return model, data
 

@@ -15,7 +15,8 @@ from tests.browser import SIZE, chromium, drag, on_object, picture
 _PHONE = {"width": 390, "height": 844}
 _HELD = 6
 """Most grasps until one is held."""
-_SCRUB, _SCRUB_RUN = 0.32, 0.8
+_SCRUB = 0.32
+_SCRUB_RUN = 0.8
 """Shares of a motion, and of an episode of a training, at which they are shown."""
 
 

@@ -14,7 +14,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.grasp.files import MOTION
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
-SHARE, SPEED = (0.3, 0.4), (0.5, 1.2)
+SHARE = (0.3, 0.4)
+SPEED = (0.5, 1.2)
 """Share of the movement's time at which human reaches of some 40 cm are fastest, and m/s."""
 _STILL = 0.05  # m/s below which the wrist has arrived
 _PROMINENT = 0.05  # m/s by which the speed falls on both sides of a peak
@@ -53,7 +54,8 @@ class Profile(NamedTuple):
 
 def profile(motion: Episode) -> Profile:
     """The profile of a motion, which has a reach."""
-    phases, dt = motion.about["phases"], motion.control_dt
+    phases = motion.about["phases"]
+    dt = motion.control_dt
     if "approach" not in phases:
         raise CongraspError(f"The grasp of '{motion.object}' has no reach.", "Set --approach.")
     end = round(phases.get("lift", phases["hold"]) / dt)

@@ -193,10 +193,8 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_pat
     # Another order would be seen
     assert np.linalg.norm(ours - np.roll(theirs, 1, 0), axis=-1).min() > 1e-2
     # The object's file frame: a point of the file is where the motion has it.
-    turn, place = (
-        Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True),
-        arrays["obj_pose"][:3],
-    )
+    turn = Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True)
+    place = arrays["obj_pose"][:3]
     point = np.array([0.1, -0.2, 0.3])
     own = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
     expected = own.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
@@ -211,7 +209,8 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
         HAND.joint_links
     ).items():  # the hand that grasps has them, too
         for mine, solid in zip(HAND.links[link].solids, theirs, strict=True):
-            assert (mine.kind, mine.size) == (solid.kind, pytest.approx(solid.size))
+            assert mine.kind == solid.kind
+            assert mine.size == pytest.approx(solid.size)
             np.testing.assert_allclose(mine.position, solid.position, atol=2e-6)
             turns = [
                 Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix()
@@ -250,7 +249,8 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
         return rows[np.lexsort(np.round(rows[:, :3], 5).T)]
 
     palm = [ours.geom("palm_0").id]
-    found, expected = outlines(ours, here, palm), outlines(theirs, there, [])
+    found = outlines(ours, here, palm)
+    expected = outlines(theirs, there, [])
     assert len(found) == len(expected) == 20
     np.testing.assert_allclose(found, expected, atol=2e-6)
     np.testing.assert_allclose(ours.geom_size[palm[0]], (0.0204, 0.0565, 0.0475))
@@ -279,14 +279,16 @@ def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called(
         link_parent=np.maximum(own.body_parentid[2:] - 2, -1),
     )
     match = match_hand(motion)
-    assert match.name == "shadow" and (match.sign == -1).all()
+    assert match.name == "shadow"
+    assert (match.sign == -1).all()
     rng = np.random.default_rng(0)
     data.qpos[:] = q = rng.uniform(*own.jnt_range.T)
     mujoco.mj_kinematics(own, data)
     model = mujoco.MjModel.from_xml_string(benchmark_model(SHADOW, "pos='0 0 0.034'"))
     theirs = mujoco.MjData(model)
     assert tuple(model.joint(i).name for i in range(1, model.njnt)) == match.hand.joints
-    place, turn = rng.normal(size=3), Rotation.random(rng=rng)
+    place = rng.normal(size=3)
+    turn = Rotation.random(rng=rng)
     theirs.qpos[:] = match.qpos(place, turn, q)
     mujoco.mj_kinematics(model, theirs)
     tip = np.array([0.0, 0.0, 0.025])
@@ -308,7 +310,8 @@ def test_hands_that_the_benchmark_lacks_are_refused_with_their_distance(motion):
 def test_squeezing_applies_the_policys_torque_within_the_motors_limit(motion):
     """Allegro's servos have 3 N.m/rad and 0.7 N.m, the benchmark's 5 N.m/rad."""
     ahead = np.zeros((T, 16))
-    ahead[:, 0], ahead[:, 1] = 0.1, -1.0  # 0.3 N.m, and 3 N.m of which the motor has 0.7
+    ahead[:, 0] = 0.1  # 0.3 N.m
+    ahead[:, 1] = -1.0  # 3 N.m, of which the motor has 0.7
     motion = dataclasses.replace(
         motion,
         joint_position=np.tile(motion.joint_position[-1], (T, 1)),
@@ -400,7 +403,9 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
     )
     lost = held._replace(name="lost", states=dict.fromkeys(STATES, afar))
     first, second = replayed([held, lost])
-    assert first.from_grasp and 0.0 < first.depth_mm < 3.0 and 0.0 < first.pushed_mm < 3.0
+    assert first.from_grasp
+    assert 0.0 < first.depth_mm < 3.0
+    assert 0.0 < first.pushed_mm < 3.0
     assert not (second.from_grasp or second.from_pregrasp)
     assert second.depth_mm == second.pushed_mm == 0.0
 
@@ -415,7 +420,8 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
     out = tmp_path / "bench"
     assert dexgraspbench((tmp_path / "grasps",), out) == 0
     said = capsys.readouterr().out
-    assert "lost/grasp.npz: The object is not held." in said and "1 grasps" in said
+    assert "lost/grasp.npz: The object is not held." in said
+    assert "1 grasps" in said
     script = [
         sys.executable,
         str(ROOT / "examples" / "dexgraspbench.py"),
@@ -431,9 +437,8 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         "squeeze_qpos": (23,),
         "obj_pose": (7,),
     }
-    assert data["obj_scale"] == 0.5 and data["joint_names"] == list(
-        BENCHMARK_HANDS["allegro"].joints
-    )
+    assert data["obj_scale"] == 0.5
+    assert data["joint_names"] == list(BENCHMARK_HANDS["allegro"].joints)
     # Mass by the benchmark's formula, and the pieces where it looks for them, in the file's unit.
     info = json.loads((out / "object/ball/info/simplified.json").read_text())
     coefficient = info["mass"] / (info["density"] * info["scale"] ** 3)
@@ -458,7 +463,8 @@ def test_every_motion_has_a_name_of_its_own(motion, tmp_path):
     for above in ("1/a", "2/a", "3/a-2"):
         save_motions(tmp_path / above[0], **{above[2:]: motion})
     grasps, left_out = read_grasps([tmp_path / x for x in "123"])
-    assert [grasp.name for grasp in grasps] == ["a", "a-2", "a-2-2"] and not left_out
+    assert [grasp.name for grasp in grasps] == ["a", "a-2", "a-2-2"]
+    assert not left_out
 
 
 def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
@@ -475,6 +481,7 @@ def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
     assert [grasp.name for grasp in grasps] == ["good"]
     reasons = {"flat": "has no volume", "moved": "no hand like", "torn": "motion"}
     for (name, word), line in zip(reasons.items(), left_out, strict=True):
-        assert f"{name}/grasp.npz" in line and word in line
+        assert f"{name}/grasp.npz" in line
+        assert word in line
     with pytest.raises(CongraspError, match=r"None of the motions can be exported.*has no volume"):
         read_grasps([tmp_path / "in" / "flat"])

@@ -236,7 +236,8 @@ def _through_sockets(senders: int, seconds: float) -> float:
     import zmq
 
     with zmq.Context() as context, context.socket(zmq.PULL) as socket:
-        socket.rcvhwm, socket.rcvtimeo = 8, 500
+        socket.rcvhwm = 8
+        socket.rcvtimeo = 500
         port = socket.bind_to_random_port("tcp://127.0.0.1")
 
         def receive() -> int:
@@ -252,7 +253,8 @@ def _through_sockets(senders: int, seconds: float) -> float:
 def _rate(receive: Callable[[], int], seconds: float) -> float:
     """MB/s that a function receives, after a while in which it is not counted."""
     _until(lambda: receive() > 0, "Nothing was received.")
-    received, began = 0, time.monotonic() + _WARM_UP
+    received = 0
+    began = time.monotonic() + _WARM_UP
     while (now := time.monotonic()) < began + seconds:
         size = receive()
         received += size if now >= began else 0

@@ -42,7 +42,8 @@ def scene(positions: np.ndarray, faces: np.ndarray, primitives=(), node=None, **
     """A GLB file of one mesh; positions may be rows of integers with padding, of which three
     columns count.
     """
-    points, corners = np.ascontiguousarray(positions), np.ascontiguousarray(faces, np.uint16)
+    points = np.ascontiguousarray(positions)
+    corners = np.ascontiguousarray(faces, np.uint16)
     kinds = {"f": 5126, "H": 5123, "h": 5122, "B": 5121}
     kind = kinds[points.dtype.char]
     views = [
@@ -133,17 +134,20 @@ def moved(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
 
 def main() -> None:
     """Writes all of them."""
-    box, float_box = stl(BOX), BOX.vertices.astype(np.float32)
+    box = stl(BOX)
+    float_box = BOX.vertices.astype(np.float32)
     long = trimesh.creation.box((0.12, 0.03, 0.03))
     both = trimesh.util.concatenate([BOX, BOX])
     other = trimesh.util.concatenate([BOX, moved(BOX, 0.04, 0, 0)])
     random = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(1, 0.03)
-    mixed, pierced = ball.copy(), ball.copy()
+    mixed = ball.copy()
+    pierced = ball.copy()
     spoilt, worse = (trimesh.creation.icosphere(2, 0.03) for _ in range(2))
     mixed.faces[::7] = np.asarray(mixed.faces)[::7, ::-1]
     pierced.update_faces(np.arange(len(ball.faces)) > 1)
-    spoilt.vertices[3], worse.vertices[:40] = np.nan, np.nan
+    spoilt.vertices[3] = np.nan
+    worse.vertices[:40] = np.nan
     far = ball.copy().apply_scale(0.5).apply_translation([0.2, 0, 0])
     inverted = BOX.copy()
     inverted.invert()

@@ -16,10 +16,13 @@ def test_numbers_of_a_name_depend_on_no_other_name_and_on_no_wider_one():
     key = jax.random.key(3)
     alone = chance.uniforms(key, {"a": 2}, 5)
     with_others = chance.uniforms(key, {"b": 7, "a": 2, "c": 1}, 5)
-    assert alone["a"].shape == (5, 2) and with_others["b"].shape == (5, 7)
+    assert alone["a"].shape == (5, 2)
+    assert with_others["b"].shape == (5, 7)
     np.testing.assert_array_equal(alone["a"], with_others["a"])
     numbers = np.concatenate([np.ravel(part) for part in with_others.values()])
-    assert len(set(numbers.tolist())) == numbers.size and numbers.min() >= 0 and numbers.max() < 1
+    assert len(set(numbers.tolist())) == numbers.size
+    assert numbers.min() >= 0
+    assert numbers.max() < 1
 
 
 def test_numbers_are_uniform():

@@ -68,7 +68,8 @@ def _without(whole, constraint):
 
 @each
 def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
-    described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
+    described = fields(HAND, TASK)
+    sizes = dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
     observed = evaluated(constraint.observe, whole)
     assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
@@ -106,15 +107,19 @@ def test_names_are_unique_over_all_constraints():
 
 @each
 def test_terms_and_errors_match_declarations(constraint, whole):
-    paid, measured = evaluated(constraint.reward, whole), evaluated(constraint.measure, whole)
+    paid = evaluated(constraint.reward, whole)
+    measured = evaluated(constraint.measure, whole)
     assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
     assert sorted(measured) == sorted(error.name for error in constraint.errors)
     for error in constraint.errors:
         # Ratios have no unit
         assert isinstance(measured[error.name], tuple) == (error.unit == ""), error.name
-        assert error.tolerance >= 0 and error.scale > 0 and error.unit in ("rad", "m", "")
+        assert error.tolerance >= 0
+        assert error.scale > 0
+        assert error.unit in ("rad", "m", "")
     for value in jax.tree.leaves((paid, measured)):
-        assert value.shape == (4,) and np.isfinite(value).all()
+        assert value.shape == (4,)
+        assert np.isfinite(value).all()
     for weight in constraint.weights:
         assert getattr(RewardWeights(), weight.name) == weight.default
     assert not constraint.optional or getattr(TASK, f"p_{constraint.name}") == 0.5
@@ -123,13 +128,16 @@ def test_terms_and_errors_match_declarations(constraint, whole):
 @each_optional
 def test_inactive_constraint_has_no_effect(constraint, whole):
     off = _without(whole, constraint)
-    start, mask = 0, dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
-    on_observation, off_observation = evaluated(observe, whole), evaluated(observe, off)
+    start = 0
+    mask = dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
+    on_observation = evaluated(observe, whole)
+    off_observation = evaluated(observe, off)
     for name, size in layout(HAND, TASK):
         block = slice(start, start + size)
         start += size
         if name in constraint.blocks:
-            assert on_observation[:, block].any() and not off_observation[:, block].any(), name
+            assert on_observation[:, block].any(), name
+            assert not off_observation[:, block].any(), name
         elif name == "mask":
             silent = [mask[block] for block in constraint.blocks]
             np.testing.assert_array_equal(
@@ -140,7 +148,8 @@ def test_inactive_constraint_has_no_effect(constraint, whole):
                 on_observation[:, block], off_observation[:, block], err_msg=name
             )
     assert not any(np.any(value) for value in evaluated(constraint.reward, off).values())
-    touching, force = whole.features.touching, whole.features.force
+    touching = whole.features.touching
+    force = whole.features.force
     for before, after in zip(
         (touching, force), constraint.earning(off, touching, force), strict=True
     ):
@@ -192,7 +201,9 @@ def test_names_that_it_gives_are_there(constraint):
         other.name for other in weaker
     }
     assert constraint.guides in ("", constraint.name, *constraint.blocks)
-    assert constraint.title and constraint.options and constraint.name.isidentifier()
+    assert constraint.title
+    assert constraint.options
+    assert constraint.name.isidentifier()
 
 
 def test_constraints_of_the_paper_are_first():
@@ -255,7 +266,8 @@ def _judged(state, surface, goal, action):
 
 def test_task_ignores_unsupported_constraints():
     """A choice of fingers and a limit of the force: f_max stays a number."""
-    task, (state, surface, goal) = TaskConfig(constraints=PAPER), scene(5)
+    task = TaskConfig(constraints=PAPER)
+    state, surface, goal = scene(5)
     flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
     known_alone = Goal({name: goal[name] for name in PAPER}, flags)
     some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
@@ -283,7 +295,8 @@ def test_requests_fill_the_arrays_that_they_give():
     np.testing.assert_array_equal(goal["heading"].direction, np.array([0, 1, 0], np.float32))
     np.testing.assert_array_equal(goal["heading"].position, np.zeros(3))
     np.testing.assert_array_equal(goal["fingers"].allowed, [True, False, True, False, False])
-    assert goal["fingers"].allowed.dtype == bool and goal["heading"].direction.dtype == np.float32
+    assert goal["fingers"].allowed.dtype == bool
+    assert goal["heading"].direction.dtype == np.float32
     assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
 
 
@@ -344,11 +357,9 @@ def _same(
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]
     own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
-    assert (
-        goals[0]
-        and set(goals[1]) - set(goals[0]) <= own
-        and set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
-    )
+    assert goals[0]
+    assert set(goals[1]) - set(goals[0]) <= own
+    assert set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
     for one, other in (goals, actives):
         for name in one:
             check(one[name], other[name], err_msg=name)
@@ -363,7 +374,8 @@ def test_draws_are_independent_of_other_constraints(constraint):
     episodes.
     """
     others = tuple(name for name in NAMES if name != constraint.name)
-    some, all_of_them = _drawn(others), _drawn(NAMES, never=constraint.name)
+    some = _drawn(others)
+    all_of_them = _drawn(NAMES, never=constraint.name)
     assert not any(np.any(all_of_them.goal.active[block]) for block in constraint.blocks)
     _same(some, all_of_them, constraint.name)
 
@@ -373,15 +385,18 @@ def test_fingers_change_no_other_draw():
     without = dataclasses.replace(
         TASK, constraints=tuple(name for name in NAMES if name != "fingers")
     )
-    some, more = suite.episodes(DRAWN, task=without), suite.episodes(DRAWN)
+    some = suite.episodes(DRAWN, task=without)
+    more = suite.episodes(DRAWN)
     _same(
         some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
     )
     chosen, pose = (np.asarray(more.goal.active[name]) for name in ("fingers", "pose_finger"))
-    assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15
+    assert not chosen[pose].any()
+    assert abs(chosen[~pose].mean() - 0.5) < 0.15
 
 
 def test_constraint_without_blocks_is_active():
     *_, goal = scene(0)
     always = [constraint for constraint in known(TASK) if not constraint.blocks]
-    assert always and all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)
+    assert always
+    assert all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)

@@ -67,9 +67,11 @@ def test_message_survives_the_type(message: Message) -> None:
 
 def test_message_without_frame_of_the_file_gets_defaults() -> None:
     read = Episode.from_message(episode_message())
-    assert read.object_file_scale == 1.0 and read.object_file_origin.tolist() == [0.0, 0.0, 0.0]
+    assert read.object_file_scale == 1.0
+    assert read.object_file_origin.tolist() == [0.0, 0.0, 0.0]
     meta = read.to_message().meta
-    assert meta["object_file_scale"] == 1.0 and meta["object_file_origin"] == [0.0, 0.0, 0.0]
+    assert meta["object_file_scale"] == 1.0
+    assert meta["object_file_origin"] == [0.0, 0.0, 0.0]
 
 
 def test_fields_are_arrays_of_the_message() -> None:
@@ -77,7 +79,9 @@ def test_fields_are_arrays_of_the_message() -> None:
     read = Episode.from_message(message)
     recorded = read.require_recorded()
     arrays = message.arrays
-    assert read.hand == "human" and read.object == "cylinder-0" and read.version == 3
+    assert read.hand == "human"
+    assert read.object == "cylinder-0"
+    assert read.version == 3
     assert read.about == {"version": 3, "actor": "a0"}
     assert read.constraints == ("heading", "affordance", "trajectory")
     assert read.active == {
@@ -100,8 +104,10 @@ def test_older_recording_is_read() -> None:
     message = episode_message(mask=(1, 0, 1, 0))
     read = Episode.from_message(older(message))
     now = Episode.from_message(message)
-    assert read.active == now.active and read.constraints == now.constraints
-    assert "mask" not in read.goal and not read.require_recorded().errors
+    assert read.active == now.active
+    assert read.constraints == now.constraints
+    assert "mask" not in read.goal
+    assert not read.require_recorded().errors
     for name, values in now.goal.items():
         np.testing.assert_array_equal(read.goal[name], values)
     drawn = [name for name, _ in read.markers()]
@@ -158,7 +164,8 @@ def test_damaged_arm_is_an_error() -> None:
 
 def test_meshes_of_an_arm_have_their_own_vertices() -> None:
     first, second = moved_arm(2).meshes
-    assert (first.link, second.link) == (0, 1)
+    assert first.link == 0
+    assert second.link == 1
     np.testing.assert_array_equal(first.vertices[first.faces[0]], np.eye(3))
     np.testing.assert_array_equal(second.vertices[second.faces[0]], 2 * np.eye(3))
 
@@ -190,7 +197,8 @@ def test_other_frames_are_those_of_every_array() -> None:
     frames = np.array([0, 0, 5])
     other = whole.at_frames(frames)
     recorded = whole.require_recorded()
-    assert other.steps == 3 and other.control_dt == whole.control_dt
+    assert other.steps == 3
+    assert other.control_dt == whole.control_dt
     np.testing.assert_array_equal(other.time, whole.time[frames])
     np.testing.assert_array_equal(other.link_force, whole.link_force[frames])
     np.testing.assert_array_equal(other.object_vertices, whole.object_vertices)
@@ -198,7 +206,8 @@ def test_other_frames_are_those_of_every_array() -> None:
     np.testing.assert_array_equal(other_recorded.action, recorded.action[frames])
     for name, values in recorded.rewards.items():
         np.testing.assert_array_equal(other_recorded.rewards[name], values[frames])
-    assert whole.arm and other.arm
+    assert whole.arm
+    assert other.arm
     np.testing.assert_array_equal(other.arm.joint_position, whole.arm.joint_position[frames])
 
 

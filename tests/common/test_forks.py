@@ -109,7 +109,8 @@ def test_a_fork_is_refused(before, how, listener, tmp_path, paper_policy):
     if "policy = " in before and how == "in_fork(call)":
         pytest.skip("JAX crashes at the end of a forked interpreter that has compiled programs")
     answer, end = lines_of(tmp_path, before.format(policy=str(paper_policy)) + f"\n{how}")
-    assert answer.startswith("ForkError: ") and "spawn" in answer
+    assert answer.startswith("ForkError: ")
+    assert "spawn" in answer
     assert end == "ended"
 
 

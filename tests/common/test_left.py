@@ -29,10 +29,12 @@ def model_of(name: str) -> mujoco.MjModel:
 
 @pytest.mark.parametrize("name", ["human", "allegro", "sharpa"])
 def test_equal_angles_and_mirrored_wrists_give_mirrored_links(name):
-    right, left = model_of(name), model_of(f"{name}:left")
+    right = model_of(name)
+    left = model_of(f"{name}:left")
     rng = np.random.default_rng(0)
     hand = get_hand(name)
-    u, q = rng.uniform(-0.5, 0.5, 6), rng.uniform(hand.lower, hand.upper)
+    u = rng.uniform(-0.5, 0.5, 6)
+    q = rng.uniform(hand.lower, hand.upper)
     poses = []
     for model, wrist in ((right, u), (left, u * [-1, 1, 1, 1, -1, -1])):
         data = mujoco.MjData(model)
@@ -53,7 +55,8 @@ def test_a_left_hand_is_one_object_by_either_name_and_messages_may_name_it():
 
 
 def test_the_surface_of_a_left_hand_is_closed_to_the_outside_and_mirrored():
-    right, left = skin_of(get_hand("human")), skin_of(get_hand("human:left"))
+    right = skin_of(get_hand("human"))
+    left = skin_of(get_hand("human:left"))
     np.testing.assert_allclose(left.points, right.points * [-1, 1, 1], atol=1e-6)
     for skin in (right, left):
         a, b, c = (skin.points[skin.faces[:, i]] for i in range(3))
@@ -97,8 +100,10 @@ class Lopsided:
 def test_mirrored_inputs_give_mirrored_actions():
     rng = np.random.default_rng(1)
     x, v, r, u, q = (rng.normal(size=size) for size in (3, 3, 4, 6, 16))
-    right, left = Lopsided(), LeftPolicy(Lopsided())
-    flip, turn = np.array([-1, 1, 1]), np.array([1, 1, -1, -1])
+    right = Lopsided()
+    left = LeftPolicy(Lopsided())
+    flip = np.array([-1, 1, 1])
+    turn = np.array([1, 1, -1, -1])
     wrist = np.concatenate([flip, -flip])
     answers = []
     for policy, m, t, w in ((right, np.ones(3), np.ones(4), np.ones(6)), (left, flip, turn, wrist)):
@@ -129,11 +134,13 @@ def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
     """By hand: slides along x and hinges about y and z change their sign, so that their bounds
     change places.
     """
-    lower, upper = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3], [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
+    lower = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3]
+    upper = [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
     limits = {"lower": lower, "upper": upper, "palm": [[0.01, 0.02, 0.03, 0.04]]}
     right = mock.Mock(metadata=lambda: {"hand": "human", "limits": limits, "period": 0.01})
     found = LeftPolicy(right).metadata()
-    assert found["hand"] == "human:left" and found["period"] == 0.01
+    assert found["hand"] == "human:left"
+    assert found["period"] == 0.01
     np.testing.assert_array_equal(
         found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
     )

@@ -20,7 +20,11 @@ from congrasp.common.wire.messages import (
     validate_rollout,
 )
 
-T, B, D, A, E = 3, 2, 5, 4, 1
+T = 3
+B = 2
+D = 5
+A = 4
+E = 1
 FORM = RolloutForm(T, B, D, A, half=True)
 
 
@@ -180,7 +184,9 @@ def test_device_arrays_pass_unread():
 @pytest.mark.parametrize("at", [0, 65535, 65536, 200_000])
 def test_every_half_is_looked_at(value, at):
     array = np.full((3, 66_667), 65504, np.float16)
-    assert is_finite(array) and is_finite(-array) and is_finite(array[:0])
+    assert is_finite(array)
+    assert is_finite(-array)
+    assert is_finite(array[:0])
     array.flat[at] = value
     assert not is_finite(array)
 

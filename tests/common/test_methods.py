@@ -23,7 +23,8 @@ from congrasp.common.task.reward import reward_terms
 from tests.scenes import HAND, F, N, evaluated, scene
 from tests.scenes import scene_of as compiled_scene
 
-FIRST, LAST = RewardWeights(drop=2.0), RewardWeights(drop=9.0, heading_position=30.0)
+FIRST = RewardWeights(drop=2.0)
+LAST = RewardWeights(drop=9.0, heading_position=30.0)
 RUN = RunConfig(
     updates=100,
     task=TaskConfig(reward=FIRST),
@@ -61,7 +62,8 @@ def test_two_phases_by_hand():
 
 def test_a_single_stage_has_the_last_weights_from_the_start():
     run = with_method(RUN, "single-stage")
-    assert run.curriculum.weights(run.task.reward, 0) == LAST and not run.curriculum.stationary(0)
+    assert run.curriculum.weights(run.task.reward, 0) == LAST
+    assert not run.curriculum.stationary(0)
     constant = with_method(dataclasses.replace(RUN, curriculum=CurriculumConfig()), "single-stage")
     assert constant.curriculum.weights(constant.task.reward, 0) == FIRST
 
@@ -85,7 +87,8 @@ def test_dgrasp_always_has_a_pose():
     terms = jax.jit(lambda weights, *step: reward_terms(scene_of(HAND, run.task, *step), weights))
     for version in (0, 99):
         paid = terms(run.curriculum.weights(run.task.reward, version), *scene(0))
-        assert not np.any(paid["heading_direction"]) and not np.any(paid["heading_position"])
+        assert not np.any(paid["heading_direction"])
+        assert not np.any(paid["heading_position"])
         assert np.any(paid["pose_wrist_position"])
 
 
@@ -129,9 +132,12 @@ def test_invalid_methods_are_refused():
 
 
 def test_rows_that_a_method_can_be_asked_for():
-    assert takes("ours", "heading") and takes("graspxl", "affordance")
-    assert takes("pd", "trajectory+affordance") and not takes("pd", "affordance")
-    assert takes("dgrasp", "pose") and not takes("dgrasp", "heading")
+    assert takes("ours", "heading")
+    assert takes("graspxl", "affordance")
+    assert takes("pd", "trajectory+affordance")
+    assert not takes("pd", "affordance")
+    assert takes("dgrasp", "pose")
+    assert not takes("dgrasp", "heading")
 
 
 # --- targets of a teacher ---
@@ -198,10 +204,8 @@ def test_labelled_student_moves_like_its_teacher():
 
     @jax.jit
     def targets(action):
-        true, shown = (
-            scene_of(HAND, task, state, surface, goal),
-            scene_of(HAND, tracked, seen, surface, goal),
-        )
+        true = scene_of(HAND, task, state, surface, goal)
+        shown = scene_of(HAND, tracked, seen, surface, goal)
         rows = observe_for_teacher(true, shown, task.control)
         own = student_action(HAND, task.control, rows, action)
         one, two, copied = (

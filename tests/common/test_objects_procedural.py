@@ -47,7 +47,8 @@ def test_most_basic_families_are_primitive():
 @settings(max_examples=12, deadline=None)
 @given(objects)
 def test_geometry_is_sound(obj):
-    points, normals = obj.points.astype(float), obj.normals.astype(float)
+    points = obj.points.astype(float)
+    normals = obj.normals.astype(float)
     assert points.shape == normals.shape == (SURFACE_POINTS, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     # On the surface of the union, with the normal pointing out of it.
@@ -167,7 +168,8 @@ def test_half_of_the_points_lie_on_a_thin_handle(family):
     obj = generate(3, family)
     owner = sample_union(obj.pieces, np.random.default_rng(0))[2]
     assert np.mean([obj.pieces[i].part for i in owner]) < 0.3
-    assert obj.graspable[obj.labels].mean() == 0.5 and obj.graspable[obj.labels[:256]].mean() == 0.5
+    assert obj.graspable[obj.labels].mean() == 0.5
+    assert obj.graspable[obj.labels[:256]].mean() == 0.5
 
 
 @pytest.mark.parametrize(
@@ -211,7 +213,8 @@ def test_actors_have_objects_of_their_own():
 @given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32 - 1))
 def test_training_never_touches_the_objects_of_evaluation(seed, count, shift):
     first = first_seed(ObjectsConfig(seed=seed, count=count), shift)
-    assert first >= 0 and first + count <= HELD_OUT_SEED
+    assert first >= 0
+    assert first + count <= HELD_OUT_SEED
 
 
 @given(
@@ -269,12 +272,10 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
     save(obj, tmp_path / "x.safetensors")
     back = load(tmp_path / "x.safetensors")
     assert digest(back) == digest(obj)
-    assert (back.name, back.family, back.part_names, back.mass) == (
-        obj.name,
-        obj.family,
-        obj.part_names,
-        obj.mass,
-    )
+    assert back.name == obj.name
+    assert back.family == obj.family
+    assert back.part_names == obj.part_names
+    assert back.mass == obj.mass
     for name in (
         "graspable",
         "inertia",
@@ -287,7 +288,9 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
         np.testing.assert_array_equal(getattr(back, name), getattr(obj, name))
         assert getattr(back, name).dtype == getattr(obj, name).dtype
     for a, b in zip(back.pieces, obj.pieces, strict=True):
-        assert (a.kind, a.size, a.part) == (b.kind, b.size, b.part)
+        assert a.kind == b.kind
+        assert a.size == b.size
+        assert a.part == b.part
         np.testing.assert_array_equal(a.pos, b.pos)
         np.testing.assert_array_equal(a.quat, b.quat)
         np.testing.assert_array_equal(a.vertices, b.vertices)

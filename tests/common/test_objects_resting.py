@@ -42,7 +42,9 @@ def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces():
     poses, likelihood = quasi_static_poses((Piece("box", tuple(half)),))
     # A rectangle of half sides a, b seen from d before its middle: 4 asin(ab / sqrt((a^2 + d^2)(b^2
     # + d^2))).
-    a, b, d = half[[1, 2, 0]], half[[2, 0, 1]], half
+    a = half[[1, 2, 0]]
+    b = half[[2, 0, 1]]
+    d = half
     share = np.arcsin(a * b / np.sqrt((a**2 + d**2) * (b**2 + d**2))) / np.pi
 
     order = np.repeat(np.argsort(-share), 2)
@@ -52,7 +54,8 @@ def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces():
 
 
 def test_a_cylinder_stands_with_the_likelihood_of_its_ends():
-    radius, half = 0.03, 0.05
+    radius = 0.03
+    half = 0.05
     poses, likelihood = quasi_static_poses((Piece("cylinder", (radius, half, 0)),))
     standing = np.isclose(poses[:, 2], half, atol=1e-6)
     assert standing.sum() == 2
@@ -99,7 +102,8 @@ def test_round_objects_rest_still(piece):
 
 
 def test_the_free_joints_damping_stops_a_rolling_ball_after_the_distance_worked_out():
-    radius, speed = 0.03, 0.05
+    radius = 0.03
+    speed = 0.05
     obj = make(Piece("ellipsoid", (radius,) * 3))
     scene = TableScene(obj)
     data = scene.data
@@ -151,7 +155,8 @@ def test_the_mujoco_body_is_the_object(family):
         if piece.vertices is None:
             np.testing.assert_allclose(geom.pos, piece.pos, atol=1e-9)
             continue
-        start, count = model.mesh_vertadr[geom.dataid[0]], model.mesh_vertnum[geom.dataid[0]]
+        start = model.mesh_vertadr[geom.dataid[0]]
+        count = model.mesh_vertnum[geom.dataid[0]]
         placed = (
             model.mesh_vert[start : start + count] @ data.geom_xmat[i].reshape(3, 3).T
             + data.geom_xpos[i]
@@ -171,7 +176,8 @@ def test_poses_follow_the_object_when_it_is_turned():
         )
         for piece in obj.pieces
     )
-    before, after = quasi_static_poses(obj.pieces), quasi_static_poses(moved)
+    before = quasi_static_poses(obj.pieces)
+    after = quasi_static_poses(moved)
     np.testing.assert_allclose(after[1], before[1], rtol=1e-6)
     np.testing.assert_allclose(after[0][:, 2], before[0][:, 2], rtol=1e-6)
 

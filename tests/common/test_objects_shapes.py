@@ -40,8 +40,10 @@ def piece(request):
 
 
 def test_mass_properties_of_a_union_with_densities_equal_mujocos():
-    pieces, densities = tuple(PIECES.values()), np.array([500.0, 900.0, 300.0, 2000.0, 1100.0])
-    found, expected = mass_properties(pieces, densities), mujoco_mass_properties(pieces, densities)
+    pieces = tuple(PIECES.values())
+    densities = np.array([500.0, 900.0, 300.0, 2000.0, 1100.0])
+    found = mass_properties(pieces, densities)
+    expected = mujoco_mass_properties(pieces, densities)
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
     np.testing.assert_allclose(found[1], expected[1], atol=1e-7)
     np.testing.assert_allclose(found[2], expected[2], atol=1e-5 * np.abs(expected[2]).max())
@@ -114,7 +116,8 @@ def test_a_union_has_no_points_inside_or_on_seams_and_keeps_flush_faces():
     assert not on_seam.any()
     # Area: a 8 x 4 x 4 cm block without two 1 x 1 cm holes, and two stubs of 2 cm with 1 x 1 cm
     # ends.
-    block, stubs = 2 * 16 + 4 * 32 - 2, 2 * (4 * 2 + 1)
+    block = 2 * 16 + 4 * 32 - 2
+    stubs = 2 * (4 * 2 + 1)
     assert np.isclose(bar.mean(), stubs / (block + stubs), atol=0.02)
     # Any prefix covers the surface as the whole does.
     assert np.isclose(bar[:400].mean(), bar.mean(), atol=0.03)

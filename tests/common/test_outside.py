@@ -36,7 +36,9 @@ class LevelGoal(NamedTuple):
 class Level(Constraint):
     """The hand stays as high as the object."""
 
-    name, title, goal = "level", "level hand", LevelGoal
+    name = "level"
+    title = "level hand"
+    goal = LevelGoal
     blocks = ("level",)
     weights = (Weight("level_height", 0.7, "Per metre of height."),)
     errors = (ErrorSpec("level_m", "m", "hold", 0.05, 0.05, "height beside the object's"),)
@@ -130,7 +132,8 @@ def episodes(task):
     from congrasp.common.task.observation import layout
     from congrasp.common.task.sampling.build import build_bank
 
-    hand, batch = get_hand("human"), 32
+    hand = get_hand("human")
+    batch = 32
     objects = [procedural.generate(0, "box")]
     physics = NativePhysics(hand, task, objects, 1)
 
@@ -151,8 +154,10 @@ def episodes(task):
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)
     physics.close()
-    active, wrist = goal.active["level"], goal["level"].wrist[:, 0]
-    assert 0.25 < active.mean() < 0.75 and 0.25 < wrist.mean() < 0.75
+    active = goal.active["level"]
+    wrist = goal["level"].wrist[:, 0]
+    assert 0.25 < active.mean() < 0.75
+    assert 0.25 < wrist.mean() < 0.75
     found = finished_episodes(rollout, task)
     np.testing.assert_array_equal(found["episode/mask_level"], active)
 
@@ -160,15 +165,15 @@ def episodes(task):
     # removal.
     height = np.asarray(rollout.trace.wrist_position - rollout.trace.object_position)[..., 2]
     final = np.asarray(rollout.trace.table)[-1] == 0
-    assert final.all() and task.hold_steps == 1
+    assert final.all()
+    assert task.hold_steps == 1
     np.testing.assert_allclose(
         found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
     )
     paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
     np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
-    assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][
-        ~active
-    ].any()
+    assert (found["term/level_height"][active] < 0).all()
+    assert not found["term/level_height"][~active].any()
     assert layout(hand, task)[-2:] == (("level", 2), ("mask", 1))
     block = np.asarray(rollout.observation)[..., -3:-1]
     np.testing.assert_array_equal(block[0, :, 0], active & wrist)
@@ -188,9 +193,8 @@ def tables(task, values):
     from congrasp.services.evaluate import columns, episodes, scores
     from tests.rows import summarised
 
-    assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {
-        "level_m": "level_m"
-    }
+    assert scores.TABLES["single"][-1] == "level"
+    assert scores.ERRORS["level"] == {"level_m": "level_m"}
     alone = values["mask_level"] > 0
     plan = {"identity": np.arange(len(alone)), "mass_kg": np.full(len(alone), 0.2)}
     some = {
@@ -206,7 +210,8 @@ def tables(task, values):
         objects=list("abcdefgh"),
     )
     np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
-    assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
+    assert row.to_json()["level_m"] == row.errors["level_m"]
+    assert row.errors["heading_m"] is None
     assert "level" in columns.RATE["error"](row) or "level" in columns.RATE["constraint"](row)
 
 
@@ -216,7 +221,8 @@ def server(task):
     from congrasp.services.serve.requests import Layout
 
     layout = Layout(get_hand("human"), task)
-    assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (2,)
+    assert layout.shapes["level_wrist"] == (1,)
+    assert layout.shapes["asked"] == (2,)
     assert layout.description()["fields"]["level_wrist"] == [layout.offsets["level_wrist"], 1]
 
 
@@ -246,9 +252,8 @@ def command_line():
     parsed = parse_errors.parse("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
-    assert list(request.constraints) == ["heading", "level"] and request.constraints["level"][
-        "wrist"
-    ].tolist() == [True]
+    assert list(request.constraints) == ["heading", "level"]
+    assert request.constraints["level"]["wrist"].tolist() == [True]
     assert RunConfig().task.reward.level_height == 0.7
 
 
@@ -284,7 +289,8 @@ def marker():
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
     arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
     drawn = dict(markers(goal_arrays(arrays), active_blocks(arrays)))
-    assert list(drawn) == ["heading", "level"] and drawn["level"].points[1, 2] == 0.01
+    assert list(drawn) == ["heading", "level"]
+    assert drawn["level"].points[1, 2] == 0.01
 
 
 def studio(task):
@@ -298,7 +304,8 @@ def studio(task):
     made.choose("level", "wrist", [True])
     row = {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}}
     assert row in describe(made)["constraints"]
-    assert made.asked == {"level"} and made.request.constraints["level"]["wrist"].tolist() == [True]
+    assert made.asked == {"level"}
+    assert made.request.constraints["level"]["wrist"].tolist() == [True]
 
 
 def onnx(task):
@@ -308,7 +315,8 @@ def onnx(task):
     from congrasp.services.train.command import untrained
 
     said = describe(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2))))
-    assert said["masks"][-1] == "level" and ["level", 2] in said["layout"]
+    assert said["masks"][-1] == "level"
+    assert ["level", 2] in said["layout"]
     fields = [entry for entry in said["observation"] if entry["block"] == "level"]
     assert [(entry["field"], entry["size"], entry["meaning"]) for entry in fields] == [
         ("level_wrist", 1, "1 for the wrist"),
@@ -323,16 +331,17 @@ def term():
     from congrasp.common.task.reward import reward_terms, terms
     from tests.scenes import evaluated, scene, scene_of
 
-    task, (state, surface, goal) = TaskConfig(constraints=("heading",)), scene(0, batch=3)
+    task = TaskConfig(constraints=("heading",))
+    state, surface, goal = scene(0, batch=3)
     start = state.object_position_initial * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.1]
     risen = start + np.array([[0.0, 0.0, 0.05], [0.0, 0.0, -0.05], [0.0, 0.0, 0.8]])
     state = state._replace(object_position=risen, object_position_initial=start)
     weights = dataclasses.replace(RewardWeights(), height=3.0)
     paid = evaluated(reward_terms, scene_of(task, state, surface, goal), weights)
     np.testing.assert_allclose(paid["height"], [3.0 * 0.05, 0.0, 3.0 * 0.2], rtol=1e-5)
-    assert (
-        set(paid) == set(terms(task)) and "height" in terms(task) and RewardWeights().height == 2.0
-    )
+    assert set(paid) == set(terms(task))
+    assert "height" in terms(task)
+    assert RewardWeights().height == 2.0
     config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))
     assert run_config_from_json(to_json(config)) == config
 

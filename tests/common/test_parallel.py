@@ -123,7 +123,8 @@ def test_a_script_without_a_guard_runs_once(kind, by, tmp_path):
         )
     lines = [line for line in done.stdout.splitlines() if line.startswith(("started", "RESULT"))]
     assert lines == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}"], done.stderr
-    assert done.returncode == 0 and "Traceback" not in done.stderr
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
 
 
 def _dedented(text):

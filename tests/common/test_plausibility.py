@@ -45,7 +45,8 @@ def deepest_contact(name: str, q: np.ndarray) -> float:
     """Deepest contact in metres between the links in MuJoCo, whose hand excludes what it
     excludes.
     """
-    hand, spec = get_hand(name), mujoco.MjSpec()
+    hand = get_hand(name)
+    spec = mujoco.MjSpec()
     hand = dataclasses.replace(
         hand, links=tuple(dataclasses.replace(link, solids=()) for link in hand.links)
     )
@@ -84,7 +85,8 @@ def test_no_points_of_two_segments_are_nearer_than_their_distance(seed):
 
 @pytest.mark.parametrize("name", HANDS)
 def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
-    hand, rng = get_hand(name), np.random.default_rng(0)
+    hand = get_hand(name)
+    rng = np.random.default_rng(0)
     measured = jax.jit(lambda q: hand_hand(hand, link_transforms(hand, q)))
     poses = [
         hand.q_open,
@@ -94,7 +96,8 @@ def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
     found = np.asarray(measured(np.array(poses, np.float32)))
     np.testing.assert_allclose(found, [deepest_contact(name, q) for q in poses], atol=1e-5)
     # Open hands are free of themselves, some poses are not
-    assert found[0] == 0.0 and found.max() > 0.002
+    assert found[0] == 0.0
+    assert found.max() > 0.002
 
 
 def test_hand_in_table_is_the_lowest_point_of_a_capsule():
@@ -119,8 +122,10 @@ def test_hand_in_object_is_the_radius_less_the_axis_distance():
     hand, transforms = posed("human", np.zeros(20))
     ball = procedural.generate(1, "ball")
     ball = type(ball)(**{**ball.__dict__, "pieces": (Piece("ellipsoid", (0.03, 0.03, 0.03)),)})
-    field, index = distance_field([ball]), np.zeros(1, int)
-    tip, radius = np.array(hand.links[6].tip), hand.links[6].capsules[0].radius
+    field = distance_field([ball])
+    index = np.zeros(1, int)
+    tip = np.array(hand.links[6].tip)
+    radius = hand.links[6].capsules[0].radius
     along = tip - np.array(hand.links[6].capsules[0].start)
     along /= np.linalg.norm(along)
     for gap in (0.010, 0.0, -0.004):

@@ -47,8 +47,11 @@ def test_file_keeps_everything_exactly(bundle, tmp_path):
     path = tmp_path / "policy.safetensors"
     bundles.save(bundle, path)
     loaded = bundles.load(path)
-    assert (loaded.spec, loaded.task) == (bundle.spec, bundle.task)
-    assert (loaded.version, loaded.run_id, loaded.transitions) == (12, "ab12", 3_000_000_000)
+    assert loaded.spec == bundle.spec
+    assert loaded.task == bundle.task
+    assert loaded.version == 12
+    assert loaded.run_id == "ab12"
+    assert loaded.transitions == 3_000_000_000
     for name in ("params", "observation", "value"):
         jax.tree.map(
             np.testing.assert_array_equal,
@@ -65,9 +68,12 @@ def test_policy_without_critic_acts_as_before(bundle, tmp_path):
     names = set(safetensors.numpy.load_file(path))
     assert {name.split("/")[0] for name in names} == {"actor", "observation"}
     loaded = bundles.load(path)
-    assert bundle.has_critic and not loaded.has_critic
+    assert bundle.has_critic
+    assert not loaded.has_critic
     assert loaded.actor_sha256 == bundle.actor_sha256
-    assert (loaded.spec, loaded.task, loaded.version) == (bundle.spec, bundle.task, 12)
+    assert loaded.spec == bundle.spec
+    assert loaded.task == bundle.task
+    assert loaded.version == 12
     jax.tree.map(
         np.testing.assert_array_equal,
         loaded.inference_parameters,
@@ -86,7 +92,8 @@ def test_policy_with_a_part_of_a_critic_is_refused(bundle):
 def test_new_critic_is_that_of_an_untrained_policy(bundle):
     begun = bundles.with_new_critic(bundles.without_critic(bundle), 5)
     jax.tree.map(np.testing.assert_array_equal, begun.params, bundle.params)
-    assert begun.value.count == 0 and begun.actor_sha256 == bundle.actor_sha256
+    assert begun.value.count == 0
+    assert begun.actor_sha256 == bundle.actor_sha256
 
 
 def _actor_bias(bundle: PolicyBundle) -> PolicyBundle:
@@ -245,7 +252,8 @@ def test_new_weights_do_not_compile_again(bundle):
 def test_spec_of_the_real_task():
     config = RunConfig()
     spec = bundles.policy_spec(config.task, config.network)
-    assert (spec.hand, spec.action_size) == ("human", 26)
+    assert spec.hand == "human"
+    assert spec.action_size == 26
     network.check_layout(spec.layout)
 
 
@@ -253,7 +261,8 @@ def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
     seen = (("mass", 1), ("observation", 4))
     statistics = Statistics(np.float64(3), np.arange(5.0), np.ones(5))
     wide = bundles.with_inputs_of(dataclasses.replace(SPEC, privileged=seen), bundle.task, bundle)
-    assert wide.spec.schema == bundle.spec.schema and wide.spec.privileged_size == 5
+    assert wide.spec.schema == bundle.spec.schema
+    assert wide.spec.privileged_size == 5
     bundles.save(dataclasses.replace(wide, privileged=statistics), tmp_path / "p")
     loaded = bundles.load(tmp_path / "p")
     assert loaded.spec.privileged == seen
@@ -274,7 +283,8 @@ def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
 
 def test_a_policy_that_observes_less_begins_with_the_same_actions():
     sizes = NetworkConfig(hidden=(8, 4), encoder=3)
-    plain, normals = TaskConfig(surface_normals=False), TaskConfig(surface_normals=True)
+    plain = TaskConfig(surface_normals=False)
+    normals = TaskConfig(surface_normals=True)
     spec, wider = (bundles.policy_spec(task, sizes) for task in (plain, normals))
     rng = np.random.default_rng(2)
     names = [
@@ -284,7 +294,8 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
     ]
     kept = np.ones(sum(size for _, size in wider.layout), bool)
     kept[: len(names)] = [name not in ("normal", "height") for name in names]
-    count, size = 1e9, np.count_nonzero(kept)
+    count = 1e9
+    size = np.count_nonzero(kept)
     seen = Statistics(np.float64(count), rng.normal(size=size), count * rng.uniform(0.5, 2.0, size))
     params = network.init(5, spec.layout, spec.action_size, sizes, spec.privileged_size)
     less = PolicyBundle(spec, plain, params, seen, normalizer.empty(), 3, "ab", 4)

@@ -48,7 +48,8 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     get_hand.cache_clear()
     mine = dataclasses.replace(get_hand("human"), name="mine")
     (tmp_path / "mine.json").write_text(hand_text(mine))
-    assert pretrained_file("mine") is None and hands_with_policy() == pretrained_hands()
+    assert pretrained_file("mine") is None
+    assert hands_with_policy() == pretrained_hands()
     with pytest.raises(CongraspError, match=r"for the hand 'mine'.*congrasp hands train"):
         policy_file(None, "mine")
     task = TaskConfig(hand=get_hand("mine").reference, constraints=("heading",))
@@ -103,7 +104,8 @@ def test_shipping_leaves_out_the_critic(tmp_path, monkeypatch, capsys):
     bundles.save(trained, tmp_path / "run.safetensors")
     ship.main([str(tmp_path / "run.safetensors"), "mine"])
     shipped = bundles.load(tmp_path / "mine.safetensors")
-    assert not shipped.has_critic and shipped.actor_sha256 == trained.actor_sha256
+    assert not shipped.has_critic
+    assert shipped.actor_sha256 == trained.actor_sha256
     assert trained.actor_sha256 in capsys.readouterr().out
 
 
@@ -113,10 +115,13 @@ def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):
     name = "allegro-student"
     file = named_policy(name)
     assert file == policy_file(pathlib.Path(name)) == module._FOLDER / f"{name}.safetensors"
-    student, teacher = bundles.load(file).task, bundles.load(policy_file(None, "allegro")).task
-    assert student.observation == "tracked" and student.hand == teacher.hand
+    student = bundles.load(file).task
+    teacher = bundles.load(policy_file(None, "allegro")).task
+    assert student.observation == "tracked"
+    assert student.hand == teacher.hand
     (entrant,) = read_entrants([name])
-    assert (entrant.hand, entrant.method) == ("allegro", "student")
+    assert entrant.hand == "allegro"
+    assert entrant.method == "student"
     (tmp_path / name).touch()
     assert policy_file(pathlib.Path(name)) == pathlib.Path(name)
     assert policy_file(pathlib.Path("folder", name)) == pathlib.Path("folder", name)

@@ -74,7 +74,8 @@ def test_heading_of_a_lone_trajectory():
     _, surface, asked = scene(0)
     path = asked["trajectory"].position.copy()
     turns = asked["trajectory"].quaternion.copy()
-    path[:, -1], turns[:, -1] = (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)
+    path[:, -1] = (1.0, 2.0, 3.0)
+    turns[:, -1] = (1.0, 0.0, 0.0, 0.0)
     asked = asked.replace("trajectory", position=path, quaternion=turns)
     q = 0.6 * HAND.q_open + 0.4 * HAND.q_closed
     tips = np.asarray(points_of(q))[len(HAND.links) :]
@@ -137,9 +138,8 @@ def _redirected(
         "heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross)
     )
     done = resolved(surface, asked, _flags(affordance=True))
-    assert np.all(done.redirected) and not np.any(
-        resolved(surface, done.goal, _flags(affordance=True)).redirected
-    )
+    assert np.all(done.redirected)
+    assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
 
 
@@ -161,7 +161,8 @@ def test_redirection_ends_at_the_surface():
     surface = heading.position - 0.02 * heading.direction
     assert np.linalg.norm(ring - surface, axis=-1).min() < 1e-6
     # From above, 3 mm of the ring or more are before each point but those of its upper half.
-    assert surface[2] > -0.001 and np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
+    assert surface[2] > -0.001
+    assert np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
 
 
 def test_redirection_is_the_smallest_rotation():
@@ -206,7 +207,8 @@ def test_redirected_headings_lead_to_the_graspable_region(seed):
     """
     _, surface, asked = scene(seed)
     done = resolved(surface, asked, _flags(affordance=True))
-    moved, heading = np.asarray(done.redirected), jax.device_get(done.goal["heading"])
+    moved = np.asarray(done.redirected)
+    heading = jax.device_get(done.goal["heading"])
     assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     before = heading.position - 0.02 * heading.direction
     away = np.where(
@@ -241,10 +243,8 @@ def test_trajectory_and_affordance_must_agree(end_x, aligned):
 
 def test_explanations_name_what_is_overridden():
     words = " ".join(explain(["affordance", "pose", "trajectory"]))
-    assert (
-        "only the fingers of the reference pose count" in words.lower()
-        and "overridden by the reference pose" in words
-    )
+    assert "only the fingers of the reference pose count" in words.lower()
+    assert "overridden by the reference pose" in words
     assert explain([]) == ["The heading guides the wrist."]
 
 
@@ -308,24 +308,23 @@ def test_trajectory_to_avoid_region_is_refused():
     end = np.array([0.08, 0.03, 0.0])
     path = np.linspace(end + np.array([0, 0.2, 0]), end, 15)
     found = only(AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))})
-    assert found.refused and (found.weaker, found.stronger) == ("affordance", "trajectory")
+    assert found.refused
+    assert found.weaker == "affordance"
+    assert found.stronger == "trajectory"
     graspable = np.hypot(0.08 - POINTS[~AVOID][:, 0].max(), 0.03)
-    assert (
-        "3.0 cm from the avoid region" in found.message
-        and f"{100 * graspable:.1f} cm from the" in found.message
-    )
+    assert "3.0 cm from the avoid region" in found.message
+    assert f"{100 * graspable:.1f} cm from the" in found.message
 
 
 def test_pose_off_the_trajectory_keeps_its_fingers():
-    pose, path = at((-0.06, 0.0, 0.0)), path_to((-0.06, 0.0, 0.0))
+    pose = at((-0.06, 0.0, 0.0))
+    path = path_to((-0.06, 0.0, 0.0))
     found = only(
         pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path
     )
     assert (found.weaker, found.stronger, found.refused) == ("pose", "trajectory", False)
-    assert (
-        "5.0 cm and 0 degrees" in found.message
-        and "only the fingers of the pose count" in found.message
-    )
+    assert "5.0 cm and 0 degrees" in found.message
+    assert "only the fingers of the pose count" in found.message
     turned = np.array([np.cos(0.5), np.sin(0.5), 0.0, 0.0])
     assert (
         "0.0 cm and 57 degrees"
@@ -338,7 +337,8 @@ def test_pose_on_avoid_region_names_the_links():
     pose = {"q": np.zeros(20), "quaternion": NOT_TURNED}
     found = only(AVOID, pose={**pose, "position": np.array([0.08, 0.0, 0.0]) - tip})
     assert (found.weaker, found.stronger, found.refused) == ("affordance", "pose", False)
-    assert "index_distal" in found.message and "thumb" not in found.message
+    assert "index_distal" in found.message
+    assert "thumb" not in found.message
     assert all_of(AVOID, pose={**pose, "position": np.array([-0.08, 0, 0]) - tip}) == []
 
 
@@ -347,8 +347,10 @@ def test_contradicting_heading_is_overridden(stronger):
     place = (-0.06, 0.0, 0.0)
     reference = {"pose": at(place)} if stronger == "pose" else {"trajectory": path_to(place)}
     found = only(heading={"direction": -HEADING}, **reference)
-    assert (found.weaker, found.stronger) == ("heading", stronger)
-    assert "180 degrees" in found.message and f"The {stronger} overrides it" in found.message
+    assert found.weaker == "heading"
+    assert found.stronger == stronger
+    assert "180 degrees" in found.message
+    assert f"The {stronger} overrides it" in found.message
 
 
 def test_heading_to_avoid_region_is_redirected():
@@ -357,6 +359,5 @@ def test_heading_to_avoid_region_is_redirected():
         heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])},
     )
     assert (found.weaker, found.stronger, found.refused) == ("heading", "affordance", False)
-    assert (
-        "0.0 cm from the avoid region" in found.message and "redirects the heading" in found.message
-    )
+    assert "0.0 cm from the avoid region" in found.message
+    assert "redirects the heading" in found.message

@@ -62,7 +62,8 @@ def test_the_hold_runs_down_once_the_table_is_gone(time, remaining):
 def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
     found = observed(time, hold, mass, friction)
     assert np.isfinite(list(found.values())).all()
-    assert 0.0 <= found["hold_remaining"] <= 1.0 and 0.0 <= found["load"] <= privileged.MOST_LOAD
+    assert 0.0 <= found["hold_remaining"] <= 1.0
+    assert 0.0 <= found["load"] <= privileged.MOST_LOAD
 
 
 @pytest.mark.parametrize(

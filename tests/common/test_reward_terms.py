@@ -12,7 +12,8 @@ from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.reward import reward_terms
 from tests.scenes import HAND, L, evaluated, near_targets, scene, scene_of
 
-TASK, X = TaskConfig(), np.array([1.0, 0.0, 0.0])
+TASK = TaskConfig()
+X = np.array([1.0, 0.0, 0.0])
 turned = partial(rotations.multiply, rotations.from_rotation_vector(0.2 * X))
 # Links of thumb and index finger
 PRESSING, HARD, SOFT, FREE = np.flatnonzero(np.isin(HAND.link_fingers, (0, 1)))[:4]

@@ -24,7 +24,8 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
 @settings(max_examples=15, deadline=None)
 @given(seeds, seeds)
 def test_products_rotations_and_matrices_agree_with_scipy(a, b):
-    first, second = _random(a), _random(b)
+    first = _random(a)
+    second = _random(b)
     vectors = np.random.default_rng(a).normal(size=(8, 3)).astype(np.float32)
     np.testing.assert_allclose(
         np.abs(np.sum(rotations.multiply(_wxyz(first), _wxyz(second)) * _wxyz(first * second), -1)),
@@ -113,7 +114,8 @@ def test_the_shortest_rotation_carries_one_vector_to_the_other(seed):
         for v in rng.normal(size=(3, 8, 3)).astype(np.float32)
     )
     axis = np.cross(a, c) / np.linalg.norm(np.cross(a, c), axis=-1, keepdims=True)
-    b[0], b[1] = -a[0], a[1]
+    b[0] = -a[0]
+    b[1] = a[1]
     turn = np.asarray(rotations.shortest(a, b, axis))
     np.testing.assert_allclose(rotations.rotate(turn, a), b, atol=2e-5)
     expected = np.arccos(np.clip(np.sum(a * b, -1), -1.0, 1.0))
@@ -130,8 +132,10 @@ def test_axis_rotation_by_hand():
 
 def test_poses_compose_and_invert():
     rng = np.random.default_rng(3)
-    p, q = rng.normal(size=(8, 3)).astype(np.float32), _wxyz(_random(1))
-    p2, q2 = rng.normal(size=(8, 3)).astype(np.float32), _wxyz(_random(2))
+    p = rng.normal(size=(8, 3)).astype(np.float32)
+    q = _wxyz(_random(1))
+    p2 = rng.normal(size=(8, 3)).astype(np.float32)
+    q2 = _wxyz(_random(2))
     local = rotations.relative_pose(p, q, p2, q2)
     back = rotations.compose_pose(p, q, *local)
     np.testing.assert_allclose(back[0], p2, atol=1e-5)

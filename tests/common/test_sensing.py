@@ -222,14 +222,19 @@ def test_trackers_are_drawn_from_their_ranges():
         (0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03)
     )
     drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 500))
-    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and longest(config, 0.01) == 11
-    assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
-    assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
-    assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
+    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10}
+    assert longest(config, 0.01) == 11
+    assert drawn.period.min() == 1.0
+    assert 9.9 < drawn.period.max() <= 10.0
+    assert 0.1 <= drawn.dropout.min() < 0.11
+    assert 0.29 < drawn.dropout.max() <= 0.3
+    assert drawn.position_noise.max() <= 0.01
+    assert drawn.rotation_noise.min() >= 0.02
     assert set(np.unique(drawn.latency)) == {0, 1, 2, 3}
     assert len(np.unique(drawn.key, axis=0)) == 500
     perfect = jax.device_get(_draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
-    assert not any(np.any(field) for field in perfect[3:-1]) and (perfect.period == 1.0).all()
+    assert not any(np.any(field) for field in perfect[3:-1])
+    assert (perfect.period == 1.0).all()
 
 
 _push = jax.jit(push)
@@ -281,7 +286,8 @@ def tracked(*given):
 
 def named(row):
     """Parts of an observation by block and field."""
-    found, start = {}, 0
+    found = {}
+    start = 0
     for block, content in observation.fields(HAND, TASK).items():
         for field in content:
             found[block, field.name] = row[start : start + field.size]
@@ -324,7 +330,8 @@ def test_tracked_state_uses_the_tracked_pose():
                     own.pop((block, field.name)), part, atol=1e-5, err_msg=field.name
                 )
             start += field.size
-    assert all(name.startswith("past") for _, name in own) and len(own) == 6
+    assert all(name.startswith("past") for _, name in own)
+    assert len(own) == 6
 
 
 def test_its_past_is_worked_out_by_hand():
@@ -367,15 +374,14 @@ def test_wrist_velocity_is_the_last_displacement():
     np.testing.assert_allclose(
         seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5
     )
-    assert (
-        not seen.contact_found.any()
-        and not seen.contact_force.any()
-        and not seen.object_velocity.any()
-    )
+    assert not seen.contact_found.any()
+    assert not seen.contact_force.any()
+    assert not seen.object_velocity.any()
     full = get_sensor(FULL).seen(FULL, state, readings)
     np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
     np.testing.assert_array_equal(full.contact_force, state.contact_force)
-    assert full.q_velocity.shape == (4, F) and full.contact_found.shape[1] == L
+    assert full.q_velocity.shape == (4, F)
+    assert full.contact_found.shape[1] == L
 
 
 @pytest.mark.parametrize(("latency", "faults"), [(0.07, 0), (0.08, 1)])

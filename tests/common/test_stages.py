@@ -22,7 +22,8 @@ def test_stages_are_in_the_order_of_their_begin_and_only_the_first_of_a_name_cou
     assert [one.name for one in kept] == ["imports", "outer", "inner"]
     assert stages.stages() == kept
     outer, inner = kept[1:]
-    assert outer.began <= inner.began and inner.ended <= outer.ended
+    assert outer.began <= inner.began
+    assert inner.ended <= outer.ended
     assert inner.ended - inner.began >= 0.02
     assert [record.getMessage().split()[1] for record in caplog.records] == [
         "imports",

@@ -24,7 +24,8 @@ def of_mesh(mesh: trimesh.Trimesh) -> GraspObject:
     """An object whose real surface is this mesh, and whose physics is its convex hull."""
     base = procedural.generate(0, "box")
     hull = Piece("mesh", (0.0, 0.0, 0.0), vertices=np.asarray(mesh.convex_hull.vertices))
-    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+    vertices = np.asarray(mesh.vertices, np.float32)
+    faces = np.asarray(mesh.faces, np.int32)
     return dataclasses.replace(base, pieces=(hull,), visual_vertices=vertices, visual_faces=faces)
 
 
@@ -86,7 +87,8 @@ def test_distances_worked_out_by_hand(piece, point, distance):
     seed=st.integers(0, 1000),
 )
 def test_off_the_surface_of_a_convex_piece_it_is_the_way_along_the_normal(kind, size, seed):
-    piece, rng = Piece(kind, size), np.random.default_rng(seed)
+    piece = Piece(kind, size)
+    rng = np.random.default_rng(seed)
     points, normals, _ = shapes.propose(piece, rng.random((50, 4)))
     way = rng.uniform(0.0, 0.03, 50)
     np.testing.assert_allclose(
@@ -100,7 +102,9 @@ def test_grids_of_primitives_are_near_the_exact_distance(family):
     points, _ = near(obj)
     exact = np.asarray(primitive_distance(obj.pieces, points))
     error = np.abs(at(distance_field([obj]), points) - exact)[(exact > 0.002) & (exact < 0.022)]
-    assert error.mean() < 1e-4 and np.percentile(error, 99) < 5e-4 and error.max() < 1e-3
+    assert error.mean() < 1e-4
+    assert np.percentile(error, 99) < 5e-4
+    assert error.max() < 1e-3
 
 
 @pytest.mark.parametrize("oriented", [True, False])
@@ -117,7 +121,8 @@ def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(
     found = at(distance_field([obj]), points)
     # At the hole's axis it has a kink
     error = np.abs(found - exact)[(exact > 0.002) & (exact < 0.017)]
-    assert error.mean() < 1e-4 and np.percentile(error, 99) < 5e-4
+    assert error.mean() < 1e-4
+    assert np.percentile(error, 99) < 5e-4
     hole, wall = at(distance_field([obj]), np.array([[0.005, 0.0, 0.0], [0.0275, 0.0, 0.0]]))
     assert hole == pytest.approx(0.015, abs=3e-4)  # not filled
     assert wall == pytest.approx(-0.0075, abs=1e-3)
@@ -125,7 +130,8 @@ def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(
 
 def test_each_object_has_its_own_grid_and_far_points_are_far():
     objects = [procedural.generate(1, "ball"), procedural.generate(2, "box")]
-    field, own = distance_field(objects), [distance_field([obj]) for obj in objects]
+    field = distance_field(objects)
+    own = [distance_field([obj]) for obj in objects]
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (40, 3))
     both = _at(field, np.array([1, 0]), np.stack([points, points]).astype(np.float32))
     np.testing.assert_allclose(both, [at(own[1], points), at(own[0], points)], atol=1e-7)
@@ -165,15 +171,18 @@ def sphere(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     half = np.array([0.03, 0.05, 0.07])
     areas = np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
-    axis, side = rng.choice(3, COUNT, p=areas / areas.sum()), rng.choice([-1.0, 1.0], COUNT)
+    axis = rng.choice(3, COUNT, p=areas / areas.sum())
+    side = rng.choice([-1.0, 1.0], COUNT)
     normals = side[:, None] * np.eye(3)[axis]
     points = rng.uniform(-half, half, (COUNT, 3))
     return np.where(normals != 0, normals * half, points), normals
 
 
 def cylinder(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    radius, half = 0.03, 0.06
-    angle, cap = rng.uniform(0, 2 * np.pi, COUNT), rng.random(COUNT) < radius / (radius + 2 * half)
+    radius = 0.03
+    half = 0.06
+    angle = rng.uniform(0, 2 * np.pi, COUNT)
+    cap = rng.random(COUNT) < radius / (radius + 2 * half)
     round_ = np.stack([np.cos(angle), np.sin(angle), np.zeros(COUNT)], -1)
     side = np.stack([np.zeros(COUNT), np.zeros(COUNT), rng.choice([-1.0, 1.0], COUNT)], -1)
     wall = radius * round_ + rng.uniform(-half, half, COUNT)[:, None] * [0, 0, 1]
@@ -211,7 +220,8 @@ def test_estimated_normals_are_near_the_exact_ones(shape, median, most, inward):
     found = np.asarray(estimate(clouds.astype(np.float32)))
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-5)
     errors = degrees(found, exact)
-    assert np.median(errors) < median and np.percentile(errors, 90) < most
+    assert np.median(errors) < median
+    assert np.percentile(errors, 90) < most
     assert np.mean(errors > 90) <= inward
 
 

@@ -41,15 +41,20 @@ def _compiled(function: Callable) -> Callable:
 
 
 FEATURES = jax.jit(functools.partial(features, HAND, TASK))
-OBSERVE, REWARD, ERRORS = _compiled(observe), _compiled(reward_terms), _compiled(errors)
-DECODE, GUIDANCE = _compiled(decode), _compiled(guidance_pose)
-WRIST, TO_JOINTS = jax.jit(wrist_pose), jax.jit(wrist_to_joints)
+OBSERVE = _compiled(observe)
+REWARD = _compiled(reward_terms)
+ERRORS = _compiled(errors)
+DECODE = _compiled(decode)
+GUIDANCE = _compiled(guidance_pose)
+WRIST = jax.jit(wrist_pose)
+TO_JOINTS = jax.jit(wrist_to_joints)
 HEADING_WRIST = jax.jit(functools.partial(heading_wrist_pose, HAND))
 CENTER = jax.jit(functools.partial(hand_center, HAND))
 
 
 def _blocks(observation: np.ndarray) -> dict[str, np.ndarray]:
-    out, start = {}, 0
+    out = {}
+    start = 0
     for name, size in layout(HAND, TASK):
         out[name] = np.asarray(observation)[:, start : start + size]
         start += size
@@ -115,7 +120,8 @@ def test_without_an_avoid_region_there_is_nothing_to_avoid():
         state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal
     ).by_constraint["affordance"]
     assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
-    assert not np.any(geometry.nearest) and not np.any(geometry.touching)
+    assert not np.any(geometry.nearest)
+    assert not np.any(geometry.touching)
 
 
 def test_observation_blocks_by_hand():
@@ -305,7 +311,8 @@ def test_dropping_is_seen_five_centimetres_down():
 def test_fingers_integrate_actions_within_their_limits():
     state, surface, goal = scene(14)
     action = np.zeros((4, F + 6), np.float32)
-    action[:, 0], action[:, 1] = 1.0, 100.0
+    action[:, 0] = 1.0
+    action[:, 1] = 100.0
     target = DECODE(state, surface, goal, TASK.control, action).q_target
     np.testing.assert_allclose(
         target[:, 0],
@@ -380,7 +387,8 @@ def test_wrist_target_is_guidance_plus_residual():
         wrist_acceleration=0.0,
         wrist_angular_acceleration=0.0,
     )
-    zero, one = np.zeros((4, F + 6), np.float32), np.zeros((4, F + 6), np.float32)
+    zero = np.zeros((4, F + 6), np.float32)
+    one = np.zeros((4, F + 6), np.float32)
     one[:, F:] = 1.0
     still, pushed = (np.asarray(DECODE(state, surface, goal, far, a).u_target) for a in (zero, one))
     np.testing.assert_allclose(pushed - still, np.tile([0.02] * 3 + [0.1] * 3, (4, 1)), atol=1e-5)
@@ -399,11 +407,13 @@ def test_no_action_drives_the_wrist_beyond_its_limits():
     state, surface, goal = scene(17)
     state = state._replace(table=np.array([True, False, True, False]))
     share = np.where(state.table, 1.0, 1 / 3)
-    wrist, (mass, inertia) = HAND.wrist, HAND.wrist_inertia
+    wrist = HAND.wrist
+    mass, inertia = HAND.wrist_inertia
     for scale in (0.0, 1.0, -30.0):
         action = np.full((4, F + 6), scale, np.float32)
         target = np.asarray(DECODE(state, surface, goal, TASK.control, action).u_target)
-        lead, speed = target - state.u, state.u_velocity
+        lead = target - state.u
+        speed = state.u_velocity
         for part, kp, kv, inert, most, farthest in (
             (slice(0, 3), wrist.slide_kp, wrist.slide_kv, mass, 15.0, 0.04),
             (slice(3, 6), wrist.hinge_kp, wrist.hinge_kv, inertia, 150.0, 0.3),
@@ -445,13 +455,17 @@ def test_a_wrist_at_rest_starts_towards_its_guidance():
 def test_metrics_against_numpy():
     state, surface, goal = scene(18)
     geometry = FEATURES(state, surface, goal)
-    found, weights = {}, {}
+    found = {}
+    weights = {}
     for name, (numerator, denominator) in ERRORS(state, surface, goal).items():
-        found[name], weights[name] = np.asarray(numerator), np.asarray(denominator)
+        found[name] = np.asarray(numerator)
+        weights[name] = np.asarray(denominator)
     b = 0
     wrist_position, wrist_quaternion = (np.asarray(x)[b] for x in WRIST(state))
-    wrist, body = _rotation(wrist_quaternion), _rotation(state.object_quaternion[b])
-    v, target = wrist.apply(grasp_frame(HAND).heading), body.apply(goal["heading"].direction[b])
+    wrist = _rotation(wrist_quaternion)
+    body = _rotation(state.object_quaternion[b])
+    v = wrist.apply(grasp_frame(HAND).heading)
+    target = body.apply(goal["heading"].direction[b])
     np.testing.assert_allclose(
         found["heading_rad"][b], np.arccos(np.clip(v @ target, -1, 1)), atol=1e-4
     )
@@ -527,10 +541,8 @@ def test_an_error_is_divided_by_the_steps_that_were_summed(steps):
     """
     one = np.ones(1)
     step = {spec.name: (0.2 * one, one) for spec in metrics.specs(TASK)}
-    sums, accumulate = (
-        metrics.empty_sums(TASK, 1),
-        jax.jit(functools.partial(metrics.accumulate, TASK)),
-    )
+    sums = metrics.empty_sums(TASK, 1)
+    accumulate = jax.jit(functools.partial(metrics.accumulate, TASK))
     for _ in range(steps):
         sums = accumulate(sums, step, approach=one > 0, hold=one < 0)
     found = metrics.episode_errors(TASK, sums)

@@ -22,7 +22,8 @@ from congrasp.common.task.sampling.trajectories import HUMAN, PAPER, make_trajec
 from tests.scenes import quaternions
 
 HAND = get_hand("human")
-COUNT, WAYPOINTS = 64, 15
+COUNT = 64
+WAYPOINTS = 15
 
 
 def _make(position, quaternion, style):
@@ -96,7 +97,8 @@ def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
 
 
 MANY = 4000
-fingers_off, wrist_off = jax.jit(disturbed_fingers, static_argnums=0), jax.jit(disturbed_wrist)
+fingers_off = jax.jit(disturbed_fingers, static_argnums=0)
+wrist_off = jax.jit(disturbed_wrist)
 
 
 def _uniform(batch, numbers):
@@ -118,7 +120,8 @@ def test_fingers_are_off_by_closure_and_joint():
     middle = 0.5 * (HAND.lower + HAND.upper)
     q = jnp.tile(jnp.array(middle), (MANY, 1))
     found = np.asarray(fingers_off(HAND, q, jnp.ones(MANY), _uniform(MANY, fingers_numbers(HAND))))
-    assert np.all(found >= HAND.lower) and np.all(found <= HAND.upper)
+    assert np.all(found >= HAND.lower)
+    assert np.all(found <= HAND.upper)
     wide = np.argmax(HAND.upper - HAND.lower)  # 2.1 rad: clipping hardly matters
     way = middle[wide] - HAND.q_open[wide]
     np.testing.assert_allclose(

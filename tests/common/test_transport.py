@@ -126,7 +126,8 @@ def test_errors_travel_in_words(pair):
         client.query(KEYS.act, Message(meta={"bug": False}), timeout=60)
     with pytest.raises(RefusedError, match="ValueError") as caught:
         client.query(KEYS.act, Message(meta={"bug": True}), timeout=60)
-    assert "secret" not in str(caught.value) and type(caught.value) is RefusedError
+    assert "secret" not in str(caught.value)
+    assert type(caught.value) is RefusedError
     with pytest.raises(OverloadedError, match=r"^Ask later\.$"):
         client.query(KEYS.act, Message(meta={"bug": False, "busy": True}), timeout=60)
 
@@ -189,7 +190,8 @@ def test_query_after_the_server_closed_fails_at_once(pair):
 
 def test_closing_waits_for_handlers_that_still_work(pair):
     server, client = pair
-    began, ended = threading.Event(), threading.Event()
+    began = threading.Event()
+    ended = threading.Event()
 
     def handler(key, message):
         began.set()
@@ -269,7 +271,8 @@ def test_closed_subscription_lets_its_reader_go(pair):
 
 def test_tokens_show_who_is_there(pair):
     server, client = pair
-    early, late = KEYS.alive("actor", "a", "01"), KEYS.alive("actor", "b", "02")
+    early = KEYS.alive("actor", "a", "01")
+    late = KEYS.alive("actor", "b", "02")
     seen = []
     client.declare_alive(early)
     server.watch_alive(KEYS.everyone, lambda key, alive: seen.append((key, alive)))
@@ -282,7 +285,8 @@ def test_tokens_show_who_is_there(pair):
 
 def test_memory_copies_nothing():
     hub = MemoryHub()
-    server, client = MemoryTransport(hub), MemoryTransport(hub)
+    server = MemoryTransport(hub)
+    client = MemoryTransport(hub)
     server.serve(KEYS.act, lambda key, message: message)
     message = Message({"x": object()})
     assert client.query(KEYS.act, message, timeout=60) is message
@@ -375,8 +379,10 @@ def test_damaged_and_oversized_messages_are_refused():
         whole = encode(Message({"x": np.zeros(8)}))
         for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
             reply = next(iter(session.get(KEYS.act, payload=payload, timeout=60)))
-            assert reply.err is not None and b"message" in reply.err.payload.to_bytes().lower()
-        assert len(damaged) == 4 and "checksum" in damaged[3]
+            assert reply.err is not None
+            assert b"message" in reply.err.payload.to_bytes().lower()
+        assert len(damaged) == 4
+        assert "checksum" in damaged[3]
         # Zenoh drops what is longer than the receiver takes, and the link goes on.
         assert not [r for r in session.get(KEYS.act, payload=bytes(2 << 20), timeout=0.5) if r.ok]
         assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=60).meta == {"n": 1}
@@ -509,7 +515,8 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     threads, settings = subprocess.run(
         command, capture_output=True, env=env, check=True
     ).stdout.split(b" ", 1)
-    assert int(threads) > zenoh_session._CLOSERS and b"tx: (worker_threads: 2)" in settings
+    assert int(threads) > zenoh_session._CLOSERS
+    assert b"tx: (worker_threads: 2)" in settings
 
 
 @pytest.mark.parametrize(

@@ -166,10 +166,12 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         hub.publish_weights(bundle(0), 0)
         actor = start(url)
         (message,) = eventually(lambda: rollouts.next_batch(1, 0.5))
-        assert (message.arrays["reward"] == 3.0).all() and message.meta["actor"] == "a"
+        assert (message.arrays["reward"] == 3.0).all()
+        assert message.meta["actor"] == "a"
         assert hub.status()["counters"]["accepted"] == 1
         actor.join(10)
-        assert not actor.is_alive() and getattr(actor, "exitcode", 0) == 0
+        assert not actor.is_alive()
+        assert getattr(actor, "exitcode", 0) == 0
         rollouts.close()
 
 
@@ -205,8 +207,10 @@ def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
         return json.loads(process.stdout.readline())
 
     with contextlib.ExitStack() as stack:
-        one, other = taker(), taker()
-        taken, given = take(one, 20), take(other, 20)
+        one = taker()
+        other = taker()
+        taken = take(one, 20)
+        given = take(other, 20)
         assert len({*taken, *given}) == 40
         one.stdin.close()
         assert one.wait(20) == 0

@@ -123,7 +123,8 @@ def test_a_mistake_in_a_manifest_is_found():
 def test_manifests_name_one_another_rightly():
     found = manifests()
     names = {(document["kind"], document["metadata"]["name"]) for document in found}
-    labels, ports = {}, {}
+    labels = {}
+    ports = {}
     for document in found:
         if document["kind"] in ("StatefulSet", "Deployment"):
             template = document["spec"]["template"]
@@ -197,9 +198,8 @@ def test_units_are_valid_and_confined(tmp_path):
         timeout=60,
         check=False,
     )
-    assert done.returncode == 0 and not any(copy.name in done.stderr for copy in copies), (
-        done.stderr
-    )
+    assert done.returncode == 0, done.stderr
+    assert not any(copy.name in done.stderr for copy in copies), done.stderr
     for copy in copies:
         confined = [
             "systemd-analyze",
@@ -269,13 +269,13 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path, variables, port):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
         given = load(arguments[0])(arguments[1:]).keywords
         options = given["options"]
-        assert (options.rank, options.ranks, options.coordinator) == (rank, 2, f"node-7:{port}")
+        assert options.rank == rank
+        assert options.ranks == 2
+        assert options.coordinator == f"node-7:{port}"
         assert options.listen == f"tcp/127.0.0.1:{port + 2}"
-        assert (
-            options.run_dir == tmp_path / "a run"
-            and given["config"].updates == 9
-            and options.inside
-        )
+        assert options.run_dir == tmp_path / "a run"
+        assert given["config"].updates == 9
+        assert options.inside
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,8 @@ def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, 
         ["bash", "-c", task["run"]], env={**environment, "PATH": path}, check=True, timeout=60
     )
     command, *rest = (tmp_path / "said").read_text().splitlines()
-    assert command == words[0] and words[1] in rest
+    assert command == words[0]
+    assert words[1] in rest
     load(command)(rest)
     check = [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash", "-"]
     for part in ("setup", "run"):
@@ -330,19 +331,18 @@ WORDS = {"min", "max", "sum", "by", "le", "rate", "histogram_quantile", "outcome
 
 
 def test_every_expression_names_metrics_that_are_exposed():
-    learner, actor, server, port = (
-        LearnerMetrics(lambda: STATUS),
-        ActorMetrics(),
-        ServerMetrics(),
-        free_port(),
-    )
+    learner = LearnerMetrics(lambda: STATUS)
+    actor = ActorMetrics()
+    server = ServerMetrics()
+    port = free_port()
     learner.update(dict.fromkeys(UPDATE, 1.0))
     server.health = lambda: {"ready": True, "version": 5, "queue": 2}
     server.answer("answered", 0.01)
     server.batch(3)
     with exposed(port, "127.0.0.1", learner, actor, server):
         found = scrape(port)
-    names, labels = {name for name, *_ in found}, {label for _, *rest in found for label in rest}
+    names = {name for name, *_ in found}
+    labels = {label for _, *rest in found for label in rest}
     expressions = [
         target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])
     ]
@@ -350,7 +350,8 @@ def test_every_expression_names_metrics_that_are_exposed():
     for expression in expressions:
         bare = re.sub(r"\{[^}]*\}|\[[^]]*\]", "", expression)
         used = set(re.findall(r"[a-z_]+", bare)) - WORDS
-        assert used and used <= names, expression
+        assert used, expression
+        assert used <= names, expression
         for value in re.findall(r'(?:figure|outcome|role)="([^"]+)"', expression):
             assert value in labels, expression
         assert all(
@@ -368,6 +369,7 @@ def test_the_panels_do_not_overlap():
             for x in range(at["x"], at["x"] + at["w"])
             for y in range(at["y"], at["y"] + at["h"])
         }
-        assert not cells & taken and max(x for x, _ in cells) < 24
+        assert not cells & taken
+        assert max(x for x, _ in cells) < 24
         taken |= cells
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])

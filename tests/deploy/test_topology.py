@@ -61,7 +61,8 @@ def hosts():
             pytest.skip("network namespaces cannot be made here: that needs root and iproute2")
         ip("-n", names["switch"], "link", "set", "bridge", "up")
         for number, (host, address) in enumerate(HOSTS.items()):
-            port, name = f"port{number}", names[host]
+            port = f"port{number}"
+            name = names[host]
             ip(
                 "-n",
                 name,
@@ -93,7 +94,8 @@ class Cluster:
     """The services as processes; volumes are folders."""
 
     def __init__(self, hosts: dict[str, list[str]], folder: pathlib.Path):
-        self._hosts, self._folder = hosts, folder
+        self._hosts = hosts
+        self._folder = folder
         self.processes: dict[str, subprocess.Popen[str]] = {}
 
     def words(self, service: str, words: list[str]) -> list[str]:
@@ -171,19 +173,18 @@ def test_a_run_on_three_hosts(hosts, tmp_path):
             trained = (run_dir / "version").exists() and int((run_dir / "version").read_text()) >= 1
             if trained and (asked := cluster.run("server", health)).returncode == 0:
                 break
-            assert cluster.processes["learner"].poll() is None and time.monotonic() < deadline, (
-                cluster.logs()
-            )
+            assert cluster.processes["learner"].poll() is None, cluster.logs()
+            assert time.monotonic() < deadline, cluster.logs()
             time.sleep(1.0)
         answer = json.loads(asked.stdout)
-        assert answer["ready"] and answer["hand"] == "human"
+        assert answer["ready"]
+        assert answer["hand"] == "human"
         observer = ["--certs", str(tmp_path / "certs" / "observer.0")]
         status = ["status", "--connect", "tls/learner:7447", *observer, "--json"]
         found = json.loads(cluster.run("actor", [*shlex.split(CONGRASP), *status]).stdout)
         roles = sorted(role["role"] for role in found["roles"])
-        assert (
-            roles == ["actor", "actor", "learner", "recorder", "server"] and found["warnings"] == []
-        )
+        assert roles == ["actor", "actor", "learner", "recorder", "server"]
+        assert found["warnings"] == []
         stranger = ["query", "--health", "--connect", "tls/server:7457", "--timeout", "3"]
         assert cluster.run("actor", [*shlex.split(CONGRASP), *stranger]).returncode != 0
     finally:

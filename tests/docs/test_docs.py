@@ -134,7 +134,8 @@ def test_the_mug_is_what_its_code_makes(tmp_path):
     runpy.run_path(str(ROOT / "examples" / "make_mug.py"))["main"](tmp_path)
     for name in ("mug.obj", "handle.obj"):
         made, shipped = (trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples"))
-        assert (ROOT / "examples" / name).stat().st_size < 200_000 and shipped.is_watertight
+        assert (ROOT / "examples" / name).stat().st_size < 200_000
+        assert shipped.is_watertight
         np.testing.assert_allclose(made.vertices, shipped.vertices, atol=2e-5)
         np.testing.assert_array_equal(made.faces, shipped.faces)
 
@@ -179,8 +180,10 @@ def test_the_loop_of_the_robots_page_runs_as_printed_with_numpy_and_zenoh_alone(
         done = run_in_base_install(code.replace("127.0.0.1:7457", f"127.0.0.1:{port}"))
     assert done.returncode == 0, done.stderr
     counted = dict(re.findall(r"(\w+)=(\d+)", done.stdout))
-    assert done.stdout.startswith("open Counters(") and counted["steps"] == "251"
-    assert int(counted["follow"]) >= 200 and int(counted["fallback"]) == 1
+    assert done.stdout.startswith("open Counters(")
+    assert counted["steps"] == "251"
+    assert int(counted["follow"]) >= 200
+    assert int(counted["fallback"]) == 1
 
 
 def example_lines():

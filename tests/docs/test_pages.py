@@ -114,7 +114,8 @@ def test_links_lead_somewhere(page):
 
 def test_the_functions_that_the_architecture_lists_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
-    file, found = "", 0
+    file = ""
+    found = 0
     for path, name in re.findall(r"^(\S+/\S*)? +(?:(?:[A-Z]\w+)\.)?(\w+) {2,}\S.*$", page, re.M):
         file = path or file
         if file:
@@ -151,7 +152,8 @@ def test_glossary_has_the_terms_of_task_and_training():
 @pytest.mark.parametrize(("term", "text"), glossary().items())
 def test_a_term_is_explained_in_few_sentences(term, text):
     sentences = re.findall(r"[.:?](?:\s|$)", text)
-    assert text and len(sentences) <= 3, term
+    assert text, term
+    assert len(sentences) <= 3, term
 
 
 def test_pages_link_to_the_glossary():
@@ -159,4 +161,5 @@ def test_pages_link_to_the_glossary():
     for page in PAGES:
         linked.update(re.findall(r"\]\([^)\s]*glossary\.md#([\w-]+)\)", page.read_text()))
     anchors = {slug(term) for term in glossary()}
-    assert linked and linked <= anchors
+    assert linked
+    assert linked <= anchors

@@ -66,7 +66,8 @@ def test_a_killed_learner_costs_no_rollout(cluster):
     # What a learner refused as stale before it died is a gap for the next one.
     assert final["counters"]["missing"] <= counts["made"] - counts["accepted"]
     assert_books_balance(final)
-    made, unknown = 0, 0
+    made = 0
+    unknown = 0
     for name in ("a", "b"):
         outcomes = cluster.outcomes(name)
         assert sorted(entry["sequence"] for entry in outcomes) == list(range(len(outcomes)))

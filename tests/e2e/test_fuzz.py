@@ -61,7 +61,8 @@ SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "4")) / 2
 SEED = int(os.environ.get("CONGRASP_FUZZ_SEED", "0"))
 KEYS = Keys("chaos")
 FORM = RolloutForm(3, 2, 32, 4, half=True)
-GROWTH, LONGEST = 150 << 20, 20.0  # bytes of memory; seconds of one message or file
+GROWTH = 150 << 20  # bytes of memory
+LONGEST = 20.0  # seconds of one message or file
 pytestmark = pytest.mark.timeout(240 + 2 * SECONDS)
 ODD = [
     None,
@@ -157,7 +158,8 @@ def odd_bytes(rng, data):
 
 def mutated(rng, message):
     """The bytes of a message with something odd in it, whose checksum is mostly right."""
-    arrays, meta = dict(message.arrays), dict(message.meta)
+    arrays = dict(message.arrays)
+    meta = dict(message.meta)
     with contextlib.suppress(CongraspError, ValueError, OverflowError, UnicodeEncodeError):
         for _ in range(rng.randrange(3)):
             meta = odd_tree(rng, meta)
@@ -182,7 +184,8 @@ def no_tracebacks():
             if record.exc_info:
                 found.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
 
-    handler, before = Handler(), threading.excepthook
+    handler = Handler()
+    before = threading.excepthook
     logging.getLogger().addHandler(handler)
     threading.excepthook = lambda arguments: found.append(repr(arguments.exc_value))
     try:
@@ -262,14 +265,17 @@ def served(endpoint, folder):
 
 
 def test_mutated_messages_at_every_key(tmp_path):
-    rng, endpoint = random.Random(SEED), f"tcp/127.0.0.1:{free_port()}"
+    rng = random.Random(SEED)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     asked, told = requests()
     with (
         no_tracebacks(),
         served(endpoint, tmp_path) as (hub, rollouts, recorder),
         ZenohTransport(connect=[endpoint]) as raw,
     ):
-        began, first, sent = time.monotonic(), 0, 0
+        began = time.monotonic()
+        first = 0
+        sent = 0
         while (now := time.monotonic()) < began + SECONDS:
             key, message = rng.choice(asked if rng.random() < 0.7 else told)
             name = f"{rng.randrange(2000)}.x"
@@ -283,7 +289,15 @@ def test_mutated_messages_at_every_key(tmp_path):
                 assert time.monotonic() - now < 2 * LONGEST, key
                 for answer in answers:
                     text = b"" if answer.ok else answer.err.payload.to_bytes()
-                    assert b"failed on" not in text and len(text) < 1500 and b"\n" not in text, (
+                    assert b"failed on" not in text, (
+                        key,
+                        text,
+                    )
+                    assert len(text) < 1500, (
+                        key,
+                        text,
+                    )
+                    assert b"\n" not in text, (
                         key,
                         text,
                     )
@@ -310,7 +324,9 @@ def test_mutated_messages_at_every_key(tmp_path):
             Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
             timeout=10.0,
         )
-        assert not recorder.error and recorder.messages and recorder.damaged
+        assert not recorder.error
+        assert recorder.messages
+        assert recorder.damaged
     print(
         f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out"
     )
@@ -326,7 +342,8 @@ def resealed(data):
     """The message with the checksum of its damaged data, as one who means harm would write it."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         length = int.from_bytes(data[:8], "little")
-        header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
+        header = json.loads(data[8 : 8 + length])
+        section = data[8 + length :]
         header = {
             "__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]},
             **header,
@@ -374,7 +391,8 @@ def _files(folder):
     for i in range(5):
         journal.write(actor="a", made=i)
     journal.close()
-    writer, convert = LogWriter(folder, "log"), Converter()
+    writer = LogWriter(folder, "log")
+    convert = Converter()
     for key, message in requests()[1][:4]:
         writer.write(*convert(key.replace("NAME", "a"), message, 10**18))
     writer.close()
@@ -406,7 +424,10 @@ def test_mutated_files_at_every_loader(tmp_path):
         load(path)
     # A process reads each pickle
     often = [0.1 if path.name == "pickle" else 1.0 for path in loaders]
-    began, first, count, refused = time.monotonic(), 0, 0, 0
+    began = time.monotonic()
+    first = 0
+    count = 0
+    refused = 0
     with no_tracebacks():
         while (now := time.monotonic()) < began + SECONDS or count < 50 * len(loaders):
             (path,) = rng.choices(list(loaders), often)
@@ -416,7 +437,8 @@ def test_mutated_files_at_every_loader(tmp_path):
                 loaders[path](path)
             except CongraspError as error:
                 refused += 1
-                assert "\n" not in str(error) and len(str(error)) < 3000
+                assert "\n" not in str(error)
+                assert len(str(error)) < 3000
             except Exception as error:
                 kept = tmp_path / "failed"
                 kept.write_bytes(data)

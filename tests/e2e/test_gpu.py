@@ -63,7 +63,8 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
     first = bundles.load(tmp_path / "run" / POLICY_FILE)
     congrasp(*run, "--resume", "--updates", 5)
     second = bundles.load(tmp_path / "run" / POLICY_FILE)
-    assert second.version > first.version and second.run_id == first.run_id
+    assert second.version > first.version
+    assert second.run_id == first.run_id
     assert second.transitions * 3 == first.transitions * 5
 
 

@@ -132,7 +132,8 @@ def test_silent_connections_keep_nobody_out(flow):
 
 def _grown(honest):
     """Bytes by which this process grows while it does something 150 times."""
-    process, most = psutil.Process(), 0
+    process = psutil.Process()
+    most = 0
     before = process.memory_info().rss
     for _ in range(150):
         honest()
@@ -152,7 +153,8 @@ def test_what_is_too_long_is_refused_before_it_is_in_memory():
 
 def test_rollouts_that_no_actor_makes_are_refused_before_they_are_in_memory(tmp_path):
     """A learner knows how long its run's rollouts are."""
-    endpoint, key = local_url(), tmp_path / "key"
+    endpoint = local_url()
+    key = tmp_path / "key"
     key.write_text(KEYS.rollout("huge"))
     with urls.listen(endpoint, "learner", longest_rollout=1 << 20) as transport:
         taken = []

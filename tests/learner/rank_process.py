@@ -50,7 +50,8 @@ or JAX itself.
 def die_in(phase: str) -> None:
     """Kills this process at that call, as the kernel would."""
     place, name, number = PHASES[phase]
-    given, calls = getattr(place, name), iter(range(1, number))
+    given = getattr(place, name)
+    calls = iter(range(1, number))
 
     def last(*args: object, **options: object) -> object:
         if next(calls, None) is None:

@@ -23,7 +23,8 @@ from tests.policies import random_bundle
 
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)
 TASK = TaskConfig(hand="allegro", constraints=("heading",), surface_points=64)
-WORLDS, STEPS = 32, 8
+WORLDS = 32
+STEPS = 8
 
 
 def save_teacher(path):
@@ -73,7 +74,8 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
     averaged over all.
     """
     run = run_of(teacher, epochs=1, learning_rate=0.0)
-    student, rows = algorithm(run), batch(run, 0)
+    student = algorithm(run)
+    rows = batch(run, 0)
     state = student.init(0)
     state.params["actor"]["network"]["output"] = jax.tree.map(
         jnp.zeros_like, state.params["actor"]["network"]["output"]
@@ -93,18 +95,18 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
         metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4
     )
     np.testing.assert_allclose(metrics["action_std"], deviation.mean(), rtol=1e-5)
-    assert (
-        after.version == 1
-        and after.transitions == STEPS * WORLDS
-        and metrics["learning_rate"] == 0.0
-    )
+    assert after.version == 1
+    assert after.transitions == STEPS * WORLDS
+    assert metrics["learning_rate"] == 0.0
     jax.tree.map(np.testing.assert_array_equal, after.params["critic"], state.params["critic"])
 
 
 def test_a_student_comes_to_its_teacher_and_keeps_its_deviation(teacher):
     run = run_of(teacher)
     student = algorithm(run)
-    state, losses, rates = student.init(0), [], []
+    state = student.init(0)
+    losses = []
+    rates = []
     for seed in range(60):
         state, metrics = student.update(state, batch(run, seed))
         losses.append(metrics["imitation_kl"])
@@ -118,7 +120,8 @@ def test_a_student_comes_to_its_teacher_and_keeps_its_deviation(teacher):
 
 def test_a_batch_that_is_not_finite_changes_nothing(teacher):
     run = run_of(teacher)
-    student, rows = algorithm(run), batch(run, 0)
+    student = algorithm(run)
+    rows = batch(run, 0)
     state = student.init(0)
     rows["teacher_observation"][3, 2] = np.nan
     with pytest.raises(
@@ -169,13 +172,13 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
     config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])[
         "config"
     ]
-    assert config.algorithm == "distill" and config.distill.teacher == str(teacher)
-    assert config.name == "quickstart-student" and config.task.method == "student"
-    assert (config.task.observation, config.task.sensing, config.task.hand) == (
-        "tracked",
-        TRACKERS,
-        "allegro",
-    )
+    assert config.algorithm == "distill"
+    assert config.distill.teacher == str(teacher)
+    assert config.name == "quickstart-student"
+    assert config.task.method == "student"
+    assert config.task.observation == "tracked"
+    assert config.task.sensing == TRACKERS
+    assert config.task.hand == "allegro"
     assert config.task.surface_points == TASK.surface_points
     assert config.task.approach_steps == 2 * TASK.approach_steps
     assert config.curriculum.weights(config.task.reward, 1) == config.task.reward

@@ -27,7 +27,10 @@ from tests import rollouts
 from tests.waits import eventually
 
 KEYS = Keys("test")
-T, B, D, A = 3, 2, 5, 4
+T = 3
+B = 2
+D = 5
+A = 4
 FORM = RolloutForm(T, B, D, A, half=True)
 
 
@@ -52,7 +55,8 @@ class Bench:
 
     def __init__(self, *, version=None, max_staleness=1, batch=2, **options):
         shared = MemoryHub()
-        self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
+        self.server = MemoryTransport(shared)
+        self.peer = MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
         self.hub, self.rollouts = rollouts.learner_hub(
             self.server, "test", form=FORM, staleness=self.staleness, **options
@@ -96,12 +100,10 @@ def sequences(batch):
 
 def test_config(bench):
     reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
-    assert (reply["config"], reply["run_id"], reply["schema"], reply["version"]) == (
-        '{"name": "x"}',
-        "e",
-        "s",
-        -1,
-    )
+    assert reply["config"] == '{"name": "x"}'
+    assert reply["run_id"] == "e"
+    assert reply["schema"] == "s"
+    assert reply["version"] == (-1)
     assert reply["arrays"] == list(FORM.arrays)
 
 
@@ -117,7 +119,8 @@ def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
 
 def test_tickets_run_out_and_return(bench):
     b = bench(version=0, max_staleness=0, batch=1)
-    assert b.ticket("t")["granted"] and b.ticket("t")["granted"]
+    assert b.ticket("t")["granted"]
+    assert b.ticket("t")["granted"]
     assert b.rollouts._sequences.of(("a", "01")).granted == 1
     assert not b.ticket("u")["granted"]
     b.ticket("t", give_back=True)
@@ -141,7 +144,8 @@ def test_death_returns_tickets_and_is_told(bench):
     assert key == KEYS.log("event", "learner", "0")
     assert event.meta["text"] == "The actor a left; 1 of its tickets returned."
     assert said == [("info", event.meta["text"])]
-    assert b.ledger()["returned"] == 1 and b.ticket("u")["granted"]
+    assert b.ledger()["returned"] == 1
+    assert b.ticket("u")["granted"]
     assert _roles(b) == {("learner", "0")}
 
 
@@ -184,7 +188,8 @@ def test_full_learner_says_when_to_come_again(bench):
     b = bench(version=0, batch=1)
     assert [b.send(i)["outcome"] for i in range(2)] == ["accepted"] * 2
     reply = b.send(2)
-    assert reply["outcome"] == "retry" and reply["retry_after"] > 0
+    assert reply["outcome"] == "retry"
+    assert reply["retry_after"] > 0
     assert b.rollouts.next_batch(1, 1)
     b.hub.publish_weights(bundle(1), 1)
     assert b.send(2)["outcome"] == "accepted"
@@ -201,20 +206,21 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
     b.send(1, version=1)
     b.hub.publish_weights(bundle(2), 2)
     reply = b.send(2, version=0)
-    assert reply["outcome"] == "stale" and "version 0" in reply["why"] and "at 2" in reply["why"]
+    assert reply["outcome"] == "stale"
+    assert "version 0" in reply["why"]
+    assert "at 2" in reply["why"]
     assert b.send(3, version=3)["outcome"] == "stale"
     assert b.send(4, run_id="other")["outcome"] == "stale"
     b.send(5, version=2)
     assert sequences(b.rollouts.next_batch(2, 1)) == [1, 5]
     texts = [events.receive(60)[1].meta["text"] for _ in range(2)]
-    assert "refused" in texts[0] and texts[1] == "Dropped as too old at version 2: 1 of a."
+    assert "refused" in texts[0]
+    assert texts[1] == "Dropped as too old at version 2: 1 of a."
     ledger = b.ledger()
-    assert (ledger["stale"], ledger["dropped"], ledger["consumed"], ledger["accepted"]) == (
-        3,
-        1,
-        2,
-        3,
-    )
+    assert ledger["stale"] == 3
+    assert ledger["dropped"] == 1
+    assert ledger["consumed"] == 2
+    assert ledger["accepted"] == 3
 
 
 def test_nobody_speaks_for_another(bench):
@@ -224,14 +230,13 @@ def test_nobody_speaks_for_another(bench):
     with pytest.raises(RefusedError, match=r"Actor 'a' published on .*/ticket/b'"):
         b.ask(KEYS.ticket("b"), asked)
     reply = b.peer.query(KEYS.rollout("b"), rollout(), timeout=60).meta
-    assert reply["outcome"] == "refused" and "the key of another actor" in reply["why"]
+    assert reply["outcome"] == "refused"
+    assert "the key of another actor" in reply["why"]
     ledger = b.ledger()
     # A's ticket is still a's
-    assert (ledger["running"], ledger["damaged"], ledger["accepted"]) == (
-        1,
-        1,
-        0,
-    )
+    assert ledger["running"] == 1
+    assert ledger["damaged"] == 1
+    assert ledger["accepted"] == 0
 
 
 def test_nobody_makes_the_learner_forget_what_another_sent(bench):
@@ -251,12 +256,16 @@ def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
         b.send(0, actor="1.b", run_id="of another training")["outcome"] for _ in range(2500)
     ]
     stale = outcomes.count("stale")
-    assert outcomes == ["stale"] * stale + ["retry"] * (2500 - stale) and 1990 <= stale <= 2000
+    assert outcomes == ["stale"] * stale + ["retry"] * (2500 - stale)
+    assert 1990 <= stale <= 2000
     reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
-    assert not reply["granted"] and reply["retry_after"] > 0
-    assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
+    assert not reply["granted"]
+    assert reply["retry_after"] > 0
+    assert b.ticket()["granted"]
+    assert b.send(0)["outcome"] == "accepted"
     ledger = b.ledger()
-    assert ledger["rejected"] == 2500 - stale + 1 and ledger["stale"] == stale
+    assert ledger["rejected"] == 2500 - stale + 1
+    assert ledger["stale"] == stale
     texts = []
     while received := events.receive(0.1):
         texts.append(received[1].meta["text"])
@@ -271,13 +280,16 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
     assert 0.5 < answers[-1]["retry_after"] <= 1.0
     asked = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
     # Another name of the same certificate
-    assert not asked["granted"] and asked["retry_after"] > 0.5
-    assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
+    assert not asked["granted"]
+    assert asked["retry_after"] > 0.5
+    assert b.ticket()["granted"]
+    assert b.send(0)["outcome"] == "accepted"
     time.sleep(1.0)
     assert b.send(0, actor="1.b", steps=1)["outcome"] == "refused"
     assert 1.5 < b.send(0, actor="1.b", steps=1)["retry_after"] <= 2.0
     (role,) = [role for role in b.ask(KEYS.status)["roles"] if role["id"] == "1.b"]
-    assert role["refused"] == 3 and b.ledger()["damaged"] == 3
+    assert role["refused"] == 3
+    assert b.ledger()["damaged"] == 3
 
 
 def test_values_beyond_the_task_are_refused_with_the_range(bench):
@@ -313,7 +325,8 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
         good = rollout(0, actor=f"{number}.x")
         bad = Message({**good.arrays, name: array}, good.meta)
         reply = b.peer.query(KEYS.rollout(f"{number}.x"), bad, timeout=60).meta
-        assert reply["outcome"] == "refused" and re.search(why, reply["why"]), reply["why"]
+        assert reply["outcome"] == "refused", reply["why"]
+        assert re.search(why, reply["why"]), reply["why"]
     good = rollout(0)
     assert b.peer.query(
         KEYS.rollout("a"), Message({**good.arrays, **fine}, good.meta), timeout=60
@@ -330,7 +343,9 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     eventually(lambda: b.ask(KEYS.status)["unlisted"] == 3000 - 64)
     status = b.ask(KEYS.status)
     names = [role["id"] for role in status["roles"]]
-    assert status["unlisted"] == 3000 - 64 and len(names) == 66 and "0.a" in names
+    assert status["unlisted"] == 3000 - 64
+    assert len(names) == 66
+    assert "0.a" in names
     assert len(encode(Message(meta=status))) < 32_000
     flood.close()
     eventually(lambda: not b.ask(KEYS.status)["unlisted"])
@@ -347,7 +362,8 @@ def test_refusal_ends_the_ticket(bench):
     b = bench(version=0)
     assert b.ticket("t")["granted"]
     assert b.send(0, ticket="t", steps=1)["outcome"] == "refused"
-    assert b.ledger()["running"] == 0 and b.ledger()["redeemed"] == 1
+    assert b.ledger()["running"] == 0
+    assert b.ledger()["redeemed"] == 1
 
 
 def test_weights_are_pulled_by_version(bench):
@@ -361,7 +377,8 @@ def test_weights_are_pulled_by_version(bench):
         "finished": False,
     }
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=60)
-    assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
+    assert pulled.meta == bundle(0).meta
+    assert pulled.arrays["actor/w"][0] == 0
     assert b.ask(KEYS.weights, {"newer_than": 0})["version"] == 0
     assert not b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=60).arrays
     b.hub.publish_weights(bundle(1), 1)
@@ -396,11 +413,9 @@ def test_status_names_everything(bench):
     b.send(0)
     time.sleep(0.05)
     status = b.ask(KEYS.status)
-    assert (
-        status["run"] == "test"
-        and status["version"] == 0
-        and status["queue"] == {"length": 1, "limit": 64}
-    )
+    assert status["run"] == "test"
+    assert status["version"] == 0
+    assert status["queue"] == {"length": 1, "limit": 64}
     rates = {"rollouts_per_second": 1.0, "steps_per_second": T * B}
     assert {
         "role": "actor",
@@ -421,8 +436,10 @@ def test_finished_run_says_so(bench):
     b.hub.finish()
     assert notices.receive(60)[1].meta["finished"]
     reply = b.ticket()
-    assert reply["finished"] and not reply["granted"]
-    assert b.send(0)["outcome"] == "stale" and b.ledger()["queued"] == 0
+    assert reply["finished"]
+    assert not reply["granted"]
+    assert b.send(0)["outcome"] == "stale"
+    assert b.ledger()["queued"] == 0
 
 
 def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
@@ -446,16 +463,15 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     assert resumed.send(6, version=4)["outcome"] == "accepted"
     assert resumed.send(6, version=4)["outcome"] == "duplicate"
     ledger = resumed.ledger()
-    assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (
-        5,
-        3,
-        2,
-        3,
-    )
+    assert ledger["accepted"] == 5
+    assert ledger["consumed"] == 3
+    assert ledger["queued"] == 2
+    assert ledger["missing"] == 3
     again = bench(version=5, batch=3, durable=resumed.rollouts.durable())
     assert again.send(8, version=5)["outcome"] == "accepted"
     # 6 and 7 were waiting as well
-    assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4
+    assert again.ledger()["missing"] == 5
+    assert again.ledger()["accepted"] == 4
     with pytest.raises(CongraspError, match="run id e, not f"):
         bench(run_id="f", durable=durable)
 
@@ -463,7 +479,8 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
 def test_deduplication_is_exact_within_its_window(arrivals):
-    known, decided = Sequences(), {}
+    known = Sequences()
+    decided = {}
     for sequence, accepted in arrivals:
         assert (sequence in known) == (sequence in decided)
         assert (sequence in known.refused) == (decided.get(sequence) is False)
@@ -478,8 +495,10 @@ def test_deduplication_stays_small_whatever_is_missing():
     known = Sequences(granted=20_000)
     for sequence in range(1, 20_000, 2):
         known.add(_header(sequence), sequence % 3 > 0)
-        assert len(known.ahead) <= 64 and len(known.refused) <= 64
-    assert 19_999 in known and 20_001 not in known
+        assert len(known.ahead) <= 64
+        assert len(known.refused) <= 64
+    assert 19_999 in known
+    assert 20_001 not in known
     assert known.missing == 10_000
 
 
@@ -511,12 +530,10 @@ def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     assert resumed.send(0, version=6)["outcome"] == "stale"  # as before
     assert resumed.send(4, version=6)["outcome"] == "accepted"
     ledger = resumed.ledger()
-    assert (ledger["consumed"], ledger["queued"], ledger["stale"], ledger["missing"]) == (
-        2,
-        1,
-        1,
-        1,
-    )
+    assert ledger["consumed"] == 2
+    assert ledger["queued"] == 1
+    assert ledger["stale"] == 1
+    assert ledger["missing"] == 1
 
 
 def _header(sequence):
@@ -550,7 +567,8 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
 
     resumed = bench(batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     resumed.hub.publish_weights(bundle(7), 7)  # which is 3 under another number
-    assert resumed.ledger()["queued"] == 5 and not resumed.ticket()["granted"]
+    assert resumed.ledger()["queued"] == 5
+    assert not resumed.ticket()["granted"]
     assert resumed.send(1, version=2)["outcome"] == "duplicate"
     batches = []
     for version in (8, 9, 10):
@@ -562,7 +580,8 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
         [0, 2],
         [],
     ]
-    assert resumed.ledger()["dropped"] == 1 and resumed.ticket()["granted"]
+    assert resumed.ledger()["dropped"] == 1
+    assert resumed.ticket()["granted"]
 
 
 def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
@@ -591,7 +610,8 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was
     noted.
     """
-    written, slow = threading.Event(), log()
+    written = threading.Event()
+    slow = log()
     b = bench(version=0, log=slow)
     add = slow.add
     slow.add = lambda header, message: written.wait(10) and add(header, message)
@@ -600,10 +620,13 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     first.start()
     while b.ledger()["queued"] == 0:
         time.sleep(0.01)
-    assert b.send(0)["outcome"] == "retry" and not answers
+    assert b.send(0)["outcome"] == "retry"
+    assert not answers
     written.set()
     first.join(60)
-    assert answers == ["accepted"] and b.send(0)["outcome"] == "duplicate" and on_disk(slow) == [0]
+    assert answers == ["accepted"]
+    assert b.send(0)["outcome"] == "duplicate"
+    assert on_disk(slow) == [0]
     # The disk refuses it, and the learner stops
     slow.add = lambda header, message: b.rollouts.close()
     assert b.send(1)["outcome"] == "retry"
@@ -639,7 +662,8 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
     other.hub.publish_weights(bundle(0, run_id="f"), 0)
-    assert not on_disk(other.rollouts._log) and other.ledger()["queued"] == 0
+    assert not on_disk(other.rollouts._log)
+    assert other.ledger()["queued"] == 0
 
 
 def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log):
@@ -647,9 +671,8 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
     b.send(0)
     resumed = bench(version=1, log=log(write=False))
     assert resumed.send(1, version=1)["outcome"] == "accepted"
-    assert on_disk(resumed.rollouts._log) == [0] and sequences(
-        resumed.rollouts.next_batch(2, 1)
-    ) == [0, 1]
+    assert on_disk(resumed.rollouts._log) == [0]
+    assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 1]
 
 
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
@@ -659,7 +682,8 @@ def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
         version=0, batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append)
     )
     assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
-    assert len(said) == 1 and "they do not survive the learner" in said[0]
+    assert len(said) == 1
+    assert "they do not survive the learner" in said[0]
     (tmp_path / "file").unlink()
     assert b.send(3)["outcome"] == "accepted"
     assert on_disk(b.rollouts._log) == [3]

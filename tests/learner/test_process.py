@@ -83,9 +83,11 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
         assert actor.ended == "The run is finished."
     assert entered == ["in", "out"]
 
-    assert (last.version, last.transitions) == (3, 3 * 2 * 8)
+    assert last.version == 3
+    assert last.transitions == 3 * 2 * 8
     shipped = bundles.load(tmp_path / "policy.safetensors")
-    assert (shipped.version, shipped.run_id) == (3, last.run_id)
+    assert shipped.version == 3
+    assert shipped.run_id == last.run_id
     jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
     assert open_run(tmp_path) == CONFIG
     assert (
@@ -100,7 +102,8 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
     values = kinds["metrics"][-1]["values"]
-    assert values["episode/success"] == 0.75 and values["episodes"] == 8
+    assert values["episode/success"] == 0.75
+    assert values["episodes"] == 8
     assert 0 <= values["staleness_mean"] <= values["staleness_max"] <= CONFIG.max_staleness
     assert all(np.isfinite(value) for value in values.values())
     assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
@@ -121,7 +124,9 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
     assert ppo._optimise._cache_size() == compiled
     actor.join(10.0)
     assert actor.ended == "The run is finished."
-    assert (last.version, last.transitions, last.run_id) == (6, 6 * 2 * 8, first.run_id)
+    assert last.version == 6
+    assert last.transitions == 6 * 2 * 8
+    assert last.run_id == first.run_id
     assert open_run(tmp_path).updates == 6
     assert actor.versions == sorted(actor.versions)
 
@@ -131,7 +136,8 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, ac
     create_run(tmp_path, CONFIG)
     act()
     assert learn(tmp_path, hub, on_host=False).version == 3
-    assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
+    assert not (tmp_path / "accepted").exists()
+    assert not (tmp_path / "audit").exists()
 
 
 def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub, act):
@@ -152,7 +158,8 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     policy = (tmp_path / "policy.safetensors").read_bytes()
     with pytest.raises(CongraspError, match=r"has checkpoints of a run\. Pass --resume"):
         learn(tmp_path, hub)
-    seen, said = [], []
+    seen = []
+    said = []
     learn(
         tmp_path,
         hub,
@@ -201,7 +208,9 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
-    actor, said, seen = act(reward=1e37), [], []
+    actor = act(reward=1e37)
+    said = []
+    seen = []
 
     def on_event(level, text):
         if "The batch was dropped" in text:
@@ -210,14 +219,15 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
 
     last = learn(tmp_path, hub, config, on_event=on_event, on_update=seen.append)
     dropped = [values["batches_dropped"] for values in seen]
-    assert 1 <= len(said) == dropped[-1] < 5 and said[0][0] == "error"
-    assert [values["update"] for values in seen] == list(range(1, 9)) and last.version == 8
+    assert 1 <= len(said) == dropped[-1] < 5
+    assert said[0][0] == "error"
+    assert [values["update"] for values in seen] == list(range(1, 9))
+    assert last.version == 8
     learnt = [values for values in seen if "policy_loss" in values]
-    assert (
-        len(learnt) == 8 - len(said)
-        and np.isfinite([values["policy_loss"] for values in learnt]).all()
-    )
-    assert np.isfinite(last.value.mean) and abs(last.value.mean) < 100
+    assert len(learnt) == 8 - len(said)
+    assert np.isfinite([values["policy_loss"] for values in learnt]).all()
+    assert np.isfinite(last.value.mean)
+    assert abs(last.value.mean) < 100
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -250,7 +260,8 @@ def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
         CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"
     ):
         learn(tmp_path, hub, config, on_event=lambda level, text: events.append((level, text)))
-    assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
+    assert events[-1][0] == "fatal"
+    assert (tmp_path / "checkpoints" / "latest").exists()
 
 
 def test_training_goes_on_from_a_given_policy(tmp_path, hub):
@@ -260,7 +271,8 @@ def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
     create_run(tmp_path / "two", CONFIG, given)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)
-    assert begun.version == 0 and begun.run_id != given.run_id
+    assert begun.version == 0
+    assert begun.run_id != given.run_id
     jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
     other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
@@ -275,7 +287,8 @@ def test_training_of_a_policy_without_critic_begins_one(tmp_path, hub):
     trained = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
     initial = bundles.without_critic(trained)
     (note,) = initial_notes(initial, CONFIG, tmp_path / "mine.safetensors")
-    assert "mine.safetensors" in note and "critic" in note
+    assert "mine.safetensors" in note
+    assert "critic" in note
     assert not list(initial_notes(trained, CONFIG, tmp_path / "mine.safetensors"))
     create_run(tmp_path / "two", CONFIG, initial)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)

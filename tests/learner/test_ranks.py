@@ -185,7 +185,8 @@ class Job:
     """Real processes of `tests.learner.rank_process`."""
 
     def __init__(self, run_dir: pathlib.Path, port: int):
-        self.run_dir, self._port = run_dir, port
+        self.run_dir = run_dir
+        self._port = port
         self.processes: list[subprocess.Popen[str]] = []
 
     def start(self, goal: int, mode: str, count: int = 2, *doom: str) -> None:
@@ -290,7 +291,8 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
 @pytest.mark.timeout(900)
 @pytest.mark.slow
 def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_resumes(job):
-    kept, mode = 0, "fresh"
+    kept = 0
+    mode = "fresh"
     for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):
         victim = int(doom[0])
         job.start(kept + 2 if doom == "1:leave" else 10**6, mode, 2, doom)

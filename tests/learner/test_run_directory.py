@@ -156,7 +156,8 @@ def test_one_learner_at_a_time_until_it_dies(run):
         with listening(folder, "tcp/127.0.0.1:7"), pytest.raises(CongraspError) as refused:
             continue_run(folder, dataclasses.replace(config, updates=9))
         said = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
-        assert said in str(refused.value) and open_run(folder) == config
+        assert said in str(refused.value)
+        assert open_run(folder) == config
         other.kill()
         assert other.wait() == -signal.SIGKILL
     continue_run(folder, dataclasses.replace(config, updates=9))
@@ -199,7 +200,8 @@ def test_leaves_come_back_where_and_what_they_were(tmp_path):
     assert meta == {"hub": {"seen": [1, 2]}, "run_id": "e"}
     jax.tree.map(np.testing.assert_array_equal, loaded, tree(1.0))
     assert isinstance(loaded["device"]["half"], jax.Array)
-    assert isinstance(loaded["host"], np.ndarray) and loaded["host"].dtype == np.float64
+    assert isinstance(loaded["host"], np.ndarray)
+    assert loaded["host"].dtype == np.float64
     assert isinstance(loaded["steps"], int)
 
 
@@ -293,9 +295,8 @@ def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
         name = "nothing" if link == "dangling" else "checkpoint_000000008.safetensors"
         (tmp_path / "latest").symlink_to(name)
     value, said = lines_of(checkpoints)
-    assert value == 10.0 and said == [
-        f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."
-    ]
+    assert value == 10.0
+    assert said == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
 
 
 def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
@@ -304,11 +305,10 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     paths[2].write_bytes(paths[2].read_bytes()[:-3])
     paths[1].write_bytes(b"")
     value, said = lines_of(checkpoints)
-    assert value == 1.0 and len(said) == 3
-    assert (
-        "000000003.safetensors is damaged: The message" in said[0]
-        and "000000002.safetensors is damaged" in said[1]
-    )
+    assert value == 1.0
+    assert len(said) == 3
+    assert "000000003.safetensors is damaged: The message" in said[0]
+    assert "000000002.safetensors is damaged" in said[1]
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0

@@ -13,7 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from congrasp.learner.hub.staleness import StalenessManager
 from tests.waits import together
 
-A, B = ("a", "1"), ("b", "1")
+A = ("a", "1")
+B = ("b", "1")
 
 
 def manager(max_staleness=1, batch=2, clock=lambda: 0.0, **options):
@@ -32,7 +33,8 @@ def test_tickets_worked_out_by_hand():
     for owner in (A, B):
         assert staleness.arrive(owner, "x", 0) == "accepted"
     assert staleness.capacity == 0  # what arrived still counts
-    assert staleness.take(0) and staleness.take(0)
+    assert staleness.take(0)
+    assert staleness.take(0)
     assert staleness.capacity == 0  # and what is being learnt from
     staleness.publish(1)
     assert staleness.capacity == 2
@@ -58,7 +60,8 @@ def test_without_staleness_nothing_starts_during_an_update():
     staleness = manager(max_staleness=0, batch=1)
     assert staleness.grant(A, "x").version == 0
     assert staleness.grant(A, "y") is None
-    assert staleness.arrive(A, "x", 0) == "accepted" and staleness.take(0)
+    assert staleness.arrive(A, "x", 0) == "accepted"
+    assert staleness.take(0)
     assert staleness.grant(A, "y") is None
     staleness.publish(1)
     assert staleness.grant(A, "y").version == 1
@@ -105,20 +108,17 @@ def test_checkpoint_keeps_what_is_settled():
     durable = staleness.durable()
     resumed = manager()
     resumed.restore(durable, 7)
-    assert resumed.version == 7 and resumed.capacity == 4  # (1 + 7 + 1) * 2 - 7 * 2
+    assert resumed.version == 7
+    assert resumed.capacity == 4  # (1 + 7 + 1) * 2 - 7 * 2
     counters = resumed.counters()
-    assert (
-        counters["accepted"],
-        counters["consumed"],
-        counters["queued"],
-        counters["running"],
-    ) == (1, 1, 0, 0)
-    assert (
-        counters["granted"],
-        counters["redeemed"],
-        counters["duplicate"],
-        counters["damaged"],
-    ) == (2, 2, 1, 2)
+    assert counters["accepted"] == 1
+    assert counters["consumed"] == 1
+    assert counters["queued"] == 0
+    assert counters["running"] == 0
+    assert counters["granted"] == 2
+    assert counters["redeemed"] == 2
+    assert counters["duplicate"] == 1
+    assert counters["damaged"] == 2
 
 
 class Admission(RuleBasedStateMachine):
@@ -129,7 +129,8 @@ class Admission(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.now = 0.0
-        self.eta, self.batch = 1, 3
+        self.eta = 1
+        self.batch = 3
         self.staleness = StalenessManager(
             self.eta, self.batch, ticket_seconds=10, tickets_per_owner=4, clock=lambda: self.now
         )
@@ -205,7 +206,8 @@ class Admission(RuleBasedStateMachine):
             assert verdict == "accepted"
             if not must_fit and capacity <= 0:  # under the oldest of its owner's tickets
                 del self.tickets[mine[0]]
-                key, must_fit = mine[0], True
+                key = mine[0]
+                must_fit = True
             if must_fit:
                 self.delivered.append(key[0])
                 self.needed[key[0][0]].append(self.now - self.granted[key])
@@ -245,11 +247,14 @@ class Admission(RuleBasedStateMachine):
 
     @rule()
     def restart(self):
-        durable, version = self.staleness.durable(), self.staleness.version
+        durable = self.staleness.durable()
+        version = self.staleness.version
         self.staleness.restore(durable, version)
         self.staleness.publish(version)  # as a learner does before anything else
         self.fates["accepted"] -= len(self.queue)
-        self.tickets, self.queue, self.in_update = {}, [], 0
+        self.tickets = {}
+        self.queue = []
+        self.in_update = 0
 
     def awaited(self, key):
         """Nobody waits for one that takes four times as long as usual, nor for an actor that needs
@@ -268,7 +273,8 @@ class Admission(RuleBasedStateMachine):
         assert version * self.batch + self.in_update + len(self.queue) + len(self.tickets) <= (
             self.eta + version + 1
         ) * self.batch + len(self.passed_over)
-        assert counts["running"] == len(self.tickets) and counts["queued"] == len(self.queue)
+        assert counts["running"] == len(self.tickets)
+        assert counts["queued"] == len(self.queue)
         assert (
             counts["capacity"]
             == (self.eta + 1) * self.batch - self.in_update - len(self.queue) - awaited
@@ -290,7 +296,9 @@ def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
     """
     now = [0.0]
     staleness = manager(clock=lambda: now[0])
-    updates, waited, last = 0, [], 0.0
+    updates = 0
+    waited = []
+    last = 0.0
     for step in range(3000):  # tenths of a second; the honest one makes a rollout in half a second
         now[0] = step / 10
         for name in ("9.x", "9.y", f"9.{step}"):
@@ -310,7 +318,8 @@ def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
             updates += 1
             waited.append(now[0] - last)
             last = now[0]
-    assert updates > 500 and max(waited) < 1.0
+    assert updates > 500
+    assert max(waited) < 1.0
     # Expired tickets put the certificate off, longer each time: it held few of what it asked 9,000
     # times for.
     assert 4 < staleness.counters()["expired"] < 40
@@ -340,11 +349,13 @@ def test_shares_follow_what_was_delivered_and_expiry_what_was_needed():
             staleness.publish(staleness.version + 1)
     # Six of eight are 0.a's, whose share is six; 1.b keeps what leaves a batch to the others.
     staleness.forget(("0.a", "1"))
-    assert (held("0.a"), held("1.b")) == (6, 4)
+    assert held("0.a") == 6
+    assert held("1.b") == 4
     assert staleness.grant(("0.a", "1"), "z").deadline == now[0] + 4 * 2.0
     assert staleness.grant(("2.new", "1"), "z").deadline == now[0] + 4 * 2.0  # as the others need
     now[0] += 8.0
-    assert (staleness.counters()["running"], staleness.counters()["expired"]) == (0, 2)
+    assert staleness.counters()["running"] == 0
+    assert staleness.counters()["expired"] == 2
     # One that comes after all teaches how long its actor needs.
     assert staleness.arrive(("0.a", "1"), "z", staleness.version) == "accepted"
     assert staleness.grant(("0.a", "1"), "y").deadline == now[0] + 4 * 8.0
@@ -373,10 +384,15 @@ class Simulation:
 
     def __init__(self, eta, batch, update=0.01):
         """A learner that needs so many seconds for an update."""
-        self.now, self.batch, self.update = 0.0, batch, update
+        self.now = 0.0
+        self.batch = batch
+        self.update = update
         self.staleness = StalenessManager(eta, batch, clock=lambda: self.now)
-        self.arrived, self.queue, self.updating = {}, [], False
-        self._events, self._count = [], itertools.count()
+        self.arrived = {}
+        self.queue = []
+        self.updating = False
+        self._events = []
+        self._count = itertools.count()
 
     def actor(self, name, *, make, send, at=0.0):
         """Adds an actor: seconds in which it makes a rollout, and in which its link carries it."""
@@ -478,4 +494,5 @@ def test_what_a_slower_actor_makes_in_time_is_learnt_from(batch, least):
 
 def test_actors_that_are_alike_share_alike():
     paces = among(1, 4, FAST, FAST, FAST)
-    assert max(paces) < 1.2 * min(paces) and sum(paces) > 60.0
+    assert max(paces) < 1.2 * min(paces)
+    assert sum(paces) > 60.0

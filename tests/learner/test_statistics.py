@@ -108,7 +108,8 @@ def test_the_batches_of_several_ranks_count_as_one():
         posed(9, 100, [0, 1], episode_success=[0, 0], episode_pose_rad=[9.0, 0.4]),
         posed(9, 200, [0], episode_success=[1], episode_pose_rad=[9.0]),
     ]
-    means, joint = figures(first, second), figures([*first, *second])
+    means = figures(first, second)
+    joint = figures([*first, *second])
     assert means == pytest.approx(joint)
     expected = {
         "episode/success": 0.5,
@@ -146,7 +147,8 @@ def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
 
 def test_a_hand_that_never_touches_is_said():
     update, said = first_alarm([0.0] * 50, [0.05] * 50)
-    assert update == 20 and "hardly touched" in said
+    assert update == 20
+    assert "hardly touched" in said
 
 
 @pytest.mark.parametrize(

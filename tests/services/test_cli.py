@@ -236,7 +236,8 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         "cli.main()"
     )
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        port, options = str(taken.getsockname()[1]), ["--physics", "native", "--actors", "0"]
+        port = str(taken.getsockname()[1])
+        options = ["--physics", "native", "--actors", "0"]
         arguments = ["train", *options, "--run-dir", str(tmp_path / "run"), "--metrics-port", port]
         command = [sys.executable, "-c", program, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -315,7 +316,8 @@ def test_numpy_warnings_reach_no_user():
         main.main(["plot"])
     """
     done = python("-c", textwrap.dedent(program))
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    assert done.stderr == ""
 
 
 def test_jax_variable_whose_value_an_error_quotes_is_named(monkeypatch, capsys):
@@ -421,7 +423,8 @@ def test_a_reader_that_is_gone_is_no_error():
     done = congrasp("hands", "list", "--help", **options)
     os.close(writer)
     lines = errors(done.stderr)
-    assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
+    assert not lines
+    assert done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_an_output_without_some_characters_gets_escapes():
@@ -447,9 +450,9 @@ def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
-    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr, (
-        done.stderr
-    )
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
 
 
 @pytest.mark.parametrize("late", [True, False])
@@ -464,7 +467,8 @@ sys.argv[1:] = ["hands", "list"]
 main()
 """
     done = python("-c", code, timeout=60)
-    assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
+    assert done.returncode == 0, done.stderr
+    assert "allegro" in done.stdout, done.stderr
     assert done.stdout.endswith("shut down\n") is not late
 
 
@@ -475,7 +479,8 @@ def test_a_command_runs_in_any_thread_of_a_program(capsys):
         thread = threading.Thread(target=lambda: codes.append(cli.run(["hands", "list"])))
         thread.start()
         thread.join(60.0)
-    assert codes == [0] and "allegro" in capsys.readouterr().out
+    assert codes == [0]
+    assert "allegro" in capsys.readouterr().out
 
 
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
@@ -530,7 +535,8 @@ def test_without_a_home_and_a_cache_everything_works(tmp_path):
         text=True,
         timeout=180,
     )
-    assert done.returncode == 0 and (tmp_path / "box.safetensors").is_file(), done.stderr
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "box.safetensors").is_file(), done.stderr
     assert done.stderr.count("/proc/nowhere") == done.stderr.count("XDG_CACHE_HOME") == 1
 
 

@@ -59,4 +59,5 @@ def test_it_is_in_the_help(capsys):
     with pytest.raises(SystemExit):
         main.run(["weigh", "--help"])
     text = capsys.readouterr().out
-    assert "Print the mass of a box." in text and "In kg/m^3." in text
+    assert "Print the mass of a box." in text
+    assert "In kg/m^3." in text

@@ -49,7 +49,8 @@ def policy() -> PolicyBundle:
 @pytest.fixture(scope="module")
 def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
-    request, state = example.request, example.state
+    request = example.request
+    state = example.state
     given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
     given |= {
         "q_target": request.q,
@@ -100,9 +101,8 @@ def test_the_studio_refuses_it_in_one_line() -> None:
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.choose("fingers", "allowed", PINCH.tolist())
-    assert studio.asked == set() and [
-        row["name"] for row in describe_request(studio)["constraints"]
-    ] == list(PAPER)
+    assert studio.asked == set()
+    assert [row["name"] for row in describe_request(studio)["constraints"]] == list(PAPER)
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
@@ -124,10 +124,8 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert (
-        found.motion.constraints == ("heading", "fingers", "force")
-        and "fingers_ratio" in found.facts()
-    )
+    assert found.motion.constraints == ("heading", "fingers", "force")
+    assert "fingers_ratio" in found.facts()
     assert 0.0 <= found.facts()["force_ratio"] <= 1.0
     save_motion(tmp_path / "grasp.npz", found.motion)
     goal = load_motion(tmp_path / "grasp.npz").goal
@@ -142,7 +140,8 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     links = np.linalg.norm(made.link_force, axis=-1)
     np.testing.assert_array_equal(errors["fingers_ratio"] > 0, ((links > 0) & other).any(-1))
     np.testing.assert_array_equal(errors["force_ratio"] > 0, (links > 3.0).any(-1))
-    assert made.active["fingers"] and not made.active["pose_finger"]
+    assert made.active["fingers"]
+    assert not made.active["pose_finger"]
     assert lanes(found.episode)["fingers"].met.shape == (steps,)
     assert "lane/fingers/share" in for_page(found.episode).arrays
 
@@ -165,7 +164,8 @@ def test_queries_for_it_are_answered_and_checked(ask) -> None:
     assert pinch.active == [
         ["Only the named fingers may touch the object.", "The heading guides the wrist."]
     ]
-    free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
+    free = ask(["heading"])
+    ignored = ask(["heading"], fingers_allowed=PINCH)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
     for one, other in ((pinch, free), (soft, firm)):
@@ -186,7 +186,8 @@ def test_queries_for_it_are_answered_and_checked(ask) -> None:
 def test_the_studio_asks_for_what_is_allowed_alone() -> None:
     studio = Studio(HAND, TASK, MUG)
     studio.ask("fingers", True)
-    assert describe_request(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
+    assert describe_request(studio)["active"]["masks"]["fingers"]
+    assert studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
     studio.choose("fingers", "allowed", [True, False, False, False, False])
     assert (
@@ -197,7 +198,8 @@ def test_the_studio_asks_for_what_is_allowed_alone() -> None:
             studio.choose("fingers", "allowed", values)
     studio = Studio(HAND, TASK, MUG)
     studio.ask("force", True)
-    assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
+    assert studio.request.given("force", "limit") == 5.0
+    assert studio.trouble == ""
     for name, field in (("pose", "q"), ("force", "limit")):
         with pytest.raises(CongraspError, match=f"nothing to choose for '{name}'"):
             studio.choose(name, field, [True])

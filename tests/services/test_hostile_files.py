@@ -40,7 +40,8 @@ from tests.episodes import episode, episode_message
 from tests.limits import limited
 
 CLAW = pathlib.Path(__file__).parents[1] / "hands" / "claw.json"
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 LOADERS = {
     "object": store.load,
     "set": set_file.load,
@@ -103,7 +104,8 @@ def test_absent_cut_and_foreign_files_are_named(tmp_path, kind, data, why):
         path.write_bytes(data)
     with pytest.raises(CongraspError, match=why) as raised:
         LOADERS[kind](path)
-    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
     with pytest.raises(CongraspError, match="the hand file has the format None"):
         hand_from_text("{}")
 
@@ -224,7 +226,8 @@ def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
     store.save(dataclasses.replace(obj, **change(obj)), tmp_path / "a.safetensors")
     with pytest.raises(CongraspError, match=why) as raised:
         store.load(tmp_path / "a.safetensors")
-    assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(tmp_path) in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -295,7 +298,8 @@ def test_hands_with_values_that_none_has_are_named(tmp_path, change, why):
     path.write_text(json.dumps(fields))
     with pytest.raises(CongraspError, match=why) as raised:
         read_hand(path)
-    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -374,7 +378,8 @@ def constraint_set():
 
 
 def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
-    path, made = tmp_path / "a.safetensors", constraint_set()
+    path = tmp_path / "a.safetensors"
+    made = constraint_set()
     for change, why in (
         (Message(made.arrays, {**made.meta, "object": "../../x"}), "cannot name the object"),
         (Message(made.arrays, {**made.meta, "object_scale": -1}), "object_scale"),
@@ -417,7 +422,8 @@ def refused(function, path, why):
     with pytest.raises(CongraspError, match=why) as caught:
         result = function(path)
         list(result) if hasattr(result, "__next__") else None
-    assert len(str(caught.value)) < 1000 and str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
 
 
 def test_json_is_of_bounded_size_and_depth(tmp_path):

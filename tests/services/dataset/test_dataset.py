@@ -133,7 +133,8 @@ def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path,
 
 def test_rows_have_requests_and_outcomes(whole, columns):
     card = json.loads((whole / CARD).read_text())
-    assert len(columns["object"]) == 8 and sorted(set(columns["object"])) == ["box_2", "box_3"]
+    assert len(columns["object"]) == 8
+    assert sorted(set(columns["object"])) == ["box_2", "box_3"]
     for asked in ("heading", "affordance"):
         rows = columns["constraints"] == asked
         assert sorted(columns["episode"][rows]) == [0, 0, 1, 1]
@@ -141,9 +142,8 @@ def test_rows_have_requests_and_outcomes(whole, columns):
         assert card["counts"][asked]["held"] == columns["held"][rows].sum()
         assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
         assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
-    assert (columns["held"] >= columns["lifted"]).all() and (
-        columns["lifted"] >= columns["pushed"]
-    ).all()
+    assert (columns["held"] >= columns["lifted"]).all()
+    assert (columns["lifted"] >= columns["pushed"]).all()
     assert columns["held"].any()
     unit = np.linalg.norm(
         columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1
@@ -202,7 +202,8 @@ def test_bad_options(whole, more, words):
 def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(whole, folder)
-    card, grasps = made(folder), folder / "grasps" / "00001-of-00002.parquet"
+    card = made(folder)
+    grasps = folder / "grasps" / "00001-of-00002.parquet"
     assert card["sha256"] == {
         name: hashlib.sha256(data).hexdigest() for name, data in contents(whole).items()
     }
@@ -216,12 +217,14 @@ def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path
         list(loader()(folder))
     grasps.write_bytes(data)
     (folder / "objects" / grasps.name).unlink()
-    assert made(folder) == card and contents(folder) == contents(whole)
+    assert made(folder) == card
+    assert contents(folder) == contents(whole)
 
 
 def test_a_range_of_the_generator_is_many_objects():
     found = objects_at(pathlib.Path("all:5-7"))
-    assert [one.load().name for one in found] == [one.name for one in found] and len(found) == 3
+    assert [one.load().name for one in found] == [one.name for one in found]
+    assert len(found) == 3
     assert len({one.digest() for one in found}) == 3
     with pytest.raises(CongraspError, match="is below the first"):
         objects_at(pathlib.Path("box:7-5"))
@@ -279,7 +282,8 @@ def refused(folder: pathlib.Path, shard: pathlib.Path) -> None:
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(CongraspError, match=re.escape(str(shard))) as error:
         made(folder)
-    assert "\n" not in str(error.value) and "elete it" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert "elete it" in str(error.value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 

@@ -48,15 +48,18 @@ def test_episodes_that_begin_alike_are_one(conditions):
     assert len(np.unique(found)) == 64
     # The limit of a force that nothing asks for does not tell episodes apart; one that is asked for
     # does.
-    goal, active = conditions.goal, conditions.goal.active["force_limit"]
+    goal = conditions.goal
+    active = conditions.goal.active["force_limit"]
     other = conditions._replace(goal=goal.replace("force", limit=goal["force"].limit + 1))
     changed = identity(other) != identity(conditions)
     np.testing.assert_array_equal(changed, active)
-    assert active.any() and not active.all()
+    assert active.any()
+    assert not active.all()
 
 
 def test_episodes_of_one_reference_are_a_cluster(conditions):
-    goal, index = conditions.goal, conditions.reset_state.object_index
+    goal = conditions.goal
+    index = conditions.reset_state.object_index
     found = reference(conditions)
     posed = goal.active["pose_finger"] | goal.active["trajectory"]
     plain = ~posed
@@ -108,9 +111,8 @@ def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
     for obj in np.flatnonzero(plan.covered):
         rests = plan.episodes.rests[index == obj]
         of_each = np.unique(rests, return_counts=True)[1]
-        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(
-            task.OBJECTS[obj].rest_poses
-        )
+        assert of_each.max() - of_each.min() <= 1
+        assert len(of_each) <= len(task.OBJECTS[obj].rest_poses)
     for block, active in zip(blocks(TASK), (*MASKS[name], 0, 0), strict=True):
         np.testing.assert_array_equal(
             conditions.goal.active[block], np.full(plan.total, bool(active))
@@ -125,7 +127,8 @@ def test_episodes_are_independent_of_other_objects(bank):
     for name in ("affordance", "pose+trajectory"):
         among = plan_row(TASK, bank, task.OBJECTS, name, 30)
         alone = plan_row(TASK, fewer, task.OBJECTS[1:], name, 8)
-        whole, part = _all(bank, among), _all(fewer, alone, size=4)
+        whole = _all(bank, among)
+        part = _all(fewer, alone, size=4)
         for i, (obj, number) in enumerate(
             zip(alone.episodes.objects, alone.episodes.numbers, strict=True)
         ):
@@ -165,7 +168,8 @@ def test_pairs_are_independent_unless_aligned(bank):
         apart[name] = np.where(own, away, np.inf).min(1)
     independent, aligned = apart.values()
     # The table leaves few references in some resting poses, so that two draws may well be the same.
-    assert aligned.max() < 0.005 and np.mean(independent > 0.005) > 0.5
+    assert aligned.max() < 0.005
+    assert np.mean(independent > 0.005) > 0.5
 
 
 def test_trajectories_end_nearer_to_the_graspable_region(bank):
@@ -182,7 +186,8 @@ def test_objects_that_allow_nothing_are_counted(bank):
     valid = np.array(bank.pose_valid)
     valid[1] = False
     plan = plan_row(TASK, bank._replace(pose_valid=valid), task.OBJECTS, "pose", 10)
-    assert plan.covered.tolist() == [True, False, True, True] and 1 not in plan.episodes.objects
+    assert plan.covered.tolist() == [True, False, True, True]
+    assert 1 not in plan.episodes.objects
     assert plan.total == 12
 
 

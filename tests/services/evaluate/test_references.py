@@ -26,7 +26,8 @@ def policy():
 def test_reference_policies_never_had_poses_or_trajectories():
     for hand in pretrained_hands():
         bundle = bundles.load(reference_file(hand))
-        assert bundle.spec.hand == hand and set(bundle.task.constraints) == {
+        assert bundle.spec.hand == hand
+        assert set(bundle.task.constraints) == {
             "heading",
             "affordance",
         }
@@ -37,10 +38,13 @@ def test_reference_policies_never_had_poses_or_trajectories():
 @pytest.mark.parametrize("count", range(1, POSES + 1))
 def test_held_out_references_are_not_for_training(count):
     order = references.arrange(count)
-    training, held_out = order[:-HELD_OUT], order[-HELD_OUT:]
-    assert len(order) == POSES and set(order) <= set(range(count))
+    training = order[:-HELD_OUT]
+    held_out = order[-HELD_OUT:]
+    assert len(order) == POSES
+    assert set(order) <= set(range(count))
     if count > 1:
-        assert set(order) == set(range(count)) and not set(training) & set(held_out)
+        assert set(order) == set(range(count))
+        assert not set(training) & set(held_out)
     if count == POSES:
         np.testing.assert_array_equal(order, np.arange(POSES))
 

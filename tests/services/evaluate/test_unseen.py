@@ -35,7 +35,8 @@ def simulated(monkeypatch):
         return [obj.name for obj in objects]
 
     def plan(self, variation):
-        assert self.bank == [obj.name for obj in self.objects] and variation.constraint == "heading"
+        assert self.bank == [obj.name for obj in self.objects]
+        assert variation.constraint == "heading"
         index = np.tile(np.arange(len(self.objects)), self.episodes // len(self.objects))
         return types.SimpleNamespace(episodes=index, total=len(index))
 
@@ -84,12 +85,14 @@ def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
     whole, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
     assert {obj["episodes"] for obj in whole.objects} == {2}
     assert [obj["name"] for obj in whole.objects] == [obj.name for obj in OBJECTS]
-    assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
+    assert whole.episodes == 10
+    assert whole.covered == 5
+    assert whole.pool == 6
+    assert whole.success == 1.0
     assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
-    assert sum(row.episodes for row in by_size) == 10 and {row.success_all for row in by_size} == {
-        1.0
-    }
+    assert sum(row.episodes for row in by_size) == 10
+    assert {row.success_all for row in by_size} == {1.0}
     assert whole.success_all == pytest.approx(5 / 6)
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
     assert whole.paper.success == 0.927
@@ -135,7 +138,8 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
 
 
 def test_no_more_than_the_next_pool_is_made_ahead(simulated):
-    made, ahead = [], []
+    made = []
+    ahead = []
 
     def make(i):
         made.append(i)
@@ -145,7 +149,8 @@ def test_no_more_than_the_next_pool_is_made_ahead(simulated):
     evaluated(
         pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated))
     )
-    assert made == [0, 1, 2, 3, 4] and max(ahead) <= 1
+    assert made == [0, 1, 2, 3, 4]
+    assert max(ahead) <= 1
 
 
 def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
@@ -168,7 +173,9 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
     monkeypatch.setattr(of_objects, "headings_of", headings_of)
     whole, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
     assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
-    assert (whole.covered, whole.pool) == (2, 4) and lost in caplog.text
+    assert whole.covered == 2
+    assert whole.pool == 4
+    assert lost in caplog.text
     with pytest.raises(CongraspError, match="None of the objects can be approached"):
         evaluated(pools_of(OBJECTS[1:2]), 6)
 
@@ -183,7 +190,8 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
         "results of other files are not resumed"
     )
     loaded = [make() for make in pools.make]
-    assert pools.size == 2 and [len(one.objects) for one in loaded] == [2, 2, 0]
+    assert pools.size == 2
+    assert [len(one.objects) for one in loaded] == [2, 2, 0]
     assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]
 
 
@@ -191,6 +199,7 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
     monkeypatch.setattr(of_objects, "_MAX_OBJECTS_ELSEWHERE", 2)
     pools = procedural_pools(5, "native", "development")
     objects = [make().objects for make in pools.make]
-    assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
+    assert pools.size == 2
+    assert [len(pool) for pool in objects] == [2, 2, 2]
     names = [obj.name for pool in objects for obj in pool]
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, FAMILIES)]

@@ -16,7 +16,8 @@ from tests.episodes import episode_message
 
 
 def record(folder: pathlib.Path, *messages: tuple[str, Message]) -> pathlib.Path:
-    convert, writer = Converter(), LogWriter(folder, "log")
+    convert = Converter()
+    writer = LogWriter(folder, "log")
     for number, (key, message) in enumerate(messages):
         writer.write(*convert(f"congrasp/run/log/{key}", message, 10**15 + number))
     writer.close()
@@ -55,7 +56,9 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
             if entry.encoding == "json":
                 known |= {path.replace("/", ".") for path in flatten(json.loads(entry.data))}
     kinds = [panel["panelType"] for panel in shown]
-    assert (kinds.count("ThreeDee"), kinds.count("Log"), kinds.count("Plot")) == (1, 1, 5)
+    assert kinds.count("ThreeDee") == 1
+    assert kinds.count("Log") == 1
+    assert kinds.count("Plot") == 5
     for panel in shown:
         config = panel["config"]
         topics = [

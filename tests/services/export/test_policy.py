@@ -85,9 +85,11 @@ def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: path
         sum(field["size"] for field in meta["observation"]),
     ]
     assert session.get_outputs()[0].shape == ["batch", len(meta["action"])]
-    assert "w, x, y, z" in meta["units"] and meta["version"] == 7
+    assert "w, x, y, z" in meta["units"]
+    assert meta["version"] == 7
     units = [entry["unit"] for entry in meta["action"]]
-    assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3 and meta["rate_hz"] == 100.0
+    assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3
+    assert meta["rate_hz"] == 100.0
 
 
 def test_the_file_s_limits_and_gains_are_those_of_the_hand(
@@ -97,22 +99,22 @@ def test_the_file_s_limits_and_gains_are_those_of_the_hand(
     stored = (
         onnxruntime.InferenceSession(tmp_path / "policy.onnx").get_modelmeta().custom_metadata_map
     )
-    limits, joints = JointLimits(**json.loads(stored["robot_limits"])), get_hand("human").joints
+    limits = JointLimits(**json.loads(stored["robot_limits"]))
+    joints = get_hand("human").joints
     for name, wanted in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
         np.testing.assert_allclose(
             getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints]
         )
     q_open = np.append(get_hand("human").q_open, np.zeros(6))
     limited = Limiter(limits, q_open).limit(np.full(26, np.nan), q_open, np.zeros(26), 0.0)
-    assert np.isfinite(limited.target).all() and limited.by == ("not_finite",)
+    assert np.isfinite(limited.target).all()
+    assert limited.by == ("not_finite",)
 
 
 @pytest.fixture(scope="module")
 def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    path, pretrained = (
-        tmp_path_factory.mktemp("onnx") / "policy.onnx",
-        bundles.load(policy_file(None)),
-    )
+    path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
+    pretrained = bundles.load(policy_file(None))
     exports.export_policy(pretrained, "onnx", path)
     assert difference(pretrained, path) <= 3e-6
     return path
@@ -139,7 +141,8 @@ def example_grasp(path: pathlib.Path) -> tuple[Any, Any]:
 
 def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     """(D,) what the policy of a task is to observe in the state of the example's grasp."""
-    hand, data = get_hand("human"), grasp.data
+    hand = get_hand("human")
+    data = grasp.data
     force, touching = grasp.forces()
     contacts = np.zeros((1, len(hand.links), CONTACTS_PER_LINK, 3))
     contacts[0, :, 0] = force  # one contact a link that carries its whole force

@@ -29,7 +29,8 @@ def file(constraint_sets, tmp_path_factory):
 
 def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
     for constraints in constraint_sets:
-        arrays, meta = constraints.arrays, constraints.meta
+        arrays = constraints.arrays
+        meta = constraints.meta
         assert set(arrays) == set(meta["arrays"])
         sizes: dict[str, int] = {"V": 2, "F": len(meta["finger_joints"]), "H": 256, "M": 20}
         for name, words in meta["arrays"].items():
@@ -40,10 +41,8 @@ def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
                     int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
                 ), name
         assert get_hand(meta["hand_reference"]) is HAND
-        assert (
-            meta["finger_joints"][0] == HAND.joints[0].name
-            and meta["quaternions"] == "(w, x, y, z)"
-        )
+        assert meta["finger_joints"][0] == HAND.joints[0].name
+        assert meta["quaternions"] == "(w, x, y, z)"
 
 
 def test_a_set_equals_the_bank_of_training(constraint_sets):
@@ -70,9 +69,8 @@ def test_a_set_equals_the_bank_of_training(constraint_sets):
 
 def test_files_round_trip(constraint_sets, file):
     read = set_file.load(file)
-    assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(
-        constraint_sets[2].meta
-    )
+    assert file.name == "mug_2.constraints.safetensors"
+    assert dict(read.meta) == dict(constraint_sets[2].meta)
     for name, array in constraint_sets[2].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
 
@@ -82,7 +80,9 @@ def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out
-    assert "human, 20 finger joints" in words and "mug_2" in words and "resting pose 1" in words
+    assert "human, 20 finger joints" in words
+    assert "mug_2" in words
+    assert "resting pose 1" in words
     colours = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
     red, _, blue = colours.T
     assert (blue - red > 60).sum() > 20  # arrows

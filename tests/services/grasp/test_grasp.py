@@ -87,14 +87,15 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     assert reports[0][0].startswith("Compiling")
     counts = [report[1:] for report in reports if report[0] == "Attempting"]
     simulated = counts[0][1]
-    assert simulated > steps and counts == [(step + 1, simulated) for step in range(simulated)]
-    assert 1 <= found.held <= found.attempts <= 12 and found.success
+    assert simulated > steps
+    assert counts == [(step + 1, simulated) for step in range(simulated)]
+    assert 1 <= found.held <= found.attempts <= 12
+    assert found.success
     motion = found.motion
-    assert (
-        motion.constraints == ("heading", "affordance")
-        and motion.about["attempts"] == found.attempts
-    )
-    assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
+    assert motion.constraints == ("heading", "affordance")
+    assert motion.about["attempts"] == found.attempts
+    assert len(motion.time) == steps
+    assert motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
     # The hand approached along the block's z axis: the wrist moved mostly in that direction.
@@ -104,17 +105,16 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     # The held block keeps its height although there is no table.
     assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
     facts = found.facts()
-    assert (
-        facts["heading_rad"] < 0.5
-        and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
-    )
+    assert facts["heading_rad"] < 0.5
+    assert {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
 
     again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
 def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
-    begun, given = [], attempts._requested
+    begun = []
+    given = attempts._requested
     monkeypatch.setattr(
         attempts, "_requested", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
     )
@@ -124,7 +124,8 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
     )
     arrays = found.episode.to_message().arrays
-    assert found.motion.hand == "human_left" and found.success
+    assert found.motion.hand == "human_left"
+    assert found.success
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
     np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
     start = mirror.fields(
@@ -174,7 +175,9 @@ def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
         monkeypatch.setattr(four._attempts, "run", run)
         return four._cause(block, request, lambda what, done, total: None)
 
-    free, light, narrow = GraspRequest(), 0.3 * block.mass, 0.8 * SIDES[0]
+    free = GraspRequest()
+    light = 0.3 * block.mass
+    narrow = 0.8 * SIDES[0]
     assert cause(free, lambda obj: obj.mass < light) == (
         f"Its weight is the cause: with a quarter of its {1000 * block.mass:.0f} g 4 of 4 attempts "
         f"hold it."
@@ -196,11 +199,15 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
     upright = int(np.argmax(block.rest_poses[:, 2]))
     found = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()
-    motion, phases = found.motion, found.facts()["phases"]
-    assert list(phases) == ["approach", "grasp", "lift", "hold"] and found.rest == upright
+    motion = found.motion
+    phases = found.facts()["phases"]
+    assert list(phases) == ["approach", "grasp", "lift", "hold"]
+    assert found.rest == upright
     seconds = lifting.task.approach_steps * lifting.task.control_dt
-    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + seconds)
-    assert motion.table.all() and found.success
+    assert phases["grasp"] >= 0.3
+    assert phases["lift"] == pytest.approx(phases["grasp"] + seconds)
+    assert motion.table.all()
+    assert found.success
     grasped, lifted, held = (
         round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold")
     )
@@ -286,12 +293,14 @@ def meshes(folder: pathlib.Path, *names: str) -> pathlib.Path:
 
 def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch, fake_grasps):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    folder, out = meshes(tmp_path / "things", "a", "b"), tmp_path / "out"
+    folder = meshes(tmp_path / "things", "a", "b")
+    out = tmp_path / "out"
     (folder / "bad.obj").write_text("no mesh")
     assert command(folder, "--out", out) == 2
     captured = capsys.readouterr()
     assert fake_grasps == ["a", "b"]
-    assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
+    assert "bad.obj" in captured.err
+    assert captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
     size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
     assert (
@@ -300,7 +309,8 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert f"b: {size}; held; best of" in captured.out
     assert "2 of 3 objects are held; 1 could not be used" in captured.out
     summary = json.loads((out / "summary.json").read_text())
-    assert (summary["objects"], summary["succeeded"]) == (3, 2)
+    assert summary["objects"] == 3
+    assert summary["succeeded"] == 2
     assert load_motion(out / "a" / MOTION).object == "a"
     assert next(read_episodes(out / "a" / RECORDING)).object == "a"
     assert sorted(path.name for path in (out / "a").iterdir()) == [RECORDING, MOTION, RESULT]
@@ -310,7 +320,8 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert json.loads((out / "a" / RESULT).read_text())["object_mass"] > 0.001
     (out / "b" / RESULT).unlink()  # as if it had been interrupted while b was written
     assert command(folder, "--out", out) == 0
-    assert fake_grasps == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
+    assert fake_grasps == ["a", "b", "b", "c"]
+    assert "a (done before)" in capsys.readouterr().out
     assert command(folder, "--out", out, "--heading", "above") == 0  # another request
     assert command(folder, "--out", out, "--heading", "above") == 0
     assert fake_grasps[4:] == ["a", "b", "c"]
@@ -354,14 +365,13 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
         red, _, blue = np.moveaxis(image, -1, 0)
-        orange, skin = (
-            (red > 90) & (blue < 0.5 * red),
-            (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red),
-        )
+        orange = (red > 90) & (blue < 0.5 * red)
+        skin = (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red)
         for part in np.array_split(np.arange(image.shape[1]), columns)[
             : 2 if name == OBJECT else columns
         ]:
-            assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
+            assert orange[:, part].sum() > 400, name
+            assert skin[:, part].sum() > 400, name
     assert (tmp_path / "out" / "summary.png").exists()
 
 
@@ -380,9 +390,11 @@ def test_an_upright_resting_pose_is_preferred():
     """
     mug = procedural.generate(0, "mug")
     upright = upright_rest(mug)
-    assert upright is not None and upright > 0
+    assert upright is not None
+    assert upright > 0
     rests = np.arange(len(mug.rest_poses))
     places = rest_ranks(mug, rests, GraspRequest())
-    assert places[upright] == 0 and sorted(places) == list(rests)
+    assert places[upright] == 0
+    assert sorted(places) == list(rests)
     np.testing.assert_array_equal(places[upright + 1 :], rests[upright + 1 :])
     assert not rest_ranks(mug, rests, GraspRequest(rest=0)).any()

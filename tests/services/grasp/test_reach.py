@@ -51,7 +51,8 @@ def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
 
 def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) exact distances of the hand's capsules from a ball, and from the table."""
-    ball, table = [], []
+    ball = []
+    table = []
     origins = np.array(
         [link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links]
     )
@@ -76,7 +77,8 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
 def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
     name, heading, speed, ball
 ) -> None:
-    hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
+    hand = get_hand(name)
+    way = np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
     reach = plan_reach(hand, ball, rest, way, first, 0.2, DT, speed)
@@ -106,7 +108,8 @@ def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
 
 
 def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
-    hand, task = get_hand("human"), TaskConfig()
+    hand = get_hand("human")
+    task = TaskConfig()
     further = dataclasses.replace(
         task, control=dataclasses.replace(task.control, approach_position_limit=0.04)
     )
@@ -148,12 +151,13 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
         "hold": pytest.approx(0.11),
     }
     motion = longer.normalised()
-    assert len(motion.time) == 15 and motion.table[:11].all() and not motion.table[11:].any()
+    assert len(motion.time) == 15
+    assert motion.table[:11].all()
+    assert not motion.table[11:].any()
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
     np.testing.assert_allclose(motion.link_position[3:], made.link_position)
-    assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[
-        :3
-    ].any()
+    assert (motion.object_position == motion.object_position[0]).all()
+    assert not motion.link_force[:3].any()
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
     u = longer.require_recorded().wrist_joints
     for t in range(3):
@@ -163,7 +167,8 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
             first.apply(u[t, :3]) + made.wrist_position[0], place[t], atol=1e-6
         )
     # Used as a reference, such a motion is cut to its grasp.
-    assert grasp_part(motion) == (3, 10) and longer.grasp_span == (3, 11)
+    assert grasp_part(motion) == (3, 10)
+    assert longer.grasp_span == (3, 11)
     lifted = dataclasses.replace(
         motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}}
     )
@@ -180,7 +185,9 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
         begin, end = dataclasses.replace(longer, about={"phases": odd}).grasp_span
         assert 0 <= begin <= end <= len(motion.time)
     drawn = steps_to_draw(100, 150, 400)
-    assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
+    assert drawn[0] == 0
+    assert {100, 150, 400} < set(drawn)
+    assert len(drawn) == 8
 
 
 def test_resting_poses_by_name_and_number() -> None:
@@ -204,7 +211,8 @@ def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> No
     mug = procedural.generate(7, "mug")
     Catalogue(tmp_path / "mine").add(mug)
     (found,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
-    assert not errors and found.load().name == "mug_7"
+    assert not errors
+    assert found.load().name == "mug_7"
     trimesh.creation.box((0.05, 0.05, 0.1)).export(tmp_path / "mug_7.stl")
     (other,), _ = find_objects([str(tmp_path / "mug_7.stl")], str(tmp_path / "mine"))
     assert other.source is not None  # a file is a file

@@ -21,9 +21,11 @@ def bvh(path, order="ZXY", unit=0.01):
     are arbitrary.
     """
     up = Rotation.from_euler("X", -90, degrees=True)
-    place, turn = up.apply(POSITION) / unit, up * ROTATION
+    place = up.apply(POSITION) / unit
+    turn = up * ROTATION
     shoulder = Rotation.from_rotvec(np.outer(T, [0.2, 0.5, -0.1]))
-    arm, hand = np.array([3.0, -20.0, 1.0]), np.array([0.0, -25.0, 2.0])
+    arm = np.array([3.0, -20.0, 1.0])
+    hand = np.array([0.0, -25.0, 2.0])
     elbow = Rotation.from_rotvec(np.outer(T, [-0.3, 0.0, 0.6]))
     root = place - shoulder.apply(arm) - (shoulder * elbow).apply(hand)
     turns = [shoulder, elbow, (shoulder * elbow).inv() * turn]

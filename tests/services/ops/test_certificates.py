@@ -29,9 +29,11 @@ def test_a_certificate_says_run_role_number_hosts_and_end(folder):
     made = read(
         issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt"
     )
-    assert (made.name, made.identity) == ("human.learner.0", ("human", "learner", 0))
+    assert made.name == "human.learner.0"
+    assert made.identity == ("human", "learner", 0)
     assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
-    assert made.expires.utcoffset() == datetime.timedelta(0) and 29.99 < made.days <= 30
+    assert made.expires.utcoffset() == datetime.timedelta(0)
+    assert 29.99 < made.days <= 30
     assert read(issue(folder, "learner") / "tls.crt").name == "human.learner.1"
     other = issue(folder, "learner", run="a.b-c")
     assert (
@@ -69,13 +71,12 @@ def test_openssl_agrees_who_may_listen(folder, tmp_path):
         ]
         return subprocess.run(command, capture_output=True, check=False, timeout=20).returncode == 0
 
-    learner, actor = issue(folder, "learner") / "tls.crt", issue(folder, "actor") / "tls.crt"
+    learner = issue(folder, "learner") / "tls.crt"
+    actor = issue(folder, "actor") / "tls.crt"
     ca = folder / "ca.crt"
-    assert (
-        verify(ca, learner, "sslserver")
-        and verify(ca, learner, "sslclient")
-        and verify(ca, actor, "sslclient")
-    )
+    assert verify(ca, learner, "sslserver")
+    assert verify(ca, learner, "sslclient")
+    assert verify(ca, actor, "sslclient")
     assert not verify(ca, actor, "sslserver")
     assert not verify(tmp_path / "other" / "ca.crt", actor, "sslclient")
 
@@ -149,7 +150,8 @@ def test_a_common_name_that_is_none_of_ours_is_nobodys(name):
 
 
 def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(folder):
-    learner, actor = issue(folder, "learner"), issue(folder, "actor")
+    learner = issue(folder, "learner")
+    actor = issue(folder, "actor")
     assert revoke(folder, "actor", 0) == "human.actor.0"
     assert revoke(folder, "actor", 3) == "human.actor.3"
     assert Credentials(learner, "learner").revoked() == {"human.actor.0", "human.actor.3"}

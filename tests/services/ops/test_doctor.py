@@ -44,7 +44,8 @@ def test_this_machine_is_looked_at(capsys):
     lines = capsys.readouterr().out.splitlines()
     if code == 0:
         assert lines.pop().startswith("Next: congrasp train --preset check")
-    assert len(lines) >= len(ALWAYS) and all(line.startswith(("ok ", "BAD")) for line in lines)
+    assert len(lines) >= len(ALWAYS)
+    assert all(line.startswith(("ok ", "BAD")) for line in lines)
     assert code == int(any(line.startswith("BAD") for line in lines))
 
 
@@ -54,7 +55,8 @@ def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypa
         importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name)
     )
     found = findings()
-    assert not found["mujoco"].fine and "4.0.0: ==3.17.0 is needed" in found["mujoco"].text
+    assert not found["mujoco"].fine
+    assert "4.0.0: ==3.17.0 is needed" in found["mujoco"].text
     assert "4.0.0 and 3.17.0 do not match" in found["mujoco, mujoco-mjx"].text
     assert command() == 1
     assert any(line.startswith("BAD  mujoco") for line in capsys.readouterr().out.splitlines())
@@ -75,7 +77,8 @@ def test_a_port_in_use_is_named(monkeypatch):
         busy.bind(("127.0.0.1", doctor._PORT))
         busy.listen()
         found = findings()["ports"]
-    assert f"{doctor._PORT} is in use" in found.text and "--listen" in found.text
+    assert f"{doctor._PORT} is in use" in found.text
+    assert "--listen" in found.text
 
 
 def _slow(patch):
@@ -127,7 +130,9 @@ def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
     with monkeypatch.context() as change:
         patch(change)
         (found,) = doctor._tried(CHECKS[what])
-    assert found.what == what and not found.fine and re.search(words, found.text), found.text
+    assert found.what == what, found.text
+    assert not found.fine, found.text
+    assert re.search(words, found.text), found.text
 
 
 def _broken():
@@ -141,21 +146,25 @@ def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
         subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer)
     )
     found = {finding.what: finding for finding in doctor._gpu()}
-    assert not found["gpu 0"].fine and "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
-    assert (
-        found["gpu 1"].fine and found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
-    )
+    assert not found["gpu 0"].fine
+    assert "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
+    assert found["gpu 1"].fine
+    assert found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
 
 
 def test_certificates_are_looked_at(tmp_path):
     (none,) = doctor._certificates(tmp_path)
-    assert not none.fine and "congrasp certs init" in none.text
+    assert not none.fine
+    assert "congrasp certs init" in none.text
     create_authority(tmp_path)
     issue(tmp_path, "actor", days=100.0)
     issue(tmp_path, "observer", days=3.0)
     found = {finding.text.split(":")[0]: finding for finding in doctor._certificates(tmp_path)}
-    actor, observer = found["quickstart.actor.0"], found["quickstart.observer.0"]
-    assert actor.fine and not observer.fine and "issue --force" in observer.text
+    actor = found["quickstart.actor.0"]
+    observer = found["quickstart.observer.0"]
+    assert actor.fine
+    assert not observer.fine
+    assert "issue --force" in observer.text
 
 
 def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
@@ -166,8 +175,11 @@ def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})
         _, clock = doctor._learner(endpoint, "r")
-        assert not clock.fine and clock.text.startswith(("+7.0", "+6.9"))
+        assert not clock.fine
+        assert clock.text.startswith(("+7.0", "+6.9"))
         (other,) = doctor._learner(endpoint, "other")
-        assert not other.fine and "No response for congrasp/other/status" in other.text
+        assert not other.fine
+        assert "No response for congrasp/other/status" in other.text
     (unreached,) = doctor._learner(endpoint, "r")
-    assert not unreached.fine and "Start the learner" in unreached.text
+    assert not unreached.fine
+    assert "Start the learner" in unreached.text

@@ -65,21 +65,21 @@ def scrape(port: int) -> dict[tuple[str, ...], float]:
 
 
 def test_a_learner_shows_its_status_and_its_last_update():
-    metrics, port = LearnerMetrics(lambda: STATUS), free_port()
+    metrics = LearnerMetrics(lambda: STATUS)
+    port = free_port()
     metrics.update({"episode/success": 0.5, "update_seconds": 0.25})
     with exposed(port, "127.0.0.1", metrics):
         found = scrape(port)
-    assert found["congrasp_learner_version",] == 7 and found["congrasp_learner_ready",] == 1
+    assert found["congrasp_learner_version",] == 7
+    assert found["congrasp_learner_ready",] == 1
     assert found["congrasp_learner_rollouts_total", "consumed"] == 7
     assert found["congrasp_learner_tickets_total", "granted"] == 9
     assert (
         found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",]
         == 4
     )
-    assert (
-        found["congrasp_learner_actor_lag", "a", "1"] == 1
-        and found["congrasp_learner_roles", "actor"] == 1
-    )
+    assert found["congrasp_learner_actor_lag", "a", "1"] == 1
+    assert found["congrasp_learner_roles", "actor"] == 1
     assert found["congrasp_learner_update", "episode/success"] == 0.5
     assert found["process_resident_memory_bytes",] > 0
 
@@ -94,16 +94,19 @@ def test_a_learner_that_starts_is_not_ready():
 
 
 def test_an_actor_shows_its_last_rollout():
-    metrics, port = ActorMetrics(), free_port()
+    metrics = ActorMetrics()
+    port = free_port()
     metrics.rollout({"version": 3.0, "rollouts": 12.0, "steps_per_second": 99.0})
     with exposed(port, "127.0.0.1", metrics):
         found = scrape(port)
-    assert found["congrasp_actor_rollouts_total",] == 12 and found["congrasp_actor_version",] == 3
+    assert found["congrasp_actor_rollouts_total",] == 12
+    assert found["congrasp_actor_version",] == 3
     assert found["congrasp_actor_steps_per_second",] == 99
 
 
 def test_a_server_counts_answers_and_batches_from_many_threads():
-    metrics, port = ServerMetrics(), free_port()
+    metrics = ServerMetrics()
+    port = free_port()
     metrics.health = lambda: {"ready": True, "version": 5, "queue": 2}
 
     def answer(number):
@@ -160,7 +163,8 @@ def scraped_until(port, condition):
 
 @pytest.mark.timeout(240)
 def test_a_learner_and_an_actor_are_scraped(tmp_path):
-    endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    ports = (free_port(), free_port())
     small = (
         "--network.hidden",
         "32",
@@ -203,7 +207,8 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
     # On a busy machine notices come first that it still waits.
     first = next(line for line in said if not line["text"].startswith("Waiting for"))
     assert first["text"] == f"Connected to the learner at {endpoint}."
-    assert (first["role"], first["id"]) == ("actor", "worker")
+    assert first["role"] == "actor"
+    assert first["id"] == "worker"
 
 
 def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
@@ -211,7 +216,9 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
         main(["actor", "--connect", "nonsense", "--log-format", "json"])
     said = capfd.readouterr()
     line = json.loads(said.out)
-    assert (end.value.code, line["level"], said.err) == (2, "error", "")
+    assert end.value.code == 2
+    assert line["level"] == "error"
+    assert said.err == ""
     assert line["text"].startswith("'nonsense' is not an endpoint.")
     with pytest.raises(SystemExit):
         main(["grasp", "nowhere.obj"])
@@ -229,7 +236,8 @@ def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
 
     with pytest.raises(CongraspError), outer(), logging_as("json", role="learner", id="0", run="r"):
         raise CongraspError("It is refused.")
-    assert log_error("It is refused.") and not log_error("It is refused.")
+    assert log_error("It is refused.")
+    assert not log_error("It is refused.")
     logging.getLogger("library").warning("after the log")
     lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     assert [(line["level"], line["text"]) for line in lines] == [

@@ -32,14 +32,16 @@ def metrics(**values):
 
 def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():
     convert = Converter()
-    evil, honest = KEYS.log("metrics", "actor", "1.b"), KEYS.log("metrics", "actor", "0.a")
+    evil = KEYS.log("metrics", "actor", "1.b")
+    honest = KEYS.log("metrics", "actor", "0.a")
     schemas = set()
     for i in range(150):
         (entry,) = convert(evil, metrics(**{f"made/up/{i}/{j}": 1.0 for j in range(100)}), i)
         schemas.add(entry.channel.schema)
         (entry,) = convert(honest, metrics(loss=float(i)), i)
         assert f'"loss":{float(i)}' in entry.data.decode()
-    assert len(schemas) <= 32 and sum(map(len, schemas)) < 500_000
+    assert len(schemas) <= 32
+    assert sum(map(len, schemas)) < 500_000
 
 
 RECORDER = """
@@ -77,7 +79,8 @@ def test_a_recorder_keeps_its_size(tmp_path):
 
 
 def test_names_of_one_identity_are_limited_until_they_have_been_silent():
-    clock, forgotten = Clock(), []
+    clock = Clock()
+    forgotten = []
     budget = LogBudget(forgotten.append, clock)
     for i in range(64):
         budget.admit(("actor", f"1.{i}"))
@@ -106,7 +109,8 @@ def test_bytes_are_limited_by_identity():
 
 
 def _odd(tmp_path):
-    pipe, known = tmp_path / "pipe.json", tmp_path / "known.json"
+    pipe = tmp_path / "pipe.json"
+    known = tmp_path / "known.json"
     os.mkfifo(pipe)
     known.write_text(hand_text(get_hand("human")))
     long = ["x" * 300_000, "{" * 100_000]
@@ -118,7 +122,8 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     """Nothing but a CongraspError of one short line, no file is opened (a pipe would wait for
     ever), nothing hangs.
     """
-    convert, whole = Converter(), episode_message()
+    convert = Converter()
+    whole = episode_message()
     messages = {
         "metrics": metrics(loss=1.0),
         "event": Message({}, {"time": 1.0, "level": "info", "text": "x"}),
@@ -134,7 +139,8 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
                 convert(KEYS.log(kind, "actor", "a"), changed, 10**18)
             except CongraspError as error:
                 refused += 1
-                assert len(str(error)) < 500 and str(error).isprintable(), (kind, name, odd)
+                assert len(str(error)) < 500, (kind, name, odd)
+                assert str(error).isprintable(), (kind, name, odd)
     assert refused > 100
 
 
@@ -160,7 +166,8 @@ def test_episodes_that_are_none_are_refused(change, why):
 
 
 def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
-    convert, whole = Converter(), episode_message()
+    convert = Converter()
+    whole = episode_message()
     long = Message(whole.arrays, {**whole.meta, "control_dt": 1.0})  # 12 s
     for _ in range(6):
         assert convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
@@ -178,4 +185,5 @@ def test_a_live_view_bounds_what_waits(monkeypatch):
         for _ in range(200):
             for entry in entries:
                 server.write(entry)
-        assert server.queued_bytes <= 1 << 20 and sum(server.left_out.values()) > 0
+        assert server.queued_bytes <= 1 << 20
+        assert sum(server.left_out.values()) > 0

@@ -81,7 +81,8 @@ def viewer(server: LiveServer, max_queue: int = 16) -> ClientConnection:
 
 
 def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.Path) -> None:
-    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    transport = MemoryTransport(MemoryHub())
+    keys = Keys("r")
     with (
         LiveServer(0) as server,
         Recorder(transport, "r", tmp_path, sinks=[server]) as recorder,
@@ -101,18 +102,21 @@ def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.
             transport.publish(keys.log("episode", "actor", "a0"), episode_message(150))
             seen.listen(3.0)
         seen.wait_for("/episode/a0/scene", 1)
-    assert recorder.error == "" and recorder.files[0].suffix == ".mcap"
+    assert recorder.error == ""
+    assert recorder.files[0].suffix == ".mcap"
     payload = json.loads(seen.frames["/metrics/learner/0"][-1][1])
     assert payload["values"] == {"kl": 0.5}
     channel = seen.advertised["/metrics/learner/0"]
-    assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+    assert channel["encoding"] == "json"
+    assert channel["schemaEncoding"] == "jsonschema"
     assert seen.advertised["/episode/a0/tf"]["schemaName"] == "foxglove.FrameTransforms"
     stamps = [stamp for stamp, _ in seen.frames["/episode/a0/tf"]]
     assert {round((b - a) / 1e9 / CONTROL_DT) for a, b in itertools.pairwise(stamps)} == {1}
 
 
 def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathlib.Path) -> None:
-    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    transport = MemoryTransport(MemoryHub())
+    keys = Keys("r")
     with LiveServer(0) as server, Recorder(transport, "r", None, sinks=[server]):
         channel = JsonChannels()
         server.write(channel.entry("/late", time.time_ns() + 3600 * 10**9, {"a": 1}))
@@ -129,7 +133,8 @@ def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathl
 
 def test_a_schema_that_grows_replaces_its_channel() -> None:
     with LiveServer(0) as server, viewer(server) as socket:
-        seen, channels = Viewer(socket), JsonChannels()
+        seen = Viewer(socket)
+        channels = JsonChannels()
         for fields in ({"a": 1}, {"a": 1, "b": 2}):
             for _ in range(400):
                 server.write(channels.entry("/m", time.time_ns(), fields))

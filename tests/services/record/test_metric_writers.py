@@ -20,7 +20,9 @@ from tests.episodes import episode_message
 
 def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
     """A run of which a learner, an actor and an episode are recorded."""
-    keys, config, logs = Keys("r"), RunConfig(name="r"), folder / "logs"
+    keys = Keys("r")
+    config = RunConfig(name="r")
+    logs = folder / "logs"
     with (
         MemoryTransport(MemoryHub()) as transport,
         recorded(transport, config, folder, logs, names) as running,
@@ -44,7 +46,8 @@ def events(folder: pathlib.Path) -> list[list[Event]]:
     """
     found = []
     for path in sorted(folder.iterdir()):
-        data, at = path.read_bytes(), 0
+        data = path.read_bytes()
+        at = 0
         found.append([])
         while at < len(data):
             (length,) = struct.unpack_from("<Q", data, at)
@@ -65,12 +68,14 @@ def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
         (update, tag) for update in range(5) for tag in ("episode/success", "kl")
     }
     assert scalars[3, "episode/success"] == pytest.approx(0.3)
-    assert (first[1].step, first[1].session_log.status) == (0, SessionLog.START)
+    assert first[1].step == 0
+    assert first[1].session_log.status == SessionLog.START
     publish(tmp_path, ["tensorboard"], range(3, 6))
     second = [
         found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3
     ]
-    assert len(second) == 1 and second[0][1].session_log.status == SessionLog.START
+    assert len(second) == 1
+    assert second[0][1].session_log.status == SessionLog.START
     # The MCAP has the same, whatever the writer does.
     np.testing.assert_array_equal(read_metrics(tmp_path / "logs")["learner/0/kl"][0], range(6))
 
@@ -84,7 +89,8 @@ def test_weights_and_biases_offline(
     data = file.read_bytes()
     for text in (b"episode/success", b"kl", b"congrasp", b"0.25", b"environments"):
         assert text in data, text
-    assert data.count(b"episode/success") >= 3 and b"pace" not in data
+    assert data.count(b"episode/success") >= 3
+    assert b"pace" not in data
     assert not (tmp_path / "tensorboard").exists()
 
 

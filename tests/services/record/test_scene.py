@@ -76,7 +76,8 @@ def test_capsules_lie_in_their_links_frames(entries: list[Entry]) -> None:
     entities = {e.id: e for e in SceneUpdate.FromString(entry.data).entities}
     for link in HAND.links:
         entity = entities[f"hand/{link.name}"]
-        assert entity.frame_id == f"a0/{link.name}" and entity.frame_locked
+        assert entity.frame_id == f"a0/{link.name}"
+        assert entity.frame_locked
         assert len(entity.cylinders) == len(link.capsules)
         for cylinder, capsule in zip(entity.cylinders, link.capsules, strict=True):
             along = Rotation.from_quat(
@@ -146,7 +147,8 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
         [raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1
     )
     np.testing.assert_array_equal(points, arrays["surface_points"])
-    red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
+    red = raw[:, offsets["red"]].astype(int)
+    green = raw[:, offsets["green"]].astype(int)
     np.testing.assert_array_equal(red > green, arrays["surface_avoid"])
 
 
@@ -169,14 +171,16 @@ def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entr
     for link, parts in zip(HAND.links, surface_parts(HAND), strict=True):
         (entry,) = of(entries, f"hand/{link.name}")
         cloud = PointCloud.FromString(entry.data)
-        assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
+        assert cloud.frame_id == f"a0/{link.name}"
+        assert entry.channel.latched
         raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
         points = raw[:, :12].copy().view("<f4")
         corners = np.concatenate([part.points[part.faces] for part in parts])
         assert max(above(corners, point) for point in points[::20].astype(float)) < 1e-6
         assert np.linalg.norm(np.ptp(points, axis=0)) > 0.01
         colours = {tuple(np.multiply(part.colour, 255).astype(int)) for part in parts}
-        assert set(map(tuple, raw[:, 12:15])) == colours and (raw[:, 15] == 255).all()
+        assert set(map(tuple, raw[:, 12:15])) == colours
+        assert (raw[:, 15] == 255).all()
         count += len(points)
     assert 2000 < count < 2100
 
@@ -185,7 +189,8 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     tmp_path: Path,
 ) -> None:
     """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
-    step, k = 9, [link.name for link in HAND.links].index("thumb_distal")
+    step = 9
+    k = [link.name for link in HAND.links].index("thumb_distal")
     writer = LogWriter(tmp_path, "log")
     writer.write(*Converter()(KEY, episode_message(), START))
     writer.close()
@@ -199,12 +204,11 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     (scene,) = [message for topic, message in found if topic.endswith("scene")]
     frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
     (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
-    assert (
-        frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
-        and frame.parent_frame_id == "a0"
-    )
+    assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
+    assert frame.parent_frame_id == "a0"
     mesh, nail = entity.triangles
-    w, axis = frame.rotation.w, vector(frame.rotation)
+    w = frame.rotation.w
+    axis = vector(frame.rotation)
     local = np.array([vector(point) for point in [*mesh.points, *nail.points]])
     world = (
         local
@@ -212,7 +216,8 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
         + 2 * np.cross(axis, np.cross(axis, local))
         + vector(frame.translation)
     )
-    arrays, skin = episode_message().arrays, skin_of(HAND)
+    arrays = episode_message().arrays
+    skin = skin_of(HAND)
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
     posed = skin.posed(arrays["link_position"][step], turns)[0]
     own = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
@@ -258,8 +263,10 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
     assert last["reward"] == pytest.approx(
         {"contact": 0.5, "distance": -0.1, "total": 0.4}, abs=1e-6
     )
-    assert last["force"]["thumb_distal"] == pytest.approx(FORCE) and last["force"]["palm"] == 0
-    assert last["links_in_contact"] == 5 and last["table"] is False
+    assert last["force"]["thumb_distal"] == pytest.approx(FORCE)
+    assert last["force"]["palm"] == 0
+    assert last["links_in_contact"] == 5
+    assert last["table"] is False
     assert list(last["q"]) == [joint.name for joint in HAND.joints]
     index = [joint.name for joint in HAND.joints].index("index_pip")
     assert last["q"]["index_pip"] == pytest.approx(float(episode_message().arrays["q"][-1, index]))
@@ -267,17 +274,16 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
 
 def test_the_raw_episode_is_kept_whole(entries: list[Entry]) -> None:
     (entry,) = of(entries, "raw")
-    kept, sent = decode(entry.data), episode_message()
+    kept = decode(entry.data)
+    sent = episode_message()
     assert kept.meta == sent.meta
     assert all(np.array_equal(kept.arrays[name], sent.arrays[name]) for name in sent.arrays)
 
 
 def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side() -> None:
     convert = Converter()
-    first, second = (
-        convert(KEY, episode_message(), START),
-        convert(KEY, episode_message(), START + 1),
-    )
+    first = convert(KEY, episode_message(), START)
+    second = convert(KEY, episode_message(), START + 1)
     assert min(e.time for e in second) > max(e.time for e in first)
     other = convert("congrasp/run/log/episode/actor/b", episode_message(), START)
     transforms = [
@@ -292,7 +298,8 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
 
 
 def test_a_clock_that_is_set_back_drops_no_episode() -> None:
-    convert, day = Converter(), 86_400_000_000_000
+    convert = Converter()
+    day = 86_400_000_000_000
     first = convert(KEY, episode_message(), START)
     left = max(entry.time for entry in first) - START
     times = [entry.time for entry in convert(KEY, episode_message(), START - day)]

@@ -106,7 +106,8 @@ class Letters(Gate):
 
     def run(self, *items):
         """Submits (peer, item) while the first is held back; their futures."""
-        batcher, first = self.batcher(), Future()
+        batcher = self.batcher()
+        first = Future()
         (peer, item), *rest = items
         threading.Thread(
             target=lambda: first.set_result(batcher.submit(item, 10.0, Peer(peer))), daemon=True
@@ -131,7 +132,8 @@ class Letters(Gate):
     ],
 )
 def test_peers_share_a_batch_however_long_their_items_are(several, items, batches):
-    gate, asked = Letters(), [item.split(":") for item in items.split()]
+    gate = Letters()
+    asked = [item.split(":") for item in items.split()]
     futures, batcher = gate.run(*asked)
     assert [future.result(10) for future in futures] == [item.upper() for _, item in asked]
     assert gate.batches == batches
@@ -158,7 +160,8 @@ def test_an_item_of_which_a_part_fails_is_run_no_further(several):
 def test_a_query_whose_deadline_passed_is_not_computed(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=4)
     running(batcher, gate)
-    late, patient = batcher.submit(1, 0.001), batcher.submit(2, 10.0)
+    late = batcher.submit(1, 0.001)
+    patient = batcher.submit(2, 10.0)
     time.sleep(0.02)
     gate.go.set()
     assert patient.result(10) == 20
@@ -169,7 +172,8 @@ def test_a_query_whose_deadline_passed_is_not_computed(gate):
 
 
 def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
-    threads, go = [], threading.Event()
+    threads = []
+    go = threading.Event()
 
     def run(items, queued):
         threads.append(threading.get_ident())
@@ -186,7 +190,9 @@ def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
     crowd = [batcher.submit(i, 10.0) for i in (3, 4)]
     go.set()
     assert [future.result(10) for future in (held.result(10), *crowd)] == [2, 3, 4]
-    assert threads[0] == alone and threads[2] not in (alone, threads[1]) and len(threads) == 3
+    assert threads[0] == alone
+    assert threads[2] not in (alone, threads[1])
+    assert len(threads) == 3
     batcher.close()
     pool.shutdown()
 

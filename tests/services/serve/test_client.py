@@ -85,7 +85,9 @@ def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     server.close()
     first, second, third = server.fields
     assert server.described == 1
-    assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
+    assert answer.version == 3
+    assert answer.active == ("words",)
+    assert answer.server_ms == 0.5
     np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
     np.testing.assert_allclose(first["q_target"], REQUEST.q, rtol=1e-6)
     np.testing.assert_array_equal(second["q_target"], np.full(20, 1.0))
@@ -122,7 +124,8 @@ def test_the_layout_is_requested_again_when_another_server_has_another_one(endpo
         server = CannedServer(endpoint, points=3)
         eventually(lambda: answered(client))
         client.act(STATE)
-        assert server.described == 1 and server.fields[1]["surface_points"].shape == (3, 3)
+        assert server.described == 1
+        assert server.fields[1]["surface_points"].shape == (3, 3)
         assert [float(fields["time"]) for fields in server.fields] == [2.0, 3.0]
     server.close()
 

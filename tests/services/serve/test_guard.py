@@ -43,7 +43,9 @@ class ScriptedPolicy:
     """
 
     def __init__(self, outcome):
-        self.outcome, self.states, self.requests = outcome, [], []
+        self.outcome = outcome
+        self.states = []
+        self.requests = []
 
     def reset(self, request):
         self.requests.append(request)
@@ -75,29 +77,30 @@ def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):
 
 
 def test_answers_are_followed_from_the_targets_that_were_commanded():
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.9, 0.9])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.9, 0.9])))
     with guarded(policy, clock) as guard:
         first = guard.step(STATE)
         clock.now += 0.01
         second = guard.step(STATE)
-    assert first.mode == second.mode == "follow" and second.answer is policy.outcome
+    assert first.mode == second.mode == "follow"
+    assert second.answer is policy.outcome
     # 1 N.m over 2 N.m/rad ahead of the joint; its limit
     np.testing.assert_allclose(first.q_target, [0.5, 0.4])
     np.testing.assert_allclose(first.q_torque, [1.0, 0.8])
     np.testing.assert_array_equal(policy.states[0]["q_target"], np.zeros(FINGERS))
     np.testing.assert_array_equal(policy.states[1]["q_target"], first.q_target)
     assert policy.requests == [REQUEST]
-    assert guard.counters.follow == guard.counters.answers == 2 and guard.counters.position == 2
+    assert guard.counters.follow == guard.counters.answers == 2
+    assert guard.counters.position == 2
 
 
 def test_velocities_that_are_not_measured_are_estimated_from_positions():
     """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m
     being its gain.
     """
-    clock, policy = (
-        Clock(100.0),
-        ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0]))),
-    )
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
     limits = dataclasses.replace(
         LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0)
     )
@@ -127,7 +130,8 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
 
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
 def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episode(fallback):
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback=fallback) as guard:
         guard.step(STATE)
         policy.outcome = TransportError("Nobody is there.")
@@ -144,12 +148,14 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
             "hold",
             fallback,
         ]
-        assert guard.trouble == "Nobody is there." and guard.counters.lost == 5
+        assert guard.trouble == "Nobody is there."
+        assert guard.counters.lost == 5
         np.testing.assert_allclose(command.q_target, OPEN if fallback == "open" else [0.2, 0.1])
         policy.outcome = answer(np.array([-0.5, 0.0]))
         clock.now += 0.5
         latched = guard.step(STATE)
-        assert latched.mode == fallback and guard.trouble == ""
+        assert latched.mode == fallback
+        assert guard.trouble == ""
         np.testing.assert_allclose(latched.q_target, command.q_target)
         guard.reset(REQUEST)
         assert guard.step(STATE).mode == "follow"
@@ -167,7 +173,8 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
     ],
 )
 def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
         guard.step({**STATE, **({} if "q" in changed or mode == "open" else changed)})
         policy.outcome = TransportError("Nobody is there.")
@@ -187,14 +194,16 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
 
 
 def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
         kept = guard.step(STATE)
         guard.freeze()
         policy.outcome = answer(np.array([0.9, 0.9]))
         clock.now += 0.5
         frozen = guard.step(STATE)
-        assert (kept.mode, frozen.mode) == ("follow", "freeze")
+        assert kept.mode == "follow"
+        assert frozen.mode == "freeze"
         np.testing.assert_allclose(frozen.q_target, kept.q_target)
         guard.open()
         clock.now += 0.5
@@ -207,7 +216,8 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
     """
     state = {name: STATE[name] for name in ("q", "u")}
     for table, mode in ((True, "open"), (False, "freeze")):
-        clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+        clock = Clock(100.0)
+        policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
         with guarded(policy, clock, fallback="open") as guard:
             guard.reset(dataclasses.replace(REQUEST, object_pose=None, cloud=np.zeros((8, 3))))
             assert guard.step({**state, "table": table}).mode == "follow"
@@ -227,7 +237,8 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
 
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
     """2 N.m/rad from the joints at 0 to the targets at 0.2 and 0.1 rad."""
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     blind = {name: np.full_like(value, np.nan) for name, value in STATE.items()}
     with guarded(policy, clock, fallback="open") as guard:
         guard.step(STATE)
@@ -281,7 +292,8 @@ def test_the_palm_stays_above_the_table():
 
 
 def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
-    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(TransportError("Nobody is there."))
     elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
     with guarded(policy, clock) as guard:
         guard.reset(elsewhere)
@@ -291,7 +303,8 @@ def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_
 
 
 def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
-    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(TransportError("Nobody is there."))
     with guarded(policy, clock) as guard:
         assert guard.step(STATE).mode == "hold"
         policy.outcome = answer(np.array([0.1, 0.1]))
@@ -309,12 +322,14 @@ def test_an_answer_to_an_old_state_is_thrown_away():
 
     with guarded(ScriptedPolicy(late), clock) as guard:
         command = guard.step(STATE)
-    assert command.mode == "hold" and guard.counters.stale == 1
+    assert command.mode == "hold"
+    assert guard.counters.stale == 1
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
 def test_after_an_answer_that_came_late_the_next_is_waited_for():
-    slow, done = threading.Event(), threading.Event()
+    slow = threading.Event()
+    done = threading.Event()
 
     def act(state):
         if not slow.is_set():
@@ -346,15 +361,14 @@ def test_a_policy_that_hangs_does_not_hold_the_loop_up():
     modes = []
     while not modes or modes[-1] != "freeze":
         modes.append(guard.step(STATE).mode)
-    assert (
-        len(policy.states) == 1
-        and guard.counters.late == len(modes)
-        and set(modes[:-1]) == {"hold"}
-    )
+    assert len(policy.states) == 1
+    assert guard.counters.late == len(modes)
+    assert set(modes[:-1]) == {"hold"}
     guard.reset(REQUEST)
     release.set()  # what comes back now is of the episode before
     guard.step(STATE)
-    assert guard.counters.answers <= 1 and not guard.counters.stale
+    assert guard.counters.answers <= 1
+    assert not guard.counters.stale
     guard.close()
 
 
@@ -386,11 +400,9 @@ def test_the_policy_is_told_what_is_not_measured():
 def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
     with guarded(ScriptedPolicy(outcome), Clock(100.0)) as guard:
         command = guard.step(STATE)
-    assert (
-        command.mode == "hold"
-        and getattr(guard.counters, counter) == 1
-        and guard.counters.answers == 0
-    )
+    assert command.mode == "hold"
+    assert getattr(guard.counters, counter) == 1
+    assert guard.counters.answers == 0
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
@@ -416,7 +428,8 @@ TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
     st.sampled_from(["freeze", "open"]),
 )
 def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
-    clock, policy = Clock(100.0), ScriptedPolicy(None)
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
         last = np.zeros(FINGERS + 6)
         for outcome, state, passed, begins in steps:
@@ -431,7 +444,8 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
             clock.now += passed
             command = guard.step(state)
             target = np.append(command.q_target, command.u_target)
-            assert (target >= LIMITS.lower).all() and (target <= LIMITS.upper).all()
+            assert (target >= LIMITS.lower).all()
+            assert (target <= LIMITS.upper).all()
             assert (np.abs(target - last) <= LIMITS.speed * 0.5 + 1e-12).all()
             assert (np.abs(np.append(command.q_torque, command.u_torque)) <= LIMITS.torque).all()
             assert command.u_target[2] >= -1e-9 or not guard._limiter._floor
@@ -463,8 +477,11 @@ def test_a_ticker_counts_the_ticks_that_it_leaves_out():
     first = ticker.wait()
     time.sleep(0.055)
     late = ticker.wait()
-    assert late - first >= 0.055 and ticker.ticks == 2 and ticker.missed >= 4
-    assert ticker.longest_ms >= 40.0 and ticker.jitter_ms(100) == ticker.longest_ms
+    assert late - first >= 0.055
+    assert ticker.ticks == 2
+    assert ticker.missed >= 4
+    assert ticker.longest_ms >= 40.0
+    assert ticker.jitter_ms(100) == ticker.longest_ms
     assert ticker.wait() > late  # at the next multiple of the period, not at once
     with pytest.raises(CongraspError, match="100 Hz"):
         Ticker(200.0)

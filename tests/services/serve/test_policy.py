@@ -86,7 +86,8 @@ def asked(request: GraspRequest, names: str) -> GraspRequest:
 
 def same(one, other):
     """Whether two answers are the same to the last digit; times apart."""
-    assert (one.version, one.active) == (other.version, other.active)
+    assert one.version == other.version
+    assert one.active == other.active
     for name in ("action", "q_target", "u_target"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
@@ -112,7 +113,9 @@ def test_both_answers_are_equal(policies, episode, names):
     for one, other in zip(*answers, strict=True):
         same(one, other)
     first, second = answers[0][:2]
-    assert first.version == 7 and first.active and not np.array_equal(first.action, second.action)
+    assert first.version == 7
+    assert first.active
+    assert not np.array_equal(first.action, second.action)
 
 
 def test_answers_may_be_changed(policies, episode):
@@ -162,12 +165,14 @@ def test_bad_requests(policies, episode, change, error):
             policy.act(episode.state)
         assert type(caught.value) is error
         messages.append(str(caught.value))
-    assert messages[0] == messages[1] and "\n" not in messages[0]
+    assert messages[0] == messages[1]
+    assert "\n" not in messages[0]
 
 
 @pytest.mark.parametrize(("change", "words"), BAD_STATES)
 def test_bad_states_leave_the_episode(policies, episode, change, words):
-    messages, answers = [], []
+    messages = []
+    answers = []
     for policy in policies:
         policy.reset(asked(episode.request, "heading"))
         policy.act(episode.state)
@@ -190,7 +195,9 @@ def test_what_a_request_lacks_is_named_at_once(policies, episode):
 
 @pytest.mark.parametrize("where", ["q", "u", "q_initial", "pose_q"])
 def test_angles_in_degrees_are_refused_wherever_they_are(policies, episode, where):
-    request, degrees, state = asked(episode.request, "pose"), np.full(20, 12.5), episode.state
+    request = asked(episode.request, "pose")
+    degrees = np.full(20, 12.5)
+    state = episode.state
     if where == "pose_q":
         request.constraints["pose"]["q"] = degrees
     for policy in policies:
@@ -247,7 +254,8 @@ def test_history_of_a_student(episode):
     """The vector that is inferred from holds the control steps before this one, newest first, and
     at the begin its first reading; velocities and forces that a client sends change nothing."""
     policy = LocalPolicy(untrained(STUDENT))
-    layout, sent = policy._function.layout, []
+    layout = policy._function.layout
+    sent = []
     parse = layout.parse
 
     def spy(query):
@@ -297,10 +305,8 @@ def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
     camera = dataclasses.replace(STUDENT.task, observation="camera")
     policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=camera)))
-    own, cloud = (
-        episode.request,
-        np.asarray(episode.request.surface) + episode.request.object_pose[0],
-    )
+    own = episode.request
+    cloud = np.asarray(episode.request.surface) + episode.request.object_pose[0]
     heading = own.constraints["heading"]
     heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}
     request = dataclasses.replace(
@@ -315,9 +321,8 @@ def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     policy.reset(request)
     for _ in range(3):
         answer = policy.act(state)
-    assert (
-        answer.q_target.shape == state["q"].shape and policy.metadata()["observation"] == "camera"
-    )
+    assert answer.q_target.shape == state["q"].shape
+    assert policy.metadata()["observation"] == "camera"
     again = policy.act_each(
         [state, {**state, "cloud": cloud[:100]}, {**state, "cloud": cloud[:60] + 0.01}]
     )
@@ -334,7 +339,8 @@ class Recorder(EpisodePolicy):
 
     def __init__(self, task):
         super().__init__()
-        self.function, self.sent = PolicyFunction(get_hand(task.hand), task), []
+        self.function = PolicyFunction(get_hand(task.hand), task)
+        self.sent = []
 
     def _described(self):
         return self.function.metadata()

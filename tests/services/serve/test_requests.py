@@ -69,7 +69,8 @@ def completed(query):
 
 
 def test_fields_land_in_their_places_and_absent_sensors_read_zero():
-    sent, (query, received) = arrays(), parse()
+    sent = arrays()
+    query, received = parse()
     assert query.vectors.shape == (1, LAYOUT.size)
     for name, value in sent.items():
         np.testing.assert_array_equal(received[name], np.asarray(value, np.float32), err_msg=name)
@@ -103,7 +104,8 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
     nothing.
     """
     own = grasp_frame(get_hand("human")).cross
-    wrist, thing = Rotation.from_euler("x", 0.4), Rotation.from_quat(turn, scalar_first=True)
+    wrist = Rotation.from_euler("x", 0.4)
+    thing = Rotation.from_quat(turn, scalar_first=True)
     held = thing.inv().apply(wrist.apply(own))
     across = np.cross(held, [0.36, 0.48, 0.8])
     direction = held if along else across / np.linalg.norm(across)
@@ -121,7 +123,9 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
     points = np.arange(count)[:, None] * np.ones(3)
     _, received = parse(surface_points=points, surface_avoid=np.arange(count) >= count // 2)
     kept = received["surface_points"][:, 0]
-    assert kept[0] == 0 and np.all(np.diff(kept) >= 0) and len(set(kept)) == min(count, 8)
+    assert kept[0] == 0
+    assert np.all(np.diff(kept) >= 0)
+    assert len(set(kept)) == min(count, 8)
     np.testing.assert_array_equal(received["surface_avoid"], kept >= count // 2)
 
 
@@ -185,10 +189,8 @@ def test_odd_constraints_are_refused_in_one_short_line():
 
 
 def test_a_query_of_another_layout_is_refused():
-    vector, meta = (
-        packed(LAYOUT, arrays()).arrays["packed"],
-        {"constraints": ["heading"], "layout": LAYOUT.digest},
-    )
+    vector = packed(LAYOUT, arrays()).arrays["packed"]
+    meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
     assert len(LAYOUT.parse(Message({"packed": np.tile(vector, (64, 1))}, meta)).vectors) == 64
     for count in (0, 65):
         with pytest.raises(CongraspError, match=f"The query has {count} states"):
@@ -222,7 +224,8 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
         for query, row in zip(queries, np.asarray(checks), strict=True)
     ]
     assert [error is not None for error in errors] == [False, True, False, True]
-    assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
+    assert "'u' is not finite" in str(errors[1])
+    assert "base_quaternion" in str(errors[3])
     _, alone = parse()
     for name, value in fields.items():
         np.testing.assert_allclose(
@@ -285,10 +288,8 @@ def test_normals_are_estimated_once_for_a_surface(monkeypatch):
         "estimated_normals",
         lambda points: calls.append(points) or estimated_normals(points),
     )
-    layout, own = (
-        Layout(HAND, CLOSER),
-        np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32),
-    )
+    layout = Layout(HAND, CLOSER)
+    own = np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
     vectors = np.zeros((5, layout.size), np.float32)
     for row, surface in enumerate((0, 1, 0, 0, 1)):
         vectors[row, layout.offsets["surface_points"] :][:24] = own[surface].reshape(-1)
@@ -296,7 +297,8 @@ def test_normals_are_estimated_once_for_a_surface(monkeypatch):
     layout.estimate_normals(vectors.copy())
     layout.estimate_normals(vectors)
     assert len(calls) == 2
-    found, expected = layout.unpack(vectors)["surface_normals"], np.asarray(estimated_normals(own))
+    found = layout.unpack(vectors)["surface_normals"]
+    expected = np.asarray(estimated_normals(own))
     np.testing.assert_allclose(
         found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
     )

@@ -36,7 +36,8 @@ OUTPUTS = {
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HAND = get_hand("allegro")
 NAMES = [joint.name for joint in HAND.joints]
-BASE, BASE_TURN = np.array([0.1, -0.2, 0.3]), Rotation.from_euler("XYZ", [0.4, -0.3, 2.0])
+BASE = np.array([0.1, -0.2, 0.3])
+BASE_TURN = Rotation.from_euler("XYZ", [0.4, -0.3, 2.0])
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,9 @@ class SteadyPolicy:
     """Wants the same targets always, and keeps what it was told."""
 
     def __init__(self):
-        self.request, self.state, self.now = None, None, 0.0
+        self.request = None
+        self.state = None
+        self.now = 0.0
         self.wanted = HAND.q_open + 0.05, np.array([0.004, 0.0, -0.004, 0.02, 0.0, 0.01])
 
     def reset(self, request):
@@ -118,20 +121,24 @@ def check(policy, obj, commanded):
     np.testing.assert_allclose(policy.state["u"], np.zeros(6), atol=1e-6)
     joints, wrist = commanded
     q_wanted, u_wanted = policy.wanted
-    assert list(joints.name) == NAMES and len(joints.velocity) == 0
+    assert list(joints.name) == NAMES
+    assert len(joints.velocity) == 0
     np.testing.assert_allclose(joints.position, q_wanted, atol=1e-6)
     # Kp of Allegro, 0.05 rad ahead
     np.testing.assert_allclose(joints.effort, 3.0 * 0.05 * np.ones(16), atol=1e-5)
-    place, turn = wrist.pose.position, wrist.pose.orientation
+    place = wrist.pose.position
+    turn = wrist.pose.orientation
     np.testing.assert_allclose(
         [place.x, place.y, place.z], BASE + BASE_TURN.as_matrix() @ u_wanted[:3], atol=1e-6
     )
-    cos, sin = np.cos([0.02, 0.01]), np.sin([0.02, 0.01])
+    cos = np.cos([0.02, 0.01])
+    sin = np.sin([0.02, 0.01])
     about_x = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
     about_z = np.array([[cos[1], -sin[1], 0], [sin[1], cos[1], 0], [0, 0, 1]])
     found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     np.testing.assert_allclose(found, BASE_TURN.as_matrix() @ about_x @ about_z, atol=1e-6)
-    assert wrist.header.frame_id == "world" and abs(wrist.header.stamp.sec - time.time()) < 60
+    assert wrist.header.frame_id == "world"
+    assert abs(wrist.header.stamp.sec - time.time()) < 60
 
 
 HOLD = 60.0
@@ -179,7 +186,8 @@ class Wire:
     """
 
     def __init__(self):
-        self.said, self.sent = [], {}
+        self.said = []
+        self.sent = {}
 
     def make(self, kind, **fields):
         return Fields(**fields)
@@ -243,14 +251,17 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
         silent.append("object_pose")
         eventually(lambda: (turn(), node._guard.trouble)[1])  # a measurement of this age is refused
         policy.now += HOLD
-        assert not turn() and node._guard._latched == "freeze"  # a tracker that is lost
+        assert not turn()
+        assert node._guard._latched == "freeze"  # a tracker that is lost
 
 
 def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
     """Against a stand-in for rclpy that takes what rclpy takes: messages by class, arrays as
     lists.
     """
-    said, sent, callbacks = [], {}, {}
+    said = []
+    sent = {}
+    callbacks = {}
 
     class Node:
         def create_subscription(self, kind, topic, callback, qos):
@@ -272,9 +283,8 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
         ]
 
         def make(self, **fields):
-            assert set(fields) <= set(names) and not any(
-                isinstance(x, np.ndarray) for x in fields.values()
-            )
+            assert set(fields) <= set(names)
+            assert not any(isinstance(x, np.ndarray) for x in fields.values())
             self.__dict__.update(fields)
 
         return type(kind.rpartition("/")[2], (), {"__init__": make})
@@ -342,13 +352,12 @@ def test_stamps_are_of_a_simulator_s_clock_where_one_is_published(example, capsy
     with node_of(example, bus) as (node, _, obj):
         sensors = node._sensors
         assert not measured(joints(time.time() - 100))
-        assert measured(joints(12)) and measured(joints(13))
+        assert measured(joints(12))
+        assert measured(joints(13))
         assert capsys.readouterr().err.count("joint_states: its stamps are a simulator's") == 1
-        assert (
-            measured(joints(14), clock(15))
-            and not measured(joints(14), clock(50))
-            and measured(joints(49))
-        )
+        assert measured(joints(14), clock(15))
+        assert not measured(joints(14), clock(50))
+        assert measured(joints(49))
         bus.said = robot_says(obj)
         node.step()
         assert bus.sent["joint_command"].header.stamp.sec == 50
@@ -366,7 +375,8 @@ def test_a_bus_that_is_absent_is_one_line(example, monkeypatch, options, words):
     monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7", *options])
     with pytest.raises(congrasp.CongraspError, match=words) as caught:
         example.main()
-    assert "\n" not in str(caught.value) and "cargo" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "cargo" not in str(caught.value)
 
 
 def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
@@ -389,14 +399,13 @@ def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
         )
     with node_of(example, bus, joint_map=(f"{NAMES[0]}=motor_1",)) as (node, _, obj):
         node.step()
-        assert (
-            node._sensors.missing().startswith("wrist_pose; ")
-            and node._sensors.names[0] == "motor_1"
-        )
+        assert node._sensors.missing().startswith("wrist_pose; ")
+        assert node._sensors.names[0] == "motor_1"
         old = dict(robot_says(obj))["wrist_pose"]
         old.header = header(age=9.0)
         bus.said = [("wrist_pose", old)]
-        assert node.step() is None and "wrist_pose (the last one is 9." in node._sensors.missing()
+        assert node.step() is None
+        assert "wrist_pose (the last one is 9." in node._sensors.missing()
     with pytest.raises(congrasp.CongraspError, match="--joint-map has 'elbow=motor_1'"):
         sys.modules["ros2_sensors"].joints_of(("elbow=motor_1",), NAMES)
 
@@ -409,7 +418,8 @@ def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example)
     An object at (0.3, 0.2, 0) of the camera is at (0.31, 0.2, 2) of the base, so at (1 - 0.2, 0.31,
     2) of the world.
     """
-    bus, level = Wire(), Rotation.identity()
+    bus = Wire()
+    level = Rotation.identity()
     quarter = Rotation.from_euler("z", 90, degrees=True)
     with node_of(example, bus, mount="0 0 0.1 0 0 0", hand_eye="0.01 0 0 0 0 0") as (
         node,
@@ -450,7 +460,8 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
     """
     bus = Wire()
     with node_of(example, bus, lift=0.1) as (node, policy, obj):
-        heights, tables = [], []
+        heights = []
+        tables = []
 
         def risen():
             bus.said = robot_says(obj)
@@ -469,7 +480,8 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
 
         eventually(risen)
         rise = [0.1 * s**2 * (3 - 2 * s) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
-        assert tables[0] and not tables[-1]
+        assert tables[0]
+        assert not tables[-1]
         assert [float(node._plan.rise(3 + n)[2]) for n in range(6)] == pytest.approx(rise)
         # 3 steps of approach, 5 of the rise, a second: from then on the targets are kept.
         assert [node._plan.lifted(n) for n in (8, 107, 108)] == [False, False, True]
@@ -481,7 +493,9 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
         bus.said = robot_says(obj)
         command = node.step()
         line = example.report(command, node._guard, node._sensors)
-        assert command is not None and bus.sent == {} and line.startswith(command.mode)
+        assert command is not None
+        assert bus.sent == {}
+        assert line.startswith(command.mode)
 
 
 @pytest.mark.parametrize(("radius", "height"), [(0.06, 0.04), (0.015, 0.0)])
@@ -509,14 +523,17 @@ def test_a_step_waits_for_the_measurement_of_its_time(example):
     """Not for one that came more than half a period early, and for none more than half a period
     late.
     """
-    bus, began = Wire(), time.monotonic()
+    bus = Wire()
+    began = time.monotonic()
     with node_of(example, bus) as (node, _, obj):
         node._last = began
         bus.receive = lambda: robot_says(obj) if time.monotonic() > began + 0.07 else []
         assert 0.07 <= node.wait(0.1) - began < 0.1
-        node._last, bus.receive = (again := time.monotonic()), lambda: robot_says(obj)
+        node._last = (again := time.monotonic())
+        bus.receive = lambda: robot_says(obj)
         assert 0.05 <= node.wait(0.1) - again < 0.1
-        node._last, bus.receive = (silent := time.monotonic()), lambda: []
+        node._last = (silent := time.monotonic())
+        bus.receive = lambda: []
         assert node.wait(0.1) - silent >= 0.15
 
 
@@ -529,8 +546,10 @@ def test_a_slow_hand_has_a_share_of_the_speed(example):
 
 TOPIC = "/camera/points"
 DESCRIBED = {"observation": "camera", "surface_points": 64, "trajectory_points": 5}
-CAMERA, CAMERA_TURN = np.array([1.0, 0.5, 0.6]), Rotation.from_euler("xyz", [-2.0, 0.3, 1.1])
-PALM, PALM_TURN = np.array([0.5, 0.1, 0.32]), Rotation.from_euler("x", 180, degrees=True)
+CAMERA = np.array([1.0, 0.5, 0.6])
+CAMERA_TURN = Rotation.from_euler("xyz", [-2.0, 0.3, 1.1])
+PALM = np.array([0.5, 0.1, 0.32])
+PALM_TURN = Rotation.from_euler("x", 180, degrees=True)
 
 
 def camera_node(example, bus, lift=0.0, age=5.0, **given):
@@ -613,7 +632,8 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
     """In the order of the cloud, 64 of 300; the same from a cloud in rows, and where the camera is
     off as stated.
     """
-    bus, points = Wire(), block()
+    bus = Wire()
+    points = block()
     expected = points[np.arange(64) * 300 // 64]
     around = surroundings()
     mixed = np.concatenate([around[:50], points, around[50:]])
@@ -622,7 +642,8 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
         np.testing.assert_allclose(policy.state["cloud"], expected, atol=1e-6)
-        assert policy.request.surface is None and policy.request.object_pose is None
+        assert policy.request.surface is None
+        assert policy.request.object_pose is None
         np.testing.assert_allclose(
             [policy.request.camera, policy.state["camera_position"]], [CAMERA] * 2
         )
@@ -645,7 +666,8 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         bus.said[-1][1].header.frame_id = "world"
         eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
-        assert policy.request.camera is None and "camera_position" not in policy.state
+        assert policy.request.camera is None
+        assert "camera_position" not in policy.state
 
 
 def test_a_cloud_is_read_as_it_comes_over_either_bus(example):
@@ -671,7 +693,8 @@ def test_a_hidden_object_stays_where_it_was_and_a_silent_camera_stops_the_hand(e
             None, node._guard, node._sensors
         )
         bus.said = camera_says(cloud_of(block(), age=9.0))
-        assert node.step() is None and f"{TOPIC} (the last one is 9." in node._sensors.missing()
+        assert node.step() is None
+        assert f"{TOPIC} (the last one is 9." in node._sensors.missing()
 
         def seen(points, beyond):
             bus.said = camera_says(cloud_of(points))
@@ -753,8 +776,6 @@ def test_constraints_of_a_cloud_are_in_the_world_frame(example, tmp_path):
             (policy.request.cloud, policy.request.avoid),
             (policy.state["cloud"], policy.state["surface_avoid"]),
         ):
-            assert (
-                avoid[points[:, 2] < 0.03].all()
-                and not avoid[points[:, 2] > 0.07].any()
-                and len(avoid) == 64
-            )
+            assert avoid[points[:, 2] < 0.03].all()
+            assert not avoid[points[:, 2] > 0.07].any()
+            assert len(avoid) == 64

@@ -66,16 +66,16 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
         client.reset(episode.request)
         first, second = (client.act(episode.state) for _ in range(2))
         health = client.health()
-        assert health["ready"] and health["hand"] == "human"
-        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health[
-            "states_per_second"
-        ] > 100
-    assert (
-        first.q_target.shape == (20,)
-        and first.u_target.shape == (6,)
-        and first.action.shape == (26,)
-    )
-    assert first.version == 0 and first.active == ("The heading guides the wrist.",)
+        assert health["ready"]
+        assert health["hand"] == "human"
+        assert health["queue_limit"] == DEPTH
+        assert health["peer_limit"] == SHARE
+        assert health["states_per_second"] > 100
+    assert first.q_target.shape == (20,)
+    assert first.u_target.shape == (6,)
+    assert first.action.shape == (26,)
+    assert first.version == 0
+    assert first.active == ("The heading guides the wrist.",)
     # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the
     # limits.
     expected = first.q_target + 0.1 * second.action[:20]
@@ -102,7 +102,8 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     )
     assert grown["congrasp_policy_queries_total", "refused"] == 1
     assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
-    assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
+    assert after["congrasp_policy_ready",] == 1
+    assert after["congrasp_policy_version",] == 0
 
 
 def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
@@ -131,7 +132,8 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
         finally:
             swapped.set()
         for versions in asked:
-            assert versions == sorted(versions) and versions[-1] == 100
+            assert versions == sorted(versions)
+            assert versions[-1] == 100
             assert len(set(versions)) > 10
 
 
@@ -165,7 +167,8 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
         together = client.act_each(states)
         first = client.act(states[0])
     for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
-        assert (one.version, one.active) == (other.version, other.active)
+        assert one.version == other.version
+        assert one.active == other.active
         for name in ("action", "q_target", "u_target"):
             np.testing.assert_allclose(
                 getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name
@@ -174,7 +177,8 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
 
 
 def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
-    old, new = object(), object()
+    old = object()
+    new = object()
 
     def part(policy: object, value: float) -> Answer:
         return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
@@ -193,10 +197,8 @@ def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
 
 def test_bad_lists_of_states_are_refused(served):
     _, endpoint, episode = served
-    good, bad = (
-        episode.state,
-        {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])},
-    )
+    good = episode.state
+    bad = {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
     with PolicyClient(endpoint, timeout=60.0) as client:
         client.reset(episode.request)
         with pytest.raises(
@@ -212,7 +214,8 @@ def test_bad_lists_of_states_are_refused(served):
 
 def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
     _, endpoint, episode = served
-    entered, go = threading.Semaphore(0), threading.Event()
+    entered = threading.Semaphore(0)
+    go = threading.Event()
     infer = PolicyFunction.__call__
 
     def hold(self, weights, queries):
@@ -259,7 +262,8 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
 
 
 def test_following_a_run_pulls_only_what_is_newer():
-    keys, policy = Keys("r"), task.policy()
+    keys = Keys("r")
+    policy = task.policy()
     with MemoryTransport(MemoryHub()) as transport:
         pull = follow_run(transport, "r", "s")
         with pytest.raises(TransportError):

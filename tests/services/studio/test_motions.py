@@ -18,7 +18,8 @@ from congrasp.services.studio.grasping import why_nothing_held
 from congrasp.services.studio.page import drawing, for_page, lanes
 from tests.episodes import episode, older
 
-STEPS, REMOVAL = 30, 18
+STEPS = 30
+REMOVAL = 18
 TOLERANCES = {
     (name, error.unit): error.tolerance
     for name in ("heading", "trajectory")
@@ -53,14 +54,13 @@ def test_the_fake_grasp_meets_its_constraints() -> None:
     found = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
     heading = found["heading"]
     np.testing.assert_allclose(heading.errors["rad"], 0.0, atol=1e-3)
-    assert heading.met[-1] and heading.counts.tolist() == [False] * REMOVAL + [True] * (
-        STEPS - REMOVAL
-    )
+    assert heading.met[-1]
+    assert heading.counts.tolist() == [False] * REMOVAL + [True] * (STEPS - REMOVAL)
     pose = found["pose"]
-    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6) and pose.errors["m"][
-        -1
-    ] == pytest.approx(0, abs=1e-6)
-    assert not pose.met[0] and pose.met[-1]
+    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6)
+    assert pose.errors["m"][-1] == pytest.approx(0, abs=1e-6)
+    assert not pose.met[0]
+    assert pose.met[-1]
     trajectory = found["trajectory"]
     assert trajectory.counts.tolist() == [True] * REMOVAL + [False] * (STEPS - REMOVAL)
     np.testing.assert_allclose(trajectory.errors["m"], 0.0, atol=1e-6)
@@ -78,13 +78,12 @@ def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
 @pytest.mark.parametrize("name", ["heading", "trajectory"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
 def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> None:
-    made, most = episode(STEPS, removal=REMOVAL), TOLERANCES[name, unit]
+    made = episode(STEPS, removal=REMOVAL)
+    most = TOLERANCES[name, unit]
     lane = lanes(with_error(made, **{f"{name}_{unit}": most + 0.001}))[name]
     np.testing.assert_allclose(lane.errors[unit], most + 0.001, atol=1e-6)
-    assert (
-        not lane.met.any()
-        and lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
-    )
+    assert not lane.met.any()
+    assert lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
 
 
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
@@ -99,7 +98,9 @@ def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
 def test_only_the_fingers_of_a_pose_count_under_a_wrist_path() -> None:
     made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
     pose = lanes(made)["pose"]
-    assert pose.met[-1] and set(pose.errors) == {"rad"} and "distance" not in pose.legend
+    assert pose.met[-1]
+    assert set(pose.errors) == {"rad"}
+    assert "distance" not in pose.legend
 
 
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
@@ -107,10 +108,8 @@ def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
     message = made.to_message()
     arrays = {**message.arrays, "active/fingers": np.bool_(True)}
     lane = lanes(Episode.from_message(Message(arrays, message.meta)))["fingers"]
-    assert (
-        not lane.met.any()
-        and lane.legend == "share of touching links of other fingers: 0 % at most"
-    )
+    assert not lane.met.any()
+    assert lane.legend == "share of touching links of other fingers: 0 % at most"
 
 
 def test_the_page_gets_one_message_with_everything_it_plays() -> None:
@@ -135,7 +134,8 @@ def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> No
     found = lanes(recorded)
     assert set(found) == {"contact"}
     np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
-    page, now = for_page(recorded), for_page(made)
+    page = for_page(recorded)
+    now = for_page(made)
     kinds = ("arrow/", "polyline/", "ghost/", "paint/")
     drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
     assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
@@ -154,7 +154,9 @@ def image(view: dict[str, object], frame: int = 5) -> np.ndarray:
 
 def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the object's pixels: the affordance paints it red and green."""
-    red, green, blue = seen[..., 0], seen[..., 1], seen[..., 2]
+    red = seen[..., 0]
+    green = seen[..., 1]
+    blue = seen[..., 2]
     return np.nonzero(
         ((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue))
     )
@@ -163,7 +165,8 @@ def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_a_picture_has_the_camera_of_the_page() -> None:
     seen = image(VIEW)
     rows, columns = painted(seen)
-    assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
+    assert seen.shape == (720, 1280, 3)
+    assert abs(np.median(columns) - 640) < 40
     # From twice as far the object is half as large along each side.
     assert len(painted(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(
         len(rows) / 4, rel=0.25
@@ -173,7 +176,9 @@ def test_a_picture_has_the_camera_of_the_page() -> None:
 def test_a_video_has_a_frame_for_every_40_ms() -> None:
     shares: list[float] = []
     made = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
-    assert made.name == "cylinder-0-3.mp4" and shares[-1] == 1.0 and shares == sorted(shares)
+    assert made.name == "cylinder-0-3.mp4"
+    assert shares[-1] == 1.0
+    assert shares == sorted(shares)
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(),
         "-i",
@@ -185,7 +190,8 @@ def test_a_video_has_a_frame_for_every_40_ms() -> None:
         "-",
     ]
     frames = subprocess.run(command, input=made.data, capture_output=True, check=True).stdout
-    assert len(frames) == len(shares) * 854 * 480 * 3 and len(shares) == 2  # steps 0 and 4
+    assert len(frames) == len(shares) * 854 * 480 * 3
+    assert len(shares) == 2  # steps 0 and 4
 
 
 @pytest.mark.parametrize(
@@ -248,7 +254,8 @@ def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without,
     assert note.startswith(
         "None of 8 attempts held. The one shown: pushed away before the table was removed."
     )
-    assert says in note and tried.keys() == set(asked)
+    assert says in note
+    assert tried.keys() == set(asked)
     for name, weaker in tried.items():
         assert set(weaker.constraints) == {"heading", *asked} - {name}
         assert (weaker.avoid is None) == (name == "affordance" or "affordance" not in asked)

@@ -79,9 +79,11 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
             )
         )
     first, *start, early, late = (line.strip() for line in said())
-    assert "First update" in start[0] and any(line.endswith(": a stage") for line in start[1:])
+    assert "First update" in start[0]
+    assert any(line.endswith(": a stage") for line in start[1:])
     assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
-    assert early.startswith("update    1/10") and early.endswith("left ?")
+    assert early.startswith("update    1/10")
+    assert early.endswith("left ?")
     # Two updates took 20 s, so that the seven others take 70.
     for words in (
         "update    3/10",
@@ -132,7 +134,8 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
     _next_steps(tmp_path)
     assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
     commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
-    assert commands and set(commands) <= set(COMMANDS)
+    assert commands
+    assert set(commands) <= set(COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +184,8 @@ def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existe
     monkeypatch.setattr(command, "train", die)
     with pytest.raises(CongraspError, match=r"did not start.*run\.failed\.log"):
         command.run_training(CONFIG, run_dir, LAUNCH, resume=False, evaluation=0)
-    assert run_dir.exists() == existed and not (existed and any(run_dir.iterdir()))
+    assert run_dir.exists() == existed
+    assert not (existed and any(run_dir.iterdir()))
     assert run_dir.with_name("run.failed.log").read_text() == "out of memory"
 
 
@@ -197,7 +201,8 @@ def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch
         command.run_training(CONFIG, tmp_path / name, LAUNCH, resume=False, evaluation=0)
     kept, removed = (line for line in said() if "was stopped" in line)
     assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in kept
-    assert "--resume" not in removed and not (tmp_path / "without").exists()
+    assert "--resume" not in removed
+    assert not (tmp_path / "without").exists()
 
 
 def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):

@@ -34,10 +34,8 @@ def test_an_unknown_preset_lists_those_that_exist():
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_travels_and_its_batch_can_be_cut(name):
     config = get_preset(name)
-    assert (
-        config.name == (name if name != "full" else "human")
-        and run_config_from_json(to_json(config)) == config
-    )
+    assert config.name == (name if name != "full" else "human")
+    assert run_config_from_json(to_json(config)) == config
     get_hand(config.task.hand)
     procedural.family_turns(1, 0, config.objects.families)  # a CongraspError where one is unknown
     transitions = config.environments * config.rollout_steps * config.rollouts_per_update
@@ -48,8 +46,11 @@ def test_the_full_task_is_that_of_the_hand_that_a_command_line_names(claw):
     assert get_preset("full") == get_preset("human") == get_preset("allegro", "human")
     assert get_preset("full", "allegro") == get_preset("allegro") == get_preset("human", "allegro")
     own = defaults(["--preset", "full", "--hand=claw"])["config"]
-    assert own == get_preset("full", "claw") and own.name == "claw" and own.task.hand == claw.text
-    assert with_hand(own, "claw") == own and easier(own) == []
+    assert own == get_preset("full", "claw")
+    assert own.name == "claw"
+    assert own.task.hand == claw.text
+    assert with_hand(own, "claw") == own
+    assert easier(own) == []
     for name in ("full", "human", "quickstart"):
         with pytest.raises(CongraspError, match="no hand 'paw'"):
             get_preset(name, "paw")
@@ -88,7 +89,8 @@ def test_the_hands_of_the_package_have_what_the_rules_give(name):
 
 @pytest.mark.parametrize("name", RULES)
 def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
-    own, human = recipe(get_hand(name)), recipe(get_hand("human"))
+    own = recipe(get_hand(name))
+    human = recipe(get_hand("human"))
     ruled = dataclasses.asdict(rules(get_hand(name)))
     share = ruled.pop("p_affordance")
     weights = dataclasses.replace(human.curriculum.reward, **ruled)
@@ -141,5 +143,6 @@ def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
     assert [one.p_affordance for one in found] == sorted(
         (one.p_affordance for one in found), reverse=True
     )
-    assert found[0].p_affordance == 0.8 and found[-1].p_affordance == 0.6
+    assert found[0].p_affordance == 0.8
+    assert found[-1].p_affordance == 0.6
     assert len({one.force_max for one in found}) == 1

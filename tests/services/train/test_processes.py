@@ -194,7 +194,8 @@ HANGS = "import time; print('update 3', flush=True); time.sleep(60)"
 @pytest.fixture
 def scripts(monkeypatch):
     """What runs for each policy, by name; and all children that were started."""
-    chosen, started = {}, []
+    chosen = {}
+    started = []
 
     class Training(Child):
         @property
@@ -224,16 +225,12 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     wanted = request(tmp_path, 3.0)
     failures = train_all(wanted, [OURS, GRAPSXL, PHASES], silent)
     assert set(failures) == {OURS, GRAPSXL}
-    assert (
-        "human-ours failed: The disk is full." in failures[OURS]
-        and "human-ours.log" in failures[OURS]
-    )
+    assert "human-ours failed: The disk is full." in failures[OURS]
+    assert "human-ours.log" in failures[OURS]
     assert "human-graspxl was stopped" in failures[GRAPSXL]
     runs = wanted.runs
-    assert (
-        background.finished_policy(runs / OURS.name) is None
-        and background.training_seconds(runs / OURS.name) is None
-    )
+    assert background.finished_policy(runs / OURS.name) is None
+    assert background.training_seconds(runs / OURS.name) is None
     assert (
         background.finished_policy(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
     )
@@ -251,13 +248,14 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
     (wanted.runs / GRAPSXL.name / "config.json").touch()
     assert train_all(wanted, [OURS, GRAPSXL], silent) == {}
     ours, graspxl = (child.arguments for child in started)
-    assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
+    assert "--resume" in ours
+    assert ours[-2:] == ["--updates", "9"]
+    assert "--preset" not in ours
     run = str(wanted.runs / GRAPSXL.name)
-    assert (
-        graspxl[graspxl.index("--run-dir") + 1] == run
-        and graspxl[graspxl.index("--evaluation") + 1] == "0"
-    )
-    assert "--resume" not in graspxl and not (wanted.runs / GRAPSXL.name / "config.json").exists()
+    assert graspxl[graspxl.index("--run-dir") + 1] == run
+    assert graspxl[graspxl.index("--evaluation") + 1] == "0"
+    assert "--resume" not in graspxl
+    assert not (wanted.runs / GRAPSXL.name / "config.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -267,6 +265,7 @@ def test_its_command_lines_are_those_of_train(policy):
     arguments = [*training_options(policy), "--environments", "4096"]
     train = parse_errors.parse("train", main.load("train"), arguments)
     config = train.keywords["config"]
-    assert (config.task.hand, config.environments) == (policy.hand, 4096)
+    assert config.task.hand == policy.hand
+    assert config.environments == 4096
     assert train.keywords["method"] == (None if policy.method == "ours" else policy.method)
     assert dataclasses.replace(config, environments=32_768) == get_preset("full", policy.hand)

@@ -38,7 +38,8 @@ METRICS = {
 
 
 def record(directory: pathlib.Path, updates: int = 30) -> None:
-    writer, channels = LogWriter(directory, "log"), JsonChannels()
+    writer = LogWriter(directory, "log")
+    channels = JsonChannels()
     for i in range(updates):
         values = nest({name: value * (1 + i / updates) for name, value in METRICS.items()})
         writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": values}))
@@ -100,7 +101,8 @@ def test_a_run_becomes_png_files(
 
 
 def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Path) -> None:
-    rising, flat = np.arange(4.0), np.full(4, 2.0)
+    rising = np.arange(4.0)
+    flat = np.full(4, 2.0)
     one = {
         "learner/0/kl": rising,
         "learner/0/term/drop": flat,
@@ -210,7 +212,8 @@ def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> Non
     heading, composed, fingers = table.rows
     assert heading[:5] == ["heading", "40", "75.0 % (59.8-85.8)", "96.9 %", "0.0 %"]
     at = table.columns.index("Heading error, rad")
-    assert heading[at : at + 2] == ["0.250", "0.137"] and composed[at : at + 2] == ["", ""]
+    assert heading[at : at + 2] == ["0.250", "0.137"]
+    assert composed[at : at + 2] == ["", ""]
     at = table.columns.index("Affordance error, share")
     assert composed[at : at + 2] == ["0.250", "0.045"]
     at = table.columns.index("Fingers error, share")

@@ -15,7 +15,8 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.services.assets.captures.human import TO_HUMAN, joint_positions
 from congrasp.services.assets.captures.references import separated
 
-FRAMES, GRASP = 90, 60
+FRAMES = 90
+GRASP = 60
 """Frames of a sequence, and the one in which the fingers have closed."""
 ORIGIN = np.array([0.02, -0.01, 0.03])
 """Where the box's centre lies in its mesh file, m."""
@@ -83,7 +84,8 @@ def make(
     q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
     tips = joint_positions(q)[:2, 3]
-    middle, across = tips.mean(0), tips[1] - tips[0]
+    middle = tips.mean(0)
+    across = tips[1] - tips[0]
     width = float(np.linalg.norm(across))
     # The box's x axis is the pinch; its other edges are shorter than a hand, and any roll about the
     # pinch will do.
@@ -92,7 +94,8 @@ def make(
     y /= np.linalg.norm(y)
     box = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1))  # object frame to wrist frame
     size = np.array([width - 0.016, 0.03, 0.03 + tail])
-    grasp_turn, grasp_at = box.inv(), -box.inv().apply(middle) + [0, 0, tail / 2]
+    grasp_turn = box.inv()
+    grasp_at = -box.inv().apply(middle) + [0, 0, tail / 2]
 
     outward = grasp_turn.apply([0, 1.0, 0.3]) / np.linalg.norm([0, 1.0, 0.3])
     side = np.cross(outward, rng.normal(size=3))

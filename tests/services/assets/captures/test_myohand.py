@@ -73,7 +73,8 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
         write(case, tmp_path / "data" / f"{case.name}.npz")
     known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", tmp_path / "data", "--meshes", tmp_path / "meshes")
-    assert not report.dropped and [row["frame"] for row in report.kept] == [known.GRASP] * 2
+    assert not report.dropped
+    assert [row["frame"] for row in report.kept] == [known.GRASP] * 2
     for m, case in enumerate(cases):
         known.check(sets["box"].arrays, m, case)
     assert sets["box"].meta["demonstrations"] == [case.name for case in cases]
@@ -93,7 +94,8 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
     options = ["--meshes", tmp_path / "meshes", "--headings", headings]
     _, report = run_import("myohand", tmp_path / "data", *options)
     held = [row["object"] for row in report.kept if row["split"] == "held-out"]
-    assert len(report.kept) == 5 and len(held) == 1
+    assert len(report.kept) == 5
+    assert len(held) == 1
     catalogue = Catalogue(tmp_path / "objects")
     found = [catalogue.get(name) for name in catalogue.list()]
     for split, names in (("training", set("abcde") - set(held)), ("held-out", set(held))):
@@ -110,7 +112,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     case = known.make("MyoHand_box_lift", "box")
     folder = tmp_path / "data"
     right = write(case, folder / "MyoHand_box_right.npz")
-    robot, pose = right["robot"], right["object"]
+    robot = right["robot"]
+    pose = right["object"]
     write(case, folder / "MyoHand_box_nokey.npz", object=None)
     write(case, folder / "MyoHand_box_back.npz", time=right["time"][::-1])
     write(case, folder / "MyoHand_box_shape.npz", robot=robot[:, :28])
@@ -129,9 +132,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     write(case, folder / "MyoHand_box_limits.npz", robot=limits)
     known.write_mesh(case, tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", folder, "--meshes", tmp_path / "meshes")
-    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"] and list(sets) == [
-        "box"
-    ]
+    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"]
+    assert list(sets) == ["box"]
     reasons = {
         row["sequence"].split("_")[-1]: (row["rule"], row["reason"]) for row in report.dropped
     }
@@ -148,7 +150,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
         ("lift", "no mesh", "no mesh of 'cup'"),
         ("limits", "joint limits", "ring_pip is 0.45 rad beyond"),
     ):
-        assert reasons[name][0] == rule and words in reasons[name][1]
+        assert reasons[name][0] == rule
+        assert words in reasons[name][1]
 
 
 def test_missing_frames_are_bridged_or_end_the_approach(run_import, tmp_path):

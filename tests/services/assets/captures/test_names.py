@@ -68,4 +68,5 @@ def test_settings_of_other_types_drop_their_sequence_alone(tmp_path, value):
     (tmp_path / "subject" / "session").mkdir(parents=True)
     (tmp_path / "subject" / "session" / "meta.yml").write_text(text)
     (dropped,) = dexycb.read(tmp_path, Meshes(()), types.SimpleNamespace())
-    assert isinstance(dropped, Dropped) and dropped.rule == "wrong layout"
+    assert isinstance(dropped, Dropped)
+    assert dropped.rule == "wrong layout"

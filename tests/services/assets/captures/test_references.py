@@ -52,10 +52,12 @@ from tests.services.assets.captures.test_myohand import write
 # --- when fingers have closed, and references that no hand can take: synthetic motions ---
 
 
-FRAMES, FIRST = 40, 5
+FRAMES = 40
+FIRST = 5
 BALL = plain_object("ball", (Piece("ellipsoid", (0.01, 0.01, 0.01), (0.5, 0.5, 0.5)),), 500.0)
 """Far from the hand."""
-THUMB, INDEX = 0.010, 0.009
+THUMB = 0.010
+INDEX = 0.009
 """Radii of the thickest skin, m."""
 
 
@@ -73,7 +75,8 @@ def moving(joints, lift, wrist=0.0, present=True):
     """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at
     (T, 5, 4, 3).
     """
-    count, up = len(joints), np.array([0.0, 0.0, 1.0])
+    count = len(joints)
+    up = np.array([0.0, 0.0, 1.0])
     return Sequence(
         name="lift",
         object_name="box",
@@ -170,7 +173,8 @@ def pinch(tmp_path, run_import):
 
 def test_a_reference_that_is_deep_in_its_object_is_dropped_and_counted(pinch):
     sets, report = pinch(0.004)
-    assert not report.dropped and list(sets) == ["box"]
+    assert not report.dropped
+    assert list(sets) == ["box"]
     _, report = pinch(0.03, code=2)
     assert report.rules()[0][:2] == ("too deep", 1)
     assert "mm deep in the object (10 mm at most)" in report.rules()[0][2]
@@ -190,7 +194,8 @@ def straight(contact):
 
 
 def test_what_is_wider_than_the_hand_opens_is_too_wide():
-    opening, cross = widest_gap(HUMAN), np.asarray(grasp_frame(HUMAN).cross)
+    opening = widest_gap(HUMAN)
+    cross = np.asarray(grasp_frame(HUMAN).cross)
     fitting, wide = (straight(np.outer([0, share * opening], cross)) for share in (0.97, 1.03))
     assert width(fitting) == pytest.approx(0.97 * opening)
     check_reference(HUMAN, fitting, BALL, 1.0)
@@ -234,7 +239,9 @@ def test_normals_of_a_surface_point_outwards():
 # --- fingers moved apart, worked out by hand for two of them ---
 
 
-ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
+ASIDE = 0.02
+LONG = 0.05
+RADIUS = 0.005
 
 
 def two_fingers(upper=1.0, couplings=()):
@@ -256,7 +263,8 @@ def test_two_fingers_part_evenly():
     """Turned by 0.38 rad each they overlap by 7 mm; at t with 2 (2 cm - 5 cm sin t) = 1 cm - 1 mm
     by 1 mm.
     """
-    hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
+    hand = two_fingers()
+    q = np.array([[-0.38, 0.38]], np.float32)
     overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
     np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
     angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
@@ -275,7 +283,8 @@ def test_where_one_may_not_go_the_other_does():
     )
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
     found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    assert found[0, 0] == np.float32(-0.38) and found[0, 1] < 0.3
+    assert found[0, 0] == np.float32(-0.38)
+    assert found[0, 1] < 0.3
     np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
 
 
@@ -289,7 +298,8 @@ def test_followers_still_follow():
 @pytest.mark.parametrize("name", ["human", "sharpa"])
 @pytest.mark.slow
 def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
-    hand, rng = get_hand(name), np.random.default_rng(3)
+    hand = get_hand(name)
+    rng = np.random.default_rng(3)
     share = rng.uniform(0.0, 1.0, (12, 1))
     q = (
         hand.q_open
@@ -297,11 +307,14 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
         + rng.normal(0, 0.25, (12, len(hand.joints)))
     )
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
-    before, found = np.asarray(deepest(hand, q)), separated(hand, q)
+    before = np.asarray(deepest(hand, q))
+    found = separated(hand, q)
     deep = before > OVERLAP
-    assert deep.any() and not deep.all()
+    assert deep.any()
+    assert not deep.all()
     np.testing.assert_array_equal(found[~deep], q[~deep])
-    assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
+    assert np.all(found >= hand.lower)
+    assert np.all(found <= hand.upper)
     np.testing.assert_array_less(
         hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5
     )
@@ -413,18 +426,21 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
     known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
     options = ["--meshes", tmp_path / "meshes", "--headings", "demonstrated"]
     sets, report = run_import("myohand", tmp_path / "data", "--hand", name, *options)
-    assert not report.dropped and "finger angles do not fit" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert not report.dropped
+    assert "finger angles do not fit" in " ".join(capsys.readouterr().out.split())
 
-    hand, scale = get_hand(name), get_hand(name).object_scale
+    hand = get_hand(name)
+    scale = get_hand(name).object_scale
     made = sets["box"]
     arrays = made.arrays
-    assert made.meta["hand"] == name and made.meta["object_scale"] == scale
+    assert made.meta["hand"] == name
+    assert made.meta["object_scale"] == scale
     assert len(describe(made)["captured"].split(", ")) == 2
     for m, case in enumerate(cases):
         q = arrays["pose/q"][0, m]
-        assert q.shape == hand.lower.shape and (q >= hand.lower).all() and (q <= hand.upper).all()
+        assert q.shape == hand.lower.shape
+        assert (q >= hand.lower).all()
+        assert (q <= hand.upper).all()
         tips = np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
         center = (tips[0] + tips[1:].mean(0)) / 2
         human = np.clip(far[-1, 9:] if m else case.q, HUMAN.lower, HUMAN.upper)

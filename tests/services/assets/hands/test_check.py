@@ -57,10 +57,13 @@ def verdicts(hand):
 )
 def test_good_hands_pass_every_check(name):
     lines, found = verdicts(HANDS[name])
-    assert not found.failed and {finding.verdict for finding in lines.values()} == {"passed"}
+    assert not found.failed
+    assert {finding.verdict for finding in lines.values()} == {"passed"}
     assert [grip.obj.name for grip in found.grips] == ["ball", "cylinder", "box"]
     for grip in found.grips:
-        assert grip.held and grip.survived["push_survival_weight"] and grip.touching.sum() >= 2
+        assert grip.held
+        assert grip.survived["push_survival_weight"]
+        assert grip.touching.sum() >= 2
 
 
 def test_a_reversed_axis_is_found_and_named():
@@ -68,12 +71,11 @@ def test_a_reversed_axis_is_found_and_named():
         CLAW, lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)), only="opposing_root"
     )
     lines, found = verdicts(turned)
-    assert (
-        found.failed
-        and lines["joint"].verdict == "failed"
-        and "'opposing_root'" in lines["joint"].measured
-    )
-    assert "axis" in lines["joint"].remedy and "closed_pose" in lines["joint"].remedy
+    assert found.failed
+    assert lines["joint"].verdict == "failed"
+    assert "'opposing_root'" in lines["joint"].measured
+    assert "axis" in lines["joint"].remedy
+    assert "closed_pose" in lines["joint"].remedy
 
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(-1.0, "doubt"), (-0.5, "failed")])
@@ -83,7 +85,8 @@ def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, ve
     follows = (Coupling("opposing_middle", "opposing_root", ratio, 0.0),)
     hand = dataclasses.replace(CLAW, couplings=follows, open_pose=opened, closed_pose=pose)
     (finding,) = (one for one in geometry_checks.joint_findings(hand) if one.check == "joint")
-    assert finding.verdict == verdict and "'opposing_middle'" in finding.measured
+    assert finding.verdict == verdict
+    assert "'opposing_middle'" in finding.measured
     assert ("parallel" in finding.remedy) == (verdict == "doubt")
 
 
@@ -126,16 +129,15 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
         CLAW, links=(dataclasses.replace(palm, capsules=away), *CLAW.links[1:])
     )
     finding = geometry_checks.palm_finding(hand)
-    assert (
-        finding.verdict == "failed" and "20.1 cm" in finding.measured and "--palm" in finding.remedy
-    )
+    assert finding.verdict == "failed"
+    assert "20.1 cm" in finding.measured
+    assert "--palm" in finding.remedy
     # All of the hand at the end of a forearm of 40 cm, whose wrist does not move.
     by = np.array([0, 0, 0.4])
     links = tuple(shifted(link, by) for link in CLAW.links)
     finding = geometry_checks.palm_finding(dataclasses.replace(CLAW, links=links))
-    assert finding.verdict == "failed" and re.search(
-        r" 5\.\d fingers' lengths from the wrist", finding.measured
-    )
+    assert finding.verdict == "failed"
+    assert re.search(r" 5\.\d fingers' lengths from the wrist", finding.measured)
 
 
 def test_gains_that_shake_are_found_and_named():
@@ -145,23 +147,22 @@ def test_gains_that_shake_are_found_and_named():
         only="left_middle",
     )
     found = physics_checks.servo_findings(loose, trials.responses(loose, recipe(loose).task, 2))
-    assert [finding.verdict for finding in found] == ["failed"] and "'left_middle'" in found[
-        0
-    ].measured
+    assert [finding.verdict for finding in found] == ["failed"]
+    assert "'left_middle'" in found[0].measured
     assert "raise kv" in found[0].remedy
     soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
     found = physics_checks.servo_findings(soft, trials.responses(soft, recipe(soft).task, 2))
-    assert len(found) == 6 and all("raise kp" in finding.remedy for finding in found)
+    assert len(found) == 6
+    assert all("raise kp" in finding.remedy for finding in found)
 
 
 def test_torques_that_are_too_weak_are_found_and_hold_nothing():
     weak = with_joints(CLAW, lambda j: dataclasses.replace(j, torque_limit=0.01 * j.torque_limit))
     lines, _ = verdicts(weak)
-    assert lines["strength"].verdict == "failed" and "torque_limit" in lines["strength"].remedy
-    assert (
-        lines["cylinder"].verdict == "failed"
-        and "repair the failures above first" in lines["cylinder"].remedy
-    )
+    assert lines["strength"].verdict == "failed"
+    assert "torque_limit" in lines["strength"].remedy
+    assert lines["cylinder"].verdict == "failed"
+    assert "repair the failures above first" in lines["cylinder"].remedy
     assert {lines[name].verdict for name in ("palm", "joints", "opening", "open", "closed")} == {
         "passed"
     }
@@ -169,21 +170,18 @@ def test_torques_that_are_too_weak_are_found_and_hold_nothing():
 
 def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     finding = geometry_checks.opening_finding(dataclasses.replace(CLAW, object_scale=3.0))
-    assert finding.verdict == "failed" and re.match(r"object_scale 1\.\d \(import", finding.remedy)
+    assert finding.verdict == "failed"
+    assert re.match(r"object_scale 1\.\d \(import", finding.remedy)
     wide = dataclasses.replace(CLAW, open_pose={}, closed_pose={})  # never closes
-    assert (
-        geometry_checks.joint_findings(wide)[0].verdict == "failed"
-        and "closed_pose" in geometry_checks.joint_findings(wide)[0].remedy
-    )
+    assert geometry_checks.joint_findings(wide)[0].verdict == "failed"
+    assert "closed_pose" in geometry_checks.joint_findings(wide)[0].remedy
     by = np.array([0.0, 0.05, 0.0])
     links = tuple(
         shifted(link, by) if link.name.startswith("right") else link for link in CLAW.links
     )
     crossed = dataclasses.replace(CLAW, links=links)
-    assert (
-        geometry_checks.open_overlap_finding(crossed).verdict == "failed"
-        and "left_lower" in geometry_checks.open_overlap_finding(crossed).measured
-    )
+    assert geometry_checks.open_overlap_finding(crossed).verdict == "failed"
+    assert "left_lower" in geometry_checks.open_overlap_finding(crossed).measured
 
 
 def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
@@ -193,7 +191,8 @@ def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
     file.write_text(hand_text(CLAW))
     assert main.run(["hands", "check", str(file), "--png", str(tmp_path / "claw.png")]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(made.findings) + 1 and lines[0].startswith("passed  palm")
+    assert len(lines) == len(made.findings) + 1
+    assert lines[0].startswith("passed  palm")
     assert (tmp_path / "claw.png").stat().st_size > 20_000
     failed = made._replace(
         findings=[made.findings[0]._replace(verdict="failed", remedy="another palm")]

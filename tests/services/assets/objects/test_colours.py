@@ -21,7 +21,9 @@ from congrasp.services.viz.episode_scene import object_at
 from congrasp.services.viz.raster import render_scene
 from tests.episodes import episode
 
-RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+RED = (255, 0, 0)
+GREEN = (0, 255, 0)
+BLUE = (0, 0, 255)
 SIDE = 0.1
 
 
@@ -47,10 +49,13 @@ def textured(path: pathlib.Path) -> pathlib.Path:
 
 def test_an_image_is_looked_up_where_it_lies_on_the_surface(tmp_path):
     found = sample_colours([textured(tmp_path / "cube.glb")], seed=0)
-    assert found is not None and found.points.shape == (COLOUR_POINTS, 3) == found.values.shape
+    assert found is not None
+    assert found.points.shape == (COLOUR_POINTS, 3) == found.values.shape
     x = found.points[:, 0]
-    assert (found.values[x < 0.04] == RED).all() and (found.values[x > 0.06] == BLUE).all()
-    assert (np.abs(found.points).min(0) >= 0).all() and found.points.max() <= SIDE + 1e-6
+    assert (found.values[x < 0.04] == RED).all()
+    assert (found.values[x > 0.06] == BLUE).all()
+    assert (np.abs(found.points).min(0) >= 0).all()
+    assert found.points.max() <= SIDE + 1e-6
     even = x[: COLOUR_POINTS // 2]
     # As many points on each face, as it has a sixth of the area.
     assert np.isclose(even, 0).mean() == pytest.approx(1 / 6, abs=0.02)
@@ -76,7 +81,8 @@ def test_a_material_without_an_image_is_its_colour(tmp_path):
     faces = "".join(f"f {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(12))
     (tmp_path / "cube.obj").write_text(f"mtllib cube.mtl\n{corners}usemtl paint\n{faces}")
     found = sample_colours([tmp_path / "cube.obj"], seed=0)
-    assert found is not None and (np.abs(found.values.astype(int) - (255, 127, 0)) <= 1).all()
+    assert found is not None
+    assert (np.abs(found.values.astype(int) - (255, 127, 0)) <= 1).all()
 
 
 def test_files_without_colours_have_none(tmp_path):
@@ -92,10 +98,10 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
     obj = import_source(source, ImportOptions(scale=0.5, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is not None
     x = obj.colours.points[:, 0]
-    assert x.min() == pytest.approx(-0.025, abs=1e-3) and x.max() == pytest.approx(0.025, abs=1e-3)
-    assert (obj.colours.values[x < -0.005] == RED).all() and (
-        obj.colours.values[x > 0.005] == BLUE
-    ).all()
+    assert x.min() == pytest.approx(-0.025, abs=1e-3)
+    assert x.max() == pytest.approx(0.025, abs=1e-3)
+    assert (obj.colours.values[x < -0.005] == RED).all()
+    assert (obj.colours.values[x > 0.005] == BLUE).all()
     assert np.ptp(obj.scaled(2.0).colours.points) == pytest.approx(2 * np.ptp(obj.colours.points))
     store.save(obj, tmp_path / "cube.safetensors")
     for ours, theirs in zip(
@@ -114,8 +120,10 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
         Camera(shown.object_position[0] + [0, -0.5, 0.0], shown.object_position[0]),
         (60, 60),
     )
-    left, right = picture[30, 25].astype(int), picture[30, 35].astype(int)
-    assert left[0] > left[2] + 60 and right[2] > right[0] + 60
+    left = picture[30, 25].astype(int)
+    right = picture[30, 35].astype(int)
+    assert left[0] > left[2] + 60
+    assert right[2] > right[0] + 60
 
 
 def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):

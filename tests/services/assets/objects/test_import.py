@@ -43,11 +43,9 @@ def options(tmp_path):
 def test_mass_properties_of_a_block(tmp_path, options, quick_import, suffix):
     block(SIDES, (0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
     (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
-    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == (
-        "block",
-        "imported",
-        ["mesh"],
-    )
+    assert obj.name == "block"
+    assert obj.family == "imported"
+    assert [piece.kind for piece in obj.pieces] == ["mesh"]
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
     np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
@@ -92,7 +90,8 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
 
 def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, monkeypatch):
     """Each of three imports waits for the others to begin."""
-    started, real = threading.Barrier(3), meshes.assemble
+    started = threading.Barrier(3)
+    real = meshes.assemble
 
     def build(*arguments, **options):
         started.wait(20)
@@ -105,7 +104,8 @@ def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, mo
         block(factor * SIDES).export(tmp_path / f"{name}.stl")
     found = dict(meshes.import_sources(find_sources(tmp_path), options))
     assert [isinstance(found[i], CongraspError) for i in range(3)] == [False, True, False]
-    assert (found[0].name, found[2].name) == ("a", "c")
+    assert found[0].name == "a"
+    assert found[2].name == "c"
     assert "b.stl is 80 m long" in str(found[1])
 
 
@@ -205,7 +205,8 @@ def test_an_open_sphere_is_cut_by_coacd():
     sphere = trimesh.creation.icosphere(4, 0.04)
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.02)
     result = decompose.decompose(sphere.vertices, sphere.faces, volume=None)
-    assert (result.method, result.notes) == ("coacd", [])
+    assert result.method == "coacd"
+    assert result.notes == []
 
 
 def break_module(folder, monkeypatch, name):
@@ -224,7 +225,8 @@ def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatc
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     break_module(tmp_path, monkeypatch, "vhacdx")
     result = decomposed(mesh)
-    assert (result.method, len(result.pieces)) == ("hull", 1)
+    assert result.method == "hull"
+    assert len(result.pieces) == 1
     np.testing.assert_allclose(
         shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6
     )
@@ -326,13 +328,15 @@ def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
         tmp_path / "bowl.stl"
     )
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
-    assert obj.surface_error < 3e-3 and abs(obj.volume_error) < 0.05
+    assert obj.surface_error < 3e-3
+    assert abs(obj.volume_error) < 0.05
 
 
 def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
     folder = tmp_path / "ell"
     folder.mkdir()
-    first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
+    first = block((0.08, 0.02, 0.02))
+    second = block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
     trimesh.util.concatenate([first, second]).export(folder / "ell.stl")
     first.export(folder / "contact0.stl")
     second.export(folder / "contact1.stl")
@@ -467,7 +471,8 @@ def _fallback(tree):
 def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
     (tmp_path / name).write_bytes(data)
     said = limited(read_mesh, tmp_path / name)
-    assert said.startswith(f"CongraspError: {tmp_path / name}") and why in said, said
+    assert said.startswith(f"CongraspError: {tmp_path / name}"), said
+    assert why in said, said
 
 
 def _inline(tree):

@@ -24,11 +24,14 @@ def ball(**options):
 
 
 def test_an_opening_is_left_and_bodies_that_touch_stay_together():
-    half, said = ball(), list[str]()
+    half = ball()
+    said = list[str]()
     half.update_faces(half.triangles_center[:, 2] < 0)
-    assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
+    assert len(closed(half, said).faces) == len(half.faces)
+    assert not said  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
-    assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
+    assert len(largest_body(pair, said).faces) == 2 * len(ball().faces)
+    assert not said
 
 
 @pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
@@ -65,14 +68,13 @@ def test_a_flat_object_is_no_table(radius, depth, knob, at):
 
 
 def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
-    scan, speck = (
-        trimesh.creation.icosphere(7, 0.05),
-        np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]]),
-    )
+    scan = trimesh.creation.icosphere(7, 0.05)
+    speck = np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]])
     volume = scan.volume
     trimesh.util.concatenate([scan, trimesh.Trimesh(speck, [[0, 1, 2]])]).export(tmp_path / "a.stl")
     found = largest_body(read_mesh(tmp_path / "a.stl"), [])
-    assert found.is_watertight and found.volume == pytest.approx(volume, rel=0.01)
+    assert found.is_watertight
+    assert found.volume == pytest.approx(volume, rel=0.01)
     small = trimesh.Trimesh(*reduced(np.vstack([scan.vertices, [100.0, 0, 0]]), scan.faces, []))
     assert small.volume == pytest.approx(volume, rel=0.01)
 
@@ -98,9 +100,11 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     ]
     mug = trimesh.util.concatenate([cup, trimesh.Trimesh(strap, faces, process=False)])
     mug.merge_vertices()
-    assert (mug.faces.shape, mug.body_count) == ((len(cup.faces) + len(faces), 3), 1)
+    assert mug.faces.shape == (len(cup.faces) + len(faces), 3)
+    assert mug.body_count == 1
     said = list[str]()
-    assert len(closed(mug, said).faces) == len(mug.faces) and not said
+    assert len(closed(mug, said).faces) == len(mug.faces)
+    assert not said
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,8 @@ _ARROW = [(0, 0), (2, 0), (0.5, 0.5), (0, 2)]
 
 def _prism(outline):
     """Points and polygons of a prism, as modelling programs export it: one polygon for each end."""
-    points, n = [(x, y, z) for z in (0, 3) for x, y in outline], len(outline)
+    points = [(x, y, z) for z in (0, 3) for x, y in outline]
+    n = len(outline)
     sides = [(i, (i + 1) % n, (i + 1) % n + n, i + n) for i in range(n)]
     return points, [tuple(range(n))[::-1], tuple(range(n, 2 * n)), *sides]
 
@@ -189,7 +194,9 @@ def test_polygons_of_a_ply_keep_their_volume_and_their_colours(tmp_path, data, v
     (tmp_path / "a.ply").write_bytes(data)
     said = list[str]()
     mesh = read_mesh(tmp_path / "a.ply", said)
-    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(volume) and not said
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(volume)
+    assert not said
     colours = load_geometry(tmp_path / "a.ply", "").visual.face_colors[:, :3]
     faces = 6 if volume == 3 else 10
     np.testing.assert_array_equal(np.unique(colours, axis=0), [(9, i, 7) for i in range(faces)])
@@ -235,11 +242,9 @@ def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
     text = "".join(" ".join(map(str, row[1:])) + "\n" for row in rows)
     (tmp_path / "a.ply").write_bytes(header.encode() + (text.encode() if kind == "ascii" else data))
     mesh = read_mesh(tmp_path / "a.ply")
-    assert (
-        mesh.is_watertight
-        and abs(mesh.volume) == pytest.approx(36)
-        and mesh.area == pytest.approx(24 + 26 * 3)
-    )
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(36)
+    assert mesh.area == pytest.approx(24 + 26 * 3)
 
 
 @pytest.mark.parametrize("turn", [1, -1])
@@ -249,11 +254,9 @@ def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
     text = "".join("v {} {} {}\n".format(*point) for point in points)
     (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
-    assert (
-        mesh.is_watertight
-        and abs(mesh.volume) == pytest.approx(36)
-        and mesh.area == pytest.approx(24 + 26 * 3)
-    )
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(36)
+    assert mesh.area == pytest.approx(24 + 26 * 3)
 
 
 def _row(face, end):
@@ -303,7 +306,8 @@ def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
     said = list[str]()
     shown = without_hollows(bottle, said)
     np.testing.assert_allclose(shown.volume, (full if filled else bottle).volume, rtol=0.01)
-    assert repair.encloses(shown) and bool(said) == filled
+    assert repair.encloses(shown)
+    assert bool(said) == filled
 
 
 def test_a_hollow_without_an_opening_is_filled():
@@ -323,7 +327,8 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     obj = one_object(tmp_path / "fine.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
     notes = obj.notes
     assert notes[0] == "its 81,920 triangles were reduced to 2,000: a hand does not feel the rest"
-    assert len(obj.visual_faces) <= 2_000 and not [note for note in notes if "open" in note]
+    assert len(obj.visual_faces) <= 2_000
+    assert not [note for note in notes if "open" in note]
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
     # As STL files have it: no triangle shares a corner
     soup = fine.vertices[fine.faces].reshape(-1, 3)
@@ -351,7 +356,8 @@ def _moebius():
     ]
     faces = []
     for i in range(24):
-        a, b = 2 * i, 2 * i + 1
+        a = 2 * i
+        b = 2 * i + 1
         c, d = (2 * i + 2, 2 * i + 3) if i < 23 else (1, 0)
         faces += [(a, b, c), (b, d, c)]
     return rim, faces

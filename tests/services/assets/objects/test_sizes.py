@@ -145,14 +145,17 @@ def imported(folder: pathlib.Path, **options):
 
 def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     obj = imported(hammer, material="head=steel,handle=wood")
-    head, handle = 7850 * 0.025**2 * 0.09, 640 * 0.025**2 * 0.25
-    assert obj.mass == pytest.approx(head + handle, rel=1e-4) and 0.4 < obj.mass < 0.6
+    head = 7850 * 0.025**2 * 0.09
+    handle = 640 * 0.025**2 * 0.25
+    assert obj.mass == pytest.approx(head + handle, rel=1e-4)
+    assert 0.4 < obj.mass < 0.6
     # The file's origin is the handle's middle, so that the centre of mass is high up.
     assert -obj.origin[2] == pytest.approx(0.1375 * head / (head + handle), rel=1e-3)
     for text in ("wood,head=steel", "handle=wood,steel"):
         assert imported(hammer, material=text).mass == obj.mass
     given = imported(hammer, material="head=steel,handle=wood", mass=0.5)
-    assert given.mass == 0.5 and given.origin == obj.origin
+    assert given.mass == 0.5
+    assert given.origin == obj.origin
     np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
 
 
@@ -164,7 +167,8 @@ def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_ma
 
 
 def test_options_weigh_objects_of_the_generator_too():
-    at, before = ObjectAt("mug_7", pathlib.Path("mug:7"), None), generate(7, "mug")
+    at = ObjectAt("mug_7", pathlib.Path("mug:7"), None)
+    before = generate(7, "mug")
     heavy = import_object(at, ImportOptions(mass=0.4))
     assert heavy.mass == 0.4
     np.testing.assert_allclose(heavy.inertia, before.inertia * 0.4 / before.mass)

@@ -50,25 +50,30 @@ def test_a_figure_stands_beside_the_papers_of_the_same_hand_method_and_source():
     )
     cells = compare([result("hands", heading)], {}, HANDS)
     (cell,) = find(cells, "hands", "heading")
-    assert (cell.ours, cell.low, cell.high, cell.paper) == (0.99, 0.97, 0.997, 0.96)
-    assert cell.difference == pytest.approx(0.03) and cell.verdict == "better"
+    assert cell.ours == 0.99
+    assert cell.low == 0.97
+    assert cell.high == 0.997
+    assert cell.paper == 0.96
+    assert cell.difference == pytest.approx(0.03)
+    assert cell.verdict == "better"
     (metres,) = find(cells, "hands", "heading", "heading_m")
-    assert (metres.low, metres.high) == pytest.approx(
-        (0.028, 0.032)
-    ) and metres.difference == pytest.approx(0.01)
+    assert (metres.low, metres.high) == pytest.approx((0.028, 0.032))
+    assert metres.difference == pytest.approx(0.01)
     assert metres.verdict == "worse"  # a larger error
     (radians,) = find(cells, "hands", "heading", "heading_rad")
-    assert radians.difference == pytest.approx(-0.043) and (radians.low, radians.verdict) == (
+    assert radians.difference == pytest.approx(-0.043)
+    assert (radians.low, radians.verdict) == (
         None,
         "",
     )
     # The paper's 96.9 % is of captured constraints: ours is only the nearest.
     (captured,) = find(cells, "single", "heading")
-    assert (
-        captured.ours is None and captured.nearest == 0.99 and "GRAB and OakInk" in captured.reason
-    )
+    assert captured.ours is None
+    assert captured.nearest == 0.99
+    assert "GRAB and OakInk" in captured.reason
     (other,) = find(cells, "hands", "heading", hand="sharpa")
-    assert other.ours is None and other.reason == "not evaluated"
+    assert other.ours is None
+    assert other.reason == "not evaluated"
 
 
 def test_every_figure_of_the_paper_has_a_cell():
@@ -110,7 +115,9 @@ def test_reasons_say_what_is_missing():
 def test_rows_without_an_episode_that_succeeds_have_no_error_to_compare():
     none = row("heading", 0.0, 0.0, 0.04, errors={"heading_rad": None, "heading_m": None})
     (cell,) = find(compare([result("hands", none)], {}, HANDS), "hands", "heading", "heading_rad")
-    assert cell.ours is None and cell.difference is None and cell.reason == "no episode succeeded"
+    assert cell.ours is None
+    assert cell.difference is None
+    assert cell.reason == "no episode succeeded"
 
 
 def test_groups_by_size_are_compared_and_others_are_our_own():
@@ -120,7 +127,8 @@ def test_groups_by_size_are_compared_and_others_are_our_own():
     ]
     results = [result("objects", *rows, table="objects")]
     (small,) = find(compare(results, {}, HANDS), "objects", "heading", group="small")
-    assert small.paper == 0.929 and small.ours == 0.9
+    assert small.paper == 0.929
+    assert small.ours == 0.9
     assert [own.group for _, own in unmatched(results)] == ["family mug"]
 
 
@@ -131,10 +139,8 @@ def test_the_summary_counts_rates_and_intervals():
         row("trajectory", 0.96, 0.93, 0.98),
     ]
     text = summary(compare([result("hands", *rows)], {}, HANDS))
-    assert (
-        text.startswith("3 of the paper's 47 success rates")
-        and "at or above the paper's in 2;" in text
-    )
+    assert text.startswith("3 of the paper's 47 success rates")
+    assert "at or above the paper's in 2;" in text
     assert "interval is above it in 1, and below it in 1." in text
 
 
@@ -187,7 +193,8 @@ def test_latex_is_balanced_and_holds_every_figure():
     body = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert len(body) == 6 + 47
     wanted = [len(table.columns) - 1 for table in shown for _ in range(1 + len(table.rows))]
-    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == wanted and set(wanted) == {7, 9}
+    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == wanted
+    assert set(wanted) == {7, 9}
     for line in body:
         assert not re.search(r"(?<!\\)[%#_]", line)
     assert r"98.4 (94.5-99.6) & 96.0 & +2.4" in text
