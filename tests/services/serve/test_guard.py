@@ -14,8 +14,9 @@ from congrasp.common.request import GraspRequest
 from congrasp.services.client.guard import Guard
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer
+from congrasp.services.client.query_thread import QueryThread
 from congrasp.services.client.ticker import Ticker
-from tests.waits import Clock
+from tests.waits import Clock, eventually
 
 FINGERS = 2
 OPEN = np.array([0.3, -0.3])
@@ -327,26 +328,22 @@ def test_an_answer_to_an_old_state_is_thrown_away():
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
-def test_after_an_answer_that_came_late_the_next_is_waited_for():
-    slow = threading.Event()
+def test_a_late_answer_does_not_replace_the_next_one():
     done = threading.Event()
 
     def act(state):
-        if not slow.is_set():
-            slow.set()
-            done.wait(20.0)
+        done.wait(20.0)
         return answer(state["q"])
 
-    clock = Clock(100.0)
-    with guarded(ScriptedPolicy(act), clock) as guard:
-        guard._wait = 0.0
-        assert guard.step(STATE).mode == "hold"
-        done.set()
-        while guard._queries._outcome is None:
-            time.sleep(0.001)
-        guard._wait = 0.4
-        clock.now += 0.1
-        assert guard.step({**STATE, "q": np.full(2, 0.1)}).answer.q_target[0] == 0.1
+    queries = QueryThread(ScriptedPolicy(act))
+    queries.begin(REQUEST)
+    assert queries.exchange(STATE, 0.0, timeout=0.0) is None
+    done.set()
+    eventually(lambda: not queries.is_busy)
+    outcome = queries.exchange({**STATE, "q": np.full(2, 0.1)}, 1.0, timeout=20.0)
+    queries.close()
+    assert outcome.state_time == 1.0
+    assert outcome.answer.q_target[0] == 0.1
 
 
 def test_a_policy_that_hangs_does_not_hold_the_loop_up():
@@ -432,6 +429,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
     policy = ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
         last = np.zeros(FINGERS + 6)
+        has_floor = False
         for outcome, state, passed, begins in steps:
             policy.outcome = outcome
             if begins:
@@ -441,6 +439,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
                     )
                 )
                 last[FINGERS:] = 0.0
+                has_floor = True
             clock.now += passed
             command = guard.step(state)
             target = np.append(command.q_target, command.u_target)
@@ -448,7 +447,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
             assert (target <= LIMITS.upper).all()
             assert (np.abs(target - last) <= LIMITS.speed * 0.5 + 1e-12).all()
             assert (np.abs(np.append(command.q_torque, command.u_torque)) <= LIMITS.torque).all()
-            assert command.u_target[2] >= -1e-9 or not guard._limiter._floor
+            assert command.u_target[2] >= -1e-9 or not has_floor
             last = target
     assert guard.counters.steps == len(steps)
 
