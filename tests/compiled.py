@@ -1,5 +1,5 @@
-"""Functions of a module as one program each: alone, every operation in them would be compiled for
-itself.
+"""Programs that JAX compiles: functions of a module as one program each (alone, every operation in
+them would be compiled for itself), and their number.
 """
 
 import functools
@@ -25,3 +25,8 @@ class Compiled:
         found = jax.jit(functools.partial(getattr(self._module, name), *self._given))
         setattr(self, name, found)
         return found
+
+
+def program_count(function: Any) -> int:
+    """Number of programs that JAX has compiled for a jitted function; it has no public count."""
+    return function._cache_size()

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.actors.physics import slots
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.object_rows import ObjectRows
-from congrasp.actors.physics.scene import compile_scene
+from congrasp.actors.physics.scene import compile_scene, scene_spec
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
@@ -34,6 +35,7 @@ from tests.actors.test_physics import (
     servoed,
     side_by_side,
 )
+from tests.compiled import program_count
 from tests.conftest import ROOT
 from tests.solids import mujoco_mass_properties
 from tests.task import warp_engine
@@ -139,7 +141,7 @@ def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(s
     first, _ = step(physics.start(start), target, table)
     before = jax.tree.map(np.array, first)
     physics.repeat(batch, 3)
-    repeated = physics._buffers[batch][1]._data.qpos.numpy()
+    repeated = physics.buffers(batch).positions()
     _same(before, first)
     after = first
     for _ in range(3):
@@ -163,7 +165,7 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
 
     monkeypatch.setattr(wp._src.context.Module, "load", noted)
     state = physics.start(start)
-    physics._buffers[len(OBJECTS)][1]._kernels.result()
+    physics.buffers(len(OBJECTS)).wait_for_kernels()
     ahead = set(loaded)
     physics.step(state, jnp.asarray(grasp(start, 5)), jnp.ones(len(OBJECTS), bool))
     assert len(ahead) > 40
@@ -176,19 +178,21 @@ def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends
 ):
     import warp as wp  # takes seconds in every worker
 
-    from congrasp.actors.physics.warp_buffers import WarpBuffers
+    from congrasp.actors.physics import warp_buffers
 
-    monkeypatch.setattr(WarpBuffers, "_load_kernels", lambda buffers: None)
+    monkeypatch.setattr(warp_buffers, "build_kernels", lambda device, variants: None)
     monkeypatch.setattr(
         wp, "get_suggested_block_size", lambda *query: pytest.fail("this would build a kernel")
     )
     monkeypatch.setattr(
         wp._src.context.Module, "load", lambda *module: pytest.fail("this builds a module")
     )
-    engines = warp_engine(OBJECTS), warp_engine(OBJECTS[:1], mesh_slots=9)
-    few, many = (
-        [module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1)
-    )
+
+    def modules(engine, batch):
+        return [module.name for module, _ in engine.allocate(batch).variants()]
+
+    few = modules(warp_engine(OBJECTS), 1)
+    many = modules(warp_engine(OBJECTS[:1], mesh_slots=9), 2)
     assert len(many) > 40, "the first are those that are queried"
     assert many[0].startswith("_nxn_broadphase"), "the first are those that are queried"
     assert all(name.startswith("_nxn_broadphase") for name in {*few} ^ {*many})
@@ -228,7 +232,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
         [sys.executable, "-c", program, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        monkeypatch.setattr(warp_build, "_PATIENCE_S", 0.1)
+        monkeypatch.setattr(warp_build, "PATIENCE_S", 0.1)
         build()  # after a wait it builds, too
         other.kill()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
@@ -298,7 +302,7 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
         np.testing.assert_allclose(
             given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
         )
-    assert step._cache_size() == 1
+    assert program_count(step) == 1
 
 
 @pytest.mark.slow
@@ -329,7 +333,7 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     assert x.contact_found.any((1, 2)).all()
     np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-4)
-    assert step._cache_size() == 1
+    assert program_count(step) == 1
 
 
 @pytest.mark.slow
@@ -416,14 +420,23 @@ def test_what_had_no_room_is_counted(start, monkeypatch):
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]
 
 
-def test_steps_whose_solver_reached_its_limit_are_counted(start):
+def test_steps_whose_solver_reached_its_limit_are_counted(start, monkeypatch):
     """An iteration limit of 1 is reached in every physics step of these environments in contact
     with the table.
     """
+
+    def limit_iterations(iterations):
+        def spec(*arguments):
+            limited_spec = scene_spec(*arguments)
+            limited_spec.option.iterations = iterations
+            return limited_spec
+
+        monkeypatch.setattr(slots, "scene_spec", spec)
+
     limited = []
     for iterations in (1, 100):
+        limit_iterations(iterations)
         warp = warp_engine(OBJECTS)
-        warp._object_rows.model.opt.iterations = iterations
         _, after = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
         limited.append(float(after.occupancy[2]))
     assert limited == [1.0, 0.0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from congrasp.actors import rollout as rollout_module
 from congrasp.actors.env import GraspEnv
 from congrasp.actors.episode import object_pieces
 from congrasp.actors.physics.engine import PhysicsState, where_environments
@@ -24,6 +25,7 @@ from congrasp.common.task.metrics import episode_fields, metric_names
 from congrasp.common.task.observation import layout
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import task as suite
+from tests.compiled import program_count
 from tests.task import BATCH, HAND, TASK
 
 STEPS = TASK.approach_steps + TASK.hold_steps
@@ -381,7 +383,7 @@ def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplo
     assert touching[:, 1].tolist() == [False] + [True] * 6
 
 
-def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
+def test_episodes_drawn_in_small_batches_equal_one_draw(monkeypatch):
     """A program of its own, of headings alone: five environments restart, two at a time."""
     task = dataclasses.replace(TASK, constraints=("heading",))
     settings = {
@@ -391,8 +393,8 @@ def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
         "traced": "none",
         "taught": False,
     }
+    monkeypatch.setattr(rollout_module, "LEAST_RENEWED", 2)
     programs = Programs(HAND, task, None, suite.commanded, **settings)
-    programs._together = 2
     bank = suite.bank()
     old, new = jax.random.split(jax.random.key(0))
     ended = np.array([True, False, True, True, False, True, False, True])
@@ -419,13 +421,13 @@ def test_workers_of_one_task_share_programs_that_compile_once():
         worker = suite.worker(seed=steps)
         worker.collect(parameters, steps)
         worker.restart()
-        before = programs.renew._cache_size()
+        before = program_count(programs.renew)
         worker.weigh_objects(np.asarray(worker.bank.weight))
         worker.restart()
         assert worker.programs is programs
-        assert programs.renew._cache_size() == before
+        assert program_count(programs.renew) == before
         compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
-        sizes.add(tuple(program._cache_size() for program in compiled))
+        sizes.add(tuple(map(program_count, compiled)))
         worker.physics.close()
     assert len(sizes) == 1
 

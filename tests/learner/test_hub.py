@@ -54,9 +54,9 @@ class Bench:
     """A hub, which has published weights where a version is given, and a peer of it."""
 
     def __init__(self, *, version=None, max_staleness=1, batch=2, **options):
-        shared = MemoryHub()
-        self.server = MemoryTransport(shared)
-        self.peer = MemoryTransport(shared)
+        self.memory = MemoryHub()
+        self.server = MemoryTransport(self.memory)
+        self.peer = MemoryTransport(self.memory)
         self.staleness = StalenessManager(max_staleness, batch)
         self.hub, self.rollouts = rollouts.learner_hub(
             self.server, "test", form=FORM, staleness=self.staleness, **options
@@ -121,7 +121,7 @@ def test_tickets_run_out_and_return(bench):
     b = bench(version=0, max_staleness=0, batch=1)
     assert b.ticket("t")["granted"]
     assert b.ticket("t")["granted"]
-    assert b.rollouts._sequences.of(("a", "01")).granted == 1
+    assert b.rollouts.decided(("a", "01")).granted == 1
     assert not b.ticket("u")["granted"]
     b.ticket("t", give_back=True)
     assert b.ticket("u")["granted"]
@@ -135,7 +135,7 @@ def test_death_returns_tickets_and_is_told(bench):
     said = []
     b = bench(version=0, max_staleness=0, batch=1, on_event=lambda *event: said.append(event))
     events = b.peer.subscribe(KEYS.logs, depth=8)
-    actor = MemoryTransport(b.peer._hub)
+    actor = MemoryTransport(b.memory)
     actor.declare_alive(KEYS.alive("actor", "a", "01"))
     assert b.ticket()["granted"]
     assert _roles(b) == {("learner", "0"), ("actor", "a")}
@@ -337,7 +337,7 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     b = bench()
     events = b.peer.subscribe(KEYS.logs, depth=1000)
     b.peer.declare_alive(KEYS.alive("actor", "0.a", "01"))
-    flood = MemoryTransport(b.peer._hub)
+    flood = MemoryTransport(b.memory)
     for i in range(3000):
         flood.declare_alive(KEYS.alive("actor", f"1.{i}", "01"))
     eventually(lambda: b.ask(KEYS.status)["unlisted"] == 3000 - 64)
@@ -543,27 +543,32 @@ def _header(sequence):
 
 
 @pytest.fixture
-def log(tmp_path):
-    return lambda **options: WriteAheadLog(tmp_path / "log", 1, **options)
+def folder(tmp_path):
+    return tmp_path / "log"
 
 
-def on_disk(log):
+@pytest.fixture
+def log(folder):
+    return functools.partial(WriteAheadLog, folder, 1)
+
+
+def on_disk(folder):
     """Sequences of the rollouts on disk, in the order of their acceptance."""
-    return [int(path.stem.split("~")[3]) for path in sorted(log._folder.glob("*.safetensors"))]
+    return [int(path.stem.split("~")[3]) for path in sorted(folder.glob("*.safetensors"))]
 
 
-def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log):
+def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log, folder):
     b = bench(version=3, batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     for i, version in enumerate((3, 2, 3, 2)):
         assert b.send(i, version=version)["outcome"] == "accepted"
-        assert on_disk(b.rollouts._log) == list(range(i + 1))  # before it is acknowledged
+        assert on_disk(folder) == list(range(i + 1))  # before it is acknowledged
     assert sequences(b.rollouts.next_batch(2, 1)) == [1, 3]
     b.hub.publish_weights(bundle(4), 4)
     assert b.send(4, version=4)["outcome"] == "accepted"
     b.hub.publish_weights(bundle(5), 5)
     # Two versions from the checkpoint: of no use to a resume
     assert b.send(5, version=5)["outcome"] == "accepted"
-    assert on_disk(b.rollouts._log) == [0, 1, 2, 3, 4]
+    assert on_disk(folder) == [0, 1, 2, 3, 4]
 
     resumed = bench(batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     resumed.hub.publish_weights(bundle(7), 7)  # which is 3 under another number
@@ -584,29 +589,29 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
     assert resumed.ticket()["granted"]
 
 
-def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
+def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log, folder):
     b = bench(version=5, batch=2, log=log())
     for i in range(3):
         assert b.send(i, version=5)["outcome"] == "accepted"
-    assert on_disk(b.rollouts._log) == []  # there is no checkpoint from which these would be fresh
+    assert on_disk(folder) == []  # there is no checkpoint from which these would be fresh
     assert sequences(b.rollouts.next_batch(2, 1)) == [0, 1]
     b.hub.publish_weights(bundle(6), 6)
     durable = b.rollouts.durable()
-    assert on_disk(b.rollouts._log) == [2]
+    assert on_disk(folder) == [2]
     assert b.send(3, version=6)["outcome"] == "accepted"  # while the checkpoint is written
     b.rollouts.note_saved()
-    assert on_disk(b.rollouts._log) == [2, 3]
+    assert on_disk(folder) == [2, 3]
 
     resumed = bench(version=6, batch=2, log=log(), durable=durable)
     assert sequences(resumed.rollouts.next_batch(2, 1)) == [2, 3]
     resumed.hub.publish_weights(bundle(7), 7)
     resumed.rollouts.durable()
-    assert on_disk(resumed.rollouts._log) == [2, 3]  # the checkpoint might yet fail
+    assert on_disk(folder) == [2, 3]  # the checkpoint might yet fail
     resumed.rollouts.note_saved()
-    assert on_disk(resumed.rollouts._log) == []
+    assert on_disk(folder) == []
 
 
-def test_nothing_is_acknowledged_before_it_is_written(bench, log):
+def test_nothing_is_acknowledged_before_it_is_written(bench, log, folder):
     """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was
     noted.
     """
@@ -626,26 +631,25 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     first.join(60)
     assert answers == ["accepted"]
     assert b.send(0)["outcome"] == "duplicate"
-    assert on_disk(slow) == [0]
+    assert on_disk(folder) == [0]
     # The disk refuses it, and the learner stops
     slow.add = lambda header, message: b.rollouts.close()
     assert b.send(1)["outcome"] == "retry"
 
 
-def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log):
+def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log, folder):
     b = bench(version=0, log=log())
     for i in range(3):
         b.send(i)
     b.rollouts.discard(b.rollouts.next_batch(2, 1))
-    assert on_disk(b.rollouts._log) == [2]
+    assert on_disk(folder) == [2]
 
 
-def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
+def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log, folder):
     said = []
     b = bench(version=0, log=log())
     for i in range(4):
         assert b.send(i)["outcome"] == "accepted"
-    folder = b.rollouts._log._folder
     damaged, renamed = sorted(folder.iterdir())[1:3]
     damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
     renamed.rename(folder / renamed.name.replace("~2.", "~9."))
@@ -662,28 +666,27 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
     other.hub.publish_weights(bundle(0, run_id="f"), 0)
-    assert not on_disk(other.rollouts._log)
+    assert not on_disk(folder)
     assert other.ledger()["queued"] == 0
 
 
-def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log):
+def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log, folder):
     b = bench(version=0, log=log())
     b.send(0)
     resumed = bench(version=1, log=log(write=False))
     assert resumed.send(1, version=1)["outcome"] == "accepted"
-    assert on_disk(resumed.rollouts._log) == [0]
+    assert on_disk(folder) == [0]
     assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 1]
 
 
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
     said = []
     (tmp_path / "file").touch()
-    b = bench(
-        version=0, batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append)
-    )
+    folder = tmp_path / "file" / "log"
+    b = bench(version=0, batch=3, log=WriteAheadLog(folder, 1, log_error=said.append))
     assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
     assert len(said) == 1
     assert "they do not survive the learner" in said[0]
     (tmp_path / "file").unlink()
     assert b.send(3)["outcome"] == "accepted"
-    assert on_disk(b.rollouts._log) == [3]
+    assert on_disk(folder) == [3]

@@ -228,7 +228,7 @@ def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
         "last_observation": rng.normal(size=(3, 12)).astype(np.float32),
     }
     whole = evaluate(batch)
-    monkeypatch.setattr(losses, "_MAX_TOGETHER", 6)
+    monkeypatch.setattr(losses, "MAX_TOGETHER", 6)
     jax.tree.map(
         functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), evaluate(batch), whole
     )

@@ -13,6 +13,7 @@ from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
+from tests.compiled import program_count
 from tests.learner import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
@@ -170,7 +171,7 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
 def test_learning_rate_follows_the_divergence_within_its_range(kl, before, limits, rate):
     hyper = {"kl_target": 0.012, "learning_rate_range": limits}
     np.testing.assert_allclose(
-        ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6
+        ppo.adapted_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6
     )
 
 
@@ -322,11 +323,11 @@ def test_more_minibatches_than_transitions_are_refused():
 
 def test_other_hyperparameters_do_not_compile_again():
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
-    compiled = ppo._optimise._cache_size()
+    compiled = program_count(ppo.optimise)
     for seed, clip in enumerate((0.1, 0.3)):
         other = changed(clip=clip, entropy=0.01, gamma=0.5, max_grad_norm=0.1)
         state, _ = other.update(state, rollout(toy.bundle_of(state), seed))
-    assert ppo._optimise._cache_size() == compiled
+    assert program_count(ppo.optimise) == compiled
 
 
 def test_same_seed_and_data_give_the_same_bits():

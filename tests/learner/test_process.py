@@ -19,6 +19,7 @@ from congrasp.learner.algorithms import ppo
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import create_run, initial_notes, open_run
+from tests.compiled import program_count
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -119,9 +120,9 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
     )
     assert first.version == 3
     assert actor.is_alive()
-    compiled = ppo._optimise._cache_size()
+    compiled = program_count(ppo.optimise)
     last = learn(tmp_path, hub, dataclasses.replace(CONFIG, updates=6), resume=True)
-    assert ppo._optimise._cache_size() == compiled
+    assert program_count(ppo.optimise) == compiled
     actor.join(10.0)
     assert actor.ended == "The run is finished."
     assert last.version == 6

@@ -19,7 +19,7 @@ import pytest
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
-from congrasp.learner.distributed.ranks import Ranks, ended_by
+from congrasp.learner.distributed.ranks import Ranks, accept_links, ended_by, open_link
 from congrasp.learner.distributed.relay import relay
 from congrasp.learner.run_directory import create_run
 from tests.children import python
@@ -38,12 +38,10 @@ class Party:
         deadline = time.monotonic() + 20.0
 
         def meet(rank: int) -> None:
-            address = "127.0.0.1", port
-            self.links[rank] = (
-                {0: ranks_module._reach(rank, count, *address, deadline)}
-                if rank
-                else ranks_module._gather(count, *address, deadline)
-            )
+            if rank == 0:
+                self.links[0] = accept_links(count, "127.0.0.1", port, deadline)
+            else:
+                self.links[rank] = {0: open_link(rank, count, "127.0.0.1", port, deadline)}
 
         self.everywhere(meet, count)
         self.ranks = [
@@ -57,7 +55,7 @@ class Party:
 
     def end(self, rank: int) -> None:
         """Its process is no more: nothing in it runs on, and the kernel ends its connections."""
-        self.ranks[rank]._leaving.set()
+        self.ranks[rank].leave()
         for link in self.links[rank].values():
             link.close()
 
@@ -67,7 +65,7 @@ class Party:
 
 @pytest.fixture
 def party(monkeypatch):
-    monkeypatch.setattr(ranks_module, "_RELAY_SECONDS", 0.2)
+    monkeypatch.setattr(ranks_module, "RELAY_SECONDS", 0.2)
     party = Party(free_port())
     yield party
     for rank in range(3):
@@ -119,7 +117,7 @@ def test_a_killed_rank_ends_the_others(party, victim):
 
 
 def test_a_silent_rank_ends_the_others(monkeypatch):
-    monkeypatch.setattr(ranks_module, "_SILENCE_SECONDS", 0.5)
+    monkeypatch.setattr(ranks_module, "SILENCE_SECONDS", 0.5)
     party = Party(free_port())  # whose hearts beat every two seconds only
     assert party.all_said({0, 1, 2})
     assert any("silent" in text for text in party.said.values())
