@@ -117,6 +117,16 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
     return jax.device_put(field)
 
 
+def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:
+    """Exact signed distance (n,) in m of points (n, 3) of the object frame from the nearest
+    primitive piece, negative inside.
+
+    Inside several pieces at once it is understated.
+    """
+    distance: Array = _least(_slots(pieces), points)
+    return distance
+
+
 class _Lattice(NamedTuple):
     """Points of a grid around an object."""
 

@@ -9,7 +9,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
 from congrasp.common.policy import bundle as bundles
 
-_FOLDER = pathlib.Path(__file__).with_name("data")
+FOLDER = pathlib.Path(__file__).with_name("data")
+"""Folder of the policies of the package."""
 SUFFIX = ".safetensors"
 
 
@@ -32,7 +33,7 @@ def packaged_file(name: str) -> pathlib.Path:
     """Path of the package's policy of this name, such as `allegro-student`, whether or not it
     exists.
     """
-    return _FOLDER / f"{name}{SUFFIX}"
+    return FOLDER / f"{name}{SUFFIX}"
 
 
 def own_policy_file(name: str) -> pathlib.Path:

@@ -47,7 +47,7 @@ _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _PAGE_PATH = re.compile("/(api|static(/vendor)?)/[^/]*$")
 """End of a path that belongs to the page, after the prefix of a proxy."""
 _TOKEN = re.compile("[0-9a-f]{32}")
-_TIMEOUT_S = 30.0
+TIMEOUT_S = 30.0
 """Time that a connection may be silent, and that a request's head may take."""
 _CONNECTIONS = 256  # at a time, shared by addresses; a browser opens six
 _DRAINED_BYTES = 64 << 10
@@ -174,7 +174,7 @@ class PageServer:
         """
         remedy = "Choose another --port, or end the process that uses it."
         with os_errors_as(f"The page cannot be offered at {host}:{port}", remedy, PORT_ERRORS):
-            self._server = _Server((host, port), _Handler)
+            self._server = BoundedServer((host, port), _Handler)
         self._server.page = self
         self.routes = routes
         self.host = host
@@ -252,7 +252,9 @@ def _disconnect(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-class _Server(http.server.ThreadingHTTPServer):
+class BoundedServer(http.server.ThreadingHTTPServer):
+    """HTTP server with a thread for each connection, and a limit of connections."""
+
     page: PageServer
     daemon_threads = True
     request_queue_size = 128  # the client retries a connection that finds no room, after a second
@@ -294,12 +296,12 @@ class _Server(http.server.ThreadingHTTPServer):
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    timeout = _TIMEOUT_S
-    server: _Server
+    timeout = TIMEOUT_S
+    server: BoundedServer
 
     def handle_one_request(self) -> None:
-        """Serves one request, whose head must arrive within `_TIMEOUT_S`, at whatever speed."""
-        timer = threading.Timer(_TIMEOUT_S, self._give_up)
+        """Serves one request, whose head must arrive within `TIMEOUT_S`, at whatever speed."""
+        timer = threading.Timer(TIMEOUT_S, self._give_up)
         timer.daemon = True
         self._head_timer = timer
         timer.start()

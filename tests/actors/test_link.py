@@ -278,7 +278,7 @@ def test_silent_learner_is_given_up(joined):
 
 
 def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch, caplog):
-    monkeypatch.setattr(patience_module, "_NOTICED_S", 0.2)
+    monkeypatch.setattr(patience_module, "NOTICED_S", 0.2)
     learner, link = joined(patience=20.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)

@@ -179,25 +179,33 @@ def heard(monkeypatch):
     return run
 
 
-def started(info: RunInfo) -> None:
-    """Starts the parts of an actor for a learner that gives this information."""
-    link = types.SimpleNamespace(actor="a")
-    process._Actor(ActorOptions("t", "a", physics="native"), CONFIG, info, link, None)
+@pytest.fixture
+def run_for(monkeypatch):
+    """Runs an actor whose learner needs rollouts of these arrays and policies of this schema."""
+
+    def run(schema: str, arrays: tuple[str, ...]) -> None:
+        info = RunInfo(to_json(CONFIG), "e", schema, arrays)
+        monkeypatch.setattr(process.ActorLink, "wait_for_config", lambda link, stop: info)
+        options = ActorOptions(run="t", actor="a", physics="native")
+        with MemoryTransport(MemoryHub()) as transport:
+            process.run_actor(transport, options, threading.Event())
+
+    return run
 
 
-def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
+def test_arrays_that_actors_do_not_record_are_refused(run_for):
     with pytest.raises(
         CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"
     ):
-        started(RunInfo("{}", "e", SPEC.schema, ("reward", "torque")))
+        run_for(SPEC.schema, ("reward", "torque"))
 
 
-def test_an_actor_of_another_version_is_one_line_before_anything_is_built(monkeypatch):
+def test_another_policy_schema_is_refused_before_objects_are_built(run_for, monkeypatch):
     monkeypatch.setattr(process, "training_set", lambda *_: pytest.fail("its objects were built"))
     with pytest.raises(
         CongraspError, match=rf"schema 0; this actor's have {SPEC.schema}\. Start the actor with"
     ):
-        started(RunInfo("{}", "e", "0", ("reward",)))
+        run_for("0", ("reward",))
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():

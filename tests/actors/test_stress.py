@@ -19,6 +19,7 @@ from congrasp.actors.attempts import Attempts, Phases
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics import make_physics
 from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics.scene import compile_scene
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.task import plausibility
@@ -178,7 +179,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
     target = np.zeros((BATCH, 6 + len(HAND.joints)), np.float32)
     pushed, _ = jax.jit(physics.step)(state, target, np.zeros(BATCH, bool), force)
     expected = np.zeros_like(pushed.data.xfrc_applied)
-    expected[:, physics._object_body, :3] = force
+    expected[:, compile_scene(HAND, TASK, OBJECTS[0]).body("object").id, :3] = force
     np.testing.assert_array_equal(pushed.data.xfrc_applied, expected)
 
 

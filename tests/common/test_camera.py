@@ -280,7 +280,8 @@ def test_student_learns_from_its_cloud(tmp_path):
             run.distill, teacher=str(path), minibatches=4, learning_rate=3e-3
         ),
     )
-    student = Distillation(policy_spec(TASK, NETWORK), run)
+    spec = policy_spec(TASK, NETWORK)
+    student = Distillation(spec, run)
     block = cloud_block()
     size = sum(width for _, width in full_layout(TASK))
     assert sum(width for _, width in teacher.spec.layout) == size
@@ -290,7 +291,7 @@ def test_student_learns_from_its_cloud(tmp_path):
         middle = rng.normal(size=(4, 32, 3))
         taught = np.zeros((4, 32, size + extra(get_hand(TASK.hand))), np.float32)
         taught[..., :3] = middle
-        seen = np.zeros((4, 32, sum(width for _, width in student._spec.layout)), np.float16)
+        seen = np.zeros((4, 32, sum(width for _, width in spec.layout)), np.float16)
         points = 0.1 * rng.normal(size=(4, 32, POINTS, 4)) + np.append(np.zeros(3), 1.0)
         points[..., :3] += middle[..., None, :]
         seen[..., block] = points.reshape(4, 32, -1)

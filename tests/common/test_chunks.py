@@ -47,7 +47,7 @@ def test_fetch_with_lost_chunks(size, lost, no_pauses):
 def no_pauses():
     """Removes the pauses after lost chunks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chunks, "_PAUSE_S", 0.0)
+        patch.setattr(chunks, "PAUSE_S", 0.0)
         yield patch
 
 
@@ -143,7 +143,7 @@ def test_outbox_limits_chunks_of_one_account():
     with outbox.turn("a") as one, outbox.turn("a") as two:
         assert one
         assert two
-    assert not outbox._sending
+    assert outbox.busy_accounts == set()
     assert account("congrasp/r/weights/latest/actor/3.gpu") == account(
         "congrasp/r/weights/latest/actor/3.b"
     )

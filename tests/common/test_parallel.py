@@ -213,8 +213,8 @@ def test_quotas_of_control_groups_count(membership, files, expected, monkeypatch
     cores.
     """
     monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1, 2})
-    monkeypatch.setattr(parallel, "_GROUPS", tmp_path)
-    monkeypatch.setattr(parallel, "_MEMBERSHIP", tmp_path / "membership")
+    monkeypatch.setattr(parallel, "CGROUPS", tmp_path)
+    monkeypatch.setattr(parallel, "CGROUP_MEMBERSHIP", tmp_path / "membership")
     (tmp_path / "membership").write_text(membership)
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 import functools
 import io
 import os
+import pathlib
 import pickle
 import re
 import threading
@@ -70,7 +71,8 @@ def test_the_process_imports_no_package_but_numpy(tmp_path):
         "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='__main__'); "
         "print(*sys.modules)"
     )
-    files = pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"
+    program = pathlib.Path(pickles.__file__).with_name("unpickle.py")
+    files = program, tmp_path / "pickles.zip", tmp_path / "answer.npz"
     modules = python("-c", listed, *files, 1 << 30, 10, 1 << 20).stdout.split()
     assert "numpy" in modules
     assert not {"jax", "congrasp", "scipy", "zenoh"}.intersection(modules)
@@ -240,8 +242,8 @@ _TENSOR = Reduced(
     ],
 )
 def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
-    monkeypatch.setattr(pickles, "_MAX_PROCESSOR_S", 1)
-    monkeypatch.setattr(pickles, "_MAX_MEMORY_BYTES", 1 << 30)
+    monkeypatch.setattr(pickles, "MAX_PROCESSOR_S", 1)
+    monkeypatch.setattr(pickles, "MAX_MEMORY_BYTES", 1 << 30)
     said = limited(parse, data)
     assert said.startswith("CongraspError: a.pkl"), said
     assert re.search(word, said), said

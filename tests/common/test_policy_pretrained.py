@@ -29,7 +29,7 @@ ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
 
 def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_FOLDER", tmp_path)
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
     given = tmp_path / "mine.safetensors"
     assert policy_file(given) == given
     with pytest.raises(
@@ -64,7 +64,7 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     # Another hand of the same name as one of the package does not get the package's policy.
     (tmp_path / "human.json").write_text(hand_text(get_hand("human")))
     assert pretrained_file(str(tmp_path / "human.json")) is None
-    assert pretrained_file("human").parent == module._FOLDER
+    assert pretrained_file("human").parent == module.FOLDER
     # Nor has a hand that was changed since the policy of the hand as it was before.
     (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(mine, object_scale=0.9)))
     get_hand.cache_clear()
@@ -81,9 +81,9 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
         pathlib.Path("congrasp/common/policy", pattern)
         for pattern in data["congrasp.common.policy"]
     ]
-    assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
+    assert [module.FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
-    assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
+    assert {path.stem for path in module.FOLDER.glob("*.safetensors")} == {
         f"{hand}{kind}"
         for hand in pretrained_hands()
         for kind in ("", "-reference", "-student", "-camera")
@@ -92,13 +92,13 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand
 
 
-@pytest.mark.parametrize("file", sorted(module._FOLDER.glob("*.safetensors")), ids=lambda f: f.stem)
+@pytest.mark.parametrize("file", sorted(module.FOLDER.glob("*.safetensors")), ids=lambda f: f.stem)
 def test_shipped_policy_has_no_critic(file):
     assert not bundles.load(file).has_critic
 
 
 def test_shipping_leaves_out_the_critic(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(module, "_FOLDER", tmp_path)
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
     task = TaskConfig(constraints=("heading",))
     trained = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4)))
     bundles.save(trained, tmp_path / "run.safetensors")
@@ -114,7 +114,7 @@ def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "allegro-student"
     file = named_policy(name)
-    assert file == policy_file(pathlib.Path(name)) == module._FOLDER / f"{name}.safetensors"
+    assert file == policy_file(pathlib.Path(name)) == module.FOLDER / f"{name}.safetensors"
     student = bundles.load(file).task
     teacher = bundles.load(policy_file(None, "allegro")).task
     assert student.observation == "tracked"

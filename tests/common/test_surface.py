@@ -1,7 +1,6 @@
 """Signed distance and normals of surfaces, against closed forms, known points and exact queries."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.objects import procedural, shapes
-from congrasp.common.objects.distance import MARGIN, DistanceField, _least, _slots, distance_field
+from congrasp.common.objects.distance import (
+    MARGIN,
+    DistanceField,
+    distance_field,
+    primitive_distance,
+)
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.normals import estimated_normals
 
@@ -42,10 +46,6 @@ def at(field: DistanceField, points: np.ndarray, index: int = 0) -> np.ndarray:
 
 
 _at = jax.jit(DistanceField.at)
-
-
-def primitive_distance(pieces: Sequence[Piece], points: np.ndarray) -> np.ndarray:
-    return np.asarray(_least(_slots(pieces), points.astype(np.float32)))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@ and end.
 """
 
 import contextlib
-import functools
 import os
 import signal
 import socket
@@ -24,6 +23,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_session import STAMP, LostSamples
 from congrasp.common.transport.zenoh_transport import MessageLimits, ZenohTransport
 from congrasp.common.wire.codec import Message, encode
+from tests.modules import fresh_copy
 from tests.socket_transport import SocketListener, SocketTransport
 from tests.waits import eventually, together
 
@@ -375,7 +375,7 @@ def test_damaged_and_oversized_messages_are_refused():
             lambda key, message: message,
             on_damage=lambda key, error: damaged.append(str(error)),
         )
-        session = client._session(KEYS.act)
+        session = client.session(KEYS.act)
         whole = encode(Message({"x": np.zeros(8)}))
         for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
             reply = next(iter(session.get(KEYS.act, payload=payload, timeout=60)))
@@ -515,7 +515,7 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     threads, settings = subprocess.run(
         command, capture_output=True, env=env, check=True
     ).stdout.split(b" ", 1)
-    assert int(threads) > zenoh_session._CLOSERS
+    assert int(threads) > zenoh_session.CLOSERS
     assert b"tx: (worker_threads: 2)" in settings
 
 
@@ -545,13 +545,14 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     ],
 )
 def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sound):
-    monkeypatch.setattr(zenoh_session, "_RUNTIME", given)
+    monkeypatch.setenv("ZENOH_RUNTIME", given)
+    session = fresh_copy(zenoh_session)
     with (
         contextlib.nullcontext()
         if sound
         else pytest.raises(CongraspError, match=r"ZENOH_RUNTIME is '.*Unset it")
     ):
-        zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
+        session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
 
 
 @pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
@@ -564,13 +565,9 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
     monkeypatch.setattr(
         zenoh_session.resource, "setrlimit", lambda kind, limit: limits.append(limit)
     )
-    monkeypatch.setattr(
-        zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__)
-    )
+    session = fresh_copy(zenoh_session)
     for _ in range(2):
-        settings = zenoh_session.configuration(
-            "policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None
-        )
+        settings = session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
     taken = [
         int(settings.get_json(f"transport/unicast/{name}"))
         for name in ("accept_pending", "max_sessions")

@@ -51,7 +51,7 @@ from congrasp.services.record.reader import read_episodes, read_metrics
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
-from congrasp.services.serve.server import PolicyServer
+from congrasp.services.serve.server import checked_timeout
 from congrasp.services.train.command import untrained
 from tests.episodes import episode, episode_message
 from tests.rollouts import bundle, learner_hub, rollout
@@ -247,7 +247,7 @@ def served(endpoint, folder):
     """
 
     def act(key, request):
-        PolicyServer._deadline(request.meta.get("timeout", 1.0))
+        checked_timeout(request.meta.get("timeout", 1.0))
         LAYOUT.parse(request)
         return Message()
 
@@ -280,7 +280,7 @@ def test_mutated_messages_at_every_key(tmp_path):
             key, message = rng.choice(asked if rng.random() < 0.7 else told)
             name = f"{rng.randrange(2000)}.x"
             meta = {k: name if v == "NAME" else v for k, v in message.meta.items()}
-            session = raw._session(key)
+            session = raw.session(key)
             data, key = mutated(rng, Message(message.arrays, meta)), key.replace("NAME", name)
             if "/log/" in key or "announce" in key:
                 session.put(key, data, attachment=rng.choice([None, b"", rng.randbytes(16)]))
@@ -304,7 +304,7 @@ def test_mutated_messages_at_every_key(tmp_path):
             sent += 1
             if sent % 50 == 0:
                 shown = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
-                token = raw._session(KEYS.status).liveliness().declare_token(shown)
+                token = raw.session(KEYS.status).liveliness().declare_token(shown)
                 token.undeclare() if rng.random() < 0.5 else None
                 assert hub.status()["run"] == "chaos"
             if not first and time.monotonic() > began + SECONDS / 3:

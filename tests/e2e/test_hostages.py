@@ -86,7 +86,7 @@ def test_peers_that_ask_for_weights_without_end_are_put_off():
     ):
         link.config(10)
         _updates(link, run, 900_000, 20)
-        assert run.hub._pull_limit.rejected > 0
+        assert run.hub.pull_limit.rejected > 0
 
 
 def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():

@@ -235,10 +235,10 @@ MAY_ASK_THE_POLICY = {
 
 
 def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(run):
-    learner = str(run.transport._session(KEYS.config).info.zid())
+    learner = str(run.transport.session(KEYS.config).info.zid())
 
     def answered(transport, key):
-        replies = transport._session(key).get(
+        replies = transport.session(key).get(
             key.replace("{learner}", learner), FifoChannel(8), timeout=3.0
         )
         return bool(list(replies))  # an empty question is answered with an error in words
@@ -513,7 +513,7 @@ def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
         ) as thief:
             for key in (KEYS.config, KEYS.ticket(ME)):
                 thief.serve(key, lambda key, request: asked.append(key) or Message())
-            eventually(lambda: list(thief._sessions.get("control").info.links()))
+            eventually(lambda: list(thief.session(KEYS.config).info.links()))
             time.sleep(0.3)
             assert answers(actor, KEYS.config) is None
             assert answers(actor, KEYS.ticket(ME)) is None
@@ -642,7 +642,7 @@ def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, fresh,
     assert answers(client, key)
     revoke(certs, "server", 0)
 
-    eventually(client._sessions.closed.is_set)
+    eventually(lambda: client.closed)
     for _ in range(2):
         with pytest.raises(
             CongraspError, match=r"The listener\'s certificate safe\.server\.0 is revoked"
@@ -677,7 +677,7 @@ def test_what_is_too_long_or_too_often_is_dropped(fresh):
     long = Message({"x": np.zeros(100_000, np.uint8)})
     assert answers(actor, KEYS.config, long) is None
     assert answers(actor, KEYS.ticket(ME), long) is None
-    session = observer._session(KEYS.status)
+    session = observer.session(KEYS.status)
     question = encode(Message())
     channels = [
         session.get(KEYS.status, FifoChannel(2), payload=question, timeout=5.0) for _ in range(300)

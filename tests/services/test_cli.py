@@ -584,18 +584,18 @@ def test_a_phase_without_counts_has_no_total(monkeypatch):
     with console.bars() as progress:
         phases = console.PhaseBar(progress, "Starting")
         phases.update("mug: Attempting", 360, 400)
-        assert console._current(progress) == "mug: Attempting, 360 of 400"
+        assert console.current_activity(progress) == "mug: Attempting, 360 of 400"
         phases.update("mug: Drawing", 0, 0)
-        assert console._current(progress) == "mug: Drawing"
+        assert console.current_activity(progress) == "mug: Drawing"
         phases.update("mug: Drawing", 1, 3)
-        assert console._current(progress) == "mug: Drawing, 1 of 3"
+        assert console.current_activity(progress) == "mug: Drawing, 1 of 3"
 
 
 def test_a_bar_without_a_step_shows_no_counts(monkeypatch):
     monkeypatch.setattr(console, "announced", lambda task: contextlib.nullcontext())
     with console.bars() as progress:
         task = progress.add_task("Episodes", total=12)
-        assert console._current(progress) == "Episodes"
-        assert str(console._Counts().render(progress.tasks[0])) == ""
+        assert console.current_activity(progress) == "Episodes"
+        assert str(console.Counts().render(progress.tasks[0])) == ""
         progress.update(task, completed=3)
-        assert "3/12" in str(console._Counts().render(progress.tasks[0]))
+        assert "3/12" in str(console.Counts().render(progress.tasks[0]))

@@ -41,7 +41,7 @@ def weigh(monkeypatch, tmp_path):
     (tmp_path / "weigh.py").write_text(textwrap.dedent(FILE))
     monkeypatch.setattr(cli, "__path__", [*cli.__path__, str(tmp_path)])
     monkeypatch.setitem(main.COMMANDS, "weigh", "the mass of a box")
-    monkeypatch.setattr(main, "_prepare_environment", lambda: None)
+    monkeypatch.setattr(main, "prepare_environment", lambda: None)
 
 
 def test_it_runs_and_its_options_follow_from_its_signature(capsys):

@@ -466,8 +466,8 @@ def test_a_bvh_that_is_none_is_one_line(tmp_path, before, after):
 
 
 def test_motions_of_others_are_of_bounded_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(bvh, "_MAX_BYTES", 100)
-    monkeypatch.setattr(wrist_paths, "_MAX_CSV_BYTES", 100)
+    monkeypatch.setattr(bvh, "MAX_BYTES", 100)
+    monkeypatch.setattr(wrist_paths, "MAX_CSV_BYTES", 100)
     for name in ("x.bvh", "x.csv"):
         (tmp_path / name).write_text("0,0,0,1,0,0,0\n" * 20)
         refused(wrist_paths.read_wrist_path, tmp_path / name, "bytes; the limit is 100")

@@ -38,7 +38,7 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setattr(bank_cache, "LEAST_OBJECTS", 1)
-        patch.setattr(references, "_MAX_ATTEMPTS", 2)
+        patch.setattr(references, "MAX_ATTEMPTS", 2)
         patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=8)})
         yield
 
@@ -208,15 +208,15 @@ def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
 def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, monkeypatch):
     variations = [Variation("affordance"), Variation()]
     simulated = []
-    run = Experiment._run
+    sample = Experiment.sample
 
-    def stopping(own, running, variation, *arguments):
+    def stopping(experiment, simulator, variation, *arguments):
         simulated.append(variation.constraint)
         if simulated == ["affordance", "heading"]:
             raise KeyboardInterrupt
-        return run(own, running, variation, *arguments)
+        return sample(experiment, simulator, variation, *arguments)
 
-    monkeypatch.setattr(Experiment, "_run", stopping)
+    monkeypatch.setattr(Experiment, "sample", stopping)
     with pytest.raises(KeyboardInterrupt):
         experiment.run(variations, stored=tmp_path)
     rows = [result.row.to_json() for result in experiment.run(variations, stored=tmp_path)]

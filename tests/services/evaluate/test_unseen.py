@@ -181,7 +181,7 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
 
 
 def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
-    monkeypatch.setattr(of_objects, "_MAX_OBJECTS_OF_FOLDER", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_OF_FOLDER", 2)
     for obj in OBJECTS:
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
@@ -196,7 +196,7 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
-    monkeypatch.setattr(of_objects, "_MAX_OBJECTS_ELSEWHERE", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_ELSEWHERE", 2)
     pools = procedural_pools(5, "native", "development")
     objects = [make().objects for make in pools.make]
     assert pools.size == 2

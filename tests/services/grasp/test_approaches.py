@@ -41,7 +41,7 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
     draft = Draft(
         (box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0)))
     )
-    cup = procedural._build("cup", "mug", draft, np.random.default_rng(0))
+    cup = procedural.build_object("cup", "mug", draft, np.random.default_rng(0))
     assert cup is not None
     face = cup.pieces[0].pos[0] + 0.04
     avoid = cup.points[:, 0] < face + 0.001
@@ -68,4 +68,4 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
     ],
 )
 def test_a_remedy_names_the_options_that_were_given(asked: GraspRequest, remedy: str) -> None:
-    assert approaches._remedy(asked, "scale it") == remedy
+    assert approaches.remedy_for(asked, "scale it") == remedy

@@ -76,7 +76,7 @@ def test_files_round_trip(constraint_sets, file):
 
 
 def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("congrasp.services.viz.constraint_sheet._SIZE", (48, 36))
+    monkeypatch.setattr("congrasp.services.viz.constraint_sheet.SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out

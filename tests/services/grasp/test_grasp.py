@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ from congrasp.services.grasp.files import (
     RESULT,
     save_grasp,
 )
-from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.grasper import Grasper, limiting_cause
 from congrasp.services.grasp.keys import identity_of_text
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.parse import read_request
@@ -114,11 +113,14 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
 
 def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
     begun = []
-    given = attempts._requested
-    monkeypatch.setattr(
-        attempts, "_requested", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
-    )
-    monkeypatch.setattr(grasper, "_left", True)
+    conditions_of = attempts.conditions_of
+
+    def recorded(*arguments):
+        begun.append(conditions_of(*arguments))
+        return begun[-1]
+
+    monkeypatch.setattr(attempts, "conditions_of", recorded)
+    monkeypatch.setattr(grasper, "left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
@@ -162,18 +164,13 @@ def test_costs_of_attempts():
     np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
 
 
-def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
+def test_the_cause_of_failures_is_weight_or_width(block):
     """Attempts hold objects that are light or narrow enough; the cause is the limit that was
     exceeded.
     """
-    four = Grasper(bundles.load(policy_file(None)), attempts=4)
 
     def cause(request, may_be_held):
-        def run(obj, episodes, progress):
-            return SimpleNamespace(metrics={"held": np.full(4, float(may_be_held(obj)))})
-
-        monkeypatch.setattr(four._attempts, "run", run)
-        return four._cause(block, request, lambda what, done, total: None)
+        return limiting_cause(block, request, lambda obj, _: np.full(4, may_be_held(obj)))
 
     free = GraspRequest()
     light = 0.3 * block.mass

@@ -2,6 +2,7 @@
 hand.
 """
 
+import errno
 import itertools
 import json
 import os
@@ -15,7 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io import journal as journal_module
 from congrasp.common.io.journal import AUDIT, Journal
+from congrasp.common.io.opening import open_to_append
 from congrasp.learner.run_directory import note_version
 from congrasp.services.cli.audit import audit as command
 from congrasp.services.ops.audit import compare as audit
@@ -196,16 +199,34 @@ def test_loss_surplus_and_damage_have_exit_codes_of_their_own(run_dir, tmp_path)
         assert command(other) == code
 
 
-def test_what_a_torn_line_told_is_no_surplus(run_dir):
-    """The disk was full for two lines of an actor's journal, and took a part of the first: it is
-    among the two.
-    """
+class FullOnce:
+    """A journal's file on a disk that is full at the first line."""
+
+    def __init__(self, file):
+        self.file = file
+        self.is_full = True
+
+    def write(self, line):
+        if self.is_full:
+            self.is_full = False
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self.file.write(line)
+
+    def close(self):
+        self.file.close()
+
+
+def test_a_torn_line_counts_among_the_lost_lines(run_dir, monkeypatch):
+    """The disk was full for two lines of an actor's journal, and took a part of the first."""
     learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
     path = run_dir / AUDIT / "a.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join([*lines[:5], lines[5][:20]]))
+    monkeypatch.setattr(
+        journal_module, "open_to_append", lambda path: FullOnce(open_to_append(path))
+    )
     journal = Journal(path)
-    journal._lost = 2
+    journal.write(answer=0)
     journal.write(answer=1, outcome="accepted", session_id="x", actor="a", incarnation="1")
     report = audit(run_dir)
     assert report.holes == 2

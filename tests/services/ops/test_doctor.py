@@ -71,13 +71,13 @@ def test_a_package_that_is_missing_comes_with_the_command_that_installs_it(monke
 
 
 def test_a_port_in_use_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_PORT", free_port())
+    monkeypatch.setattr(doctor, "PORT", free_port())
     assert "are free" in findings()["ports"].text
     with socket.socket() as busy:
-        busy.bind(("127.0.0.1", doctor._PORT))
+        busy.bind(("127.0.0.1", doctor.PORT))
         busy.listen()
         found = findings()["ports"]
-    assert f"{doctor._PORT} is in use" in found.text
+    assert f"{doctor.PORT} is in use" in found.text
     assert "--listen" in found.text
 
 
@@ -88,11 +88,11 @@ def _slow(patch):
 
 
 CHECKS = {
-    "python": doctor._python,
-    "gpu": doctor._gpu,
-    "jax": doctor._jax,
-    "disk": lambda: doctor._disk(pathlib.Path()),
-    "clock": doctor._clock,
+    "python": doctor.check_python,
+    "gpu": doctor.check_gpu,
+    "jax": doctor.check_jax,
+    "disk": lambda: doctor.check_disk(pathlib.Path()),
+    "clock": doctor.check_clock,
 }
 CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda form: "now"}
 
@@ -119,8 +119,16 @@ CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda 
             "3.10.4: 3.11, 3.12",
             lambda m: m.setattr(doctor.platform, "python_version", lambda: "3.10.4"),
         ),
-        ("jax", "NVIDIA GPU is not found", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
-        ("gpu", "install the NVIDIA driver", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
+        (
+            "jax",
+            "NVIDIA GPU is not found",
+            lambda m: m.setattr(doctor, "NVIDIA_DEVICE", os.devnull),
+        ),
+        (
+            "gpu",
+            "install the NVIDIA driver",
+            lambda m: m.setattr(doctor, "NVIDIA_DEVICE", os.devnull),
+        ),
         ("jax", "RuntimeError: no such device", lambda m: m.setattr(jax, "devices", _broken)),
     ],
 )
@@ -129,7 +137,7 @@ def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
         monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
     with monkeypatch.context() as change:
         patch(change)
-        (found,) = doctor._tried(CHECKS[what])
+        (found,) = doctor.run_check(CHECKS[what])
     assert found.what == what, found.text
     assert not found.fine, found.text
     assert re.search(words, found.text), found.text
@@ -141,11 +149,11 @@ def _broken():
 
 def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
     answer = "NVIDIA H100, 81559, 1024, 535.1\nNVIDIA H100, 81559, 0, 580.65\n"
-    monkeypatch.setattr(doctor, "_NVIDIA", os.devnull)
+    monkeypatch.setattr(doctor, "NVIDIA_DEVICE", os.devnull)
     monkeypatch.setattr(
         subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer)
     )
-    found = {finding.what: finding for finding in doctor._gpu()}
+    found = {finding.what: finding for finding in doctor.check_gpu()}
     assert not found["gpu 0"].fine
     assert "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
     assert found["gpu 1"].fine
@@ -153,13 +161,13 @@ def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
 
 
 def test_certificates_are_looked_at(tmp_path):
-    (none,) = doctor._certificates(tmp_path)
+    (none,) = doctor.check_certificates(tmp_path)
     assert not none.fine
     assert "congrasp certs init" in none.text
     create_authority(tmp_path)
     issue(tmp_path, "actor", days=100.0)
     issue(tmp_path, "observer", days=3.0)
-    found = {finding.text.split(":")[0]: finding for finding in doctor._certificates(tmp_path)}
+    found = {finding.text.split(":")[0]: finding for finding in doctor.check_certificates(tmp_path)}
     actor = found["quickstart.actor.0"]
     observer = found["quickstart.observer.0"]
     assert actor.fine
@@ -171,15 +179,15 @@ def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
         hub = learner_hub(server, "r").hub
-        assert [finding.fine for finding in doctor._learner(endpoint, "r")] == [True, True]
+        assert [finding.fine for finding in doctor.check_learner(endpoint, "r")] == [True, True]
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})
-        _, clock = doctor._learner(endpoint, "r")
+        _, clock = doctor.check_learner(endpoint, "r")
         assert not clock.fine
         assert clock.text.startswith(("+7.0", "+6.9"))
-        (other,) = doctor._learner(endpoint, "other")
+        (other,) = doctor.check_learner(endpoint, "other")
         assert not other.fine
         assert "No response for congrasp/other/status" in other.text
-    (unreached,) = doctor._learner(endpoint, "r")
+    (unreached,) = doctor.check_learner(endpoint, "r")
     assert not unreached.fine
     assert "Start the learner" in unreached.text

@@ -70,10 +70,10 @@ def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     with listening(tmp_path / "run", endpoint):
         assert Status(tmp_path / "run", json=True)() == 0
         assert json.loads(capsys.readouterr().out)["roles"][0]["id"] == "worker-7"
-        page = View()._of_folder(tmp_path / "run")
+        page = View().of_folder(tmp_path / "run")
         assert page == View(connect=endpoint, run="r", recordings=tmp_path / "run")
     (tmp_path / "run" / POLICY_FILE).touch()
-    page = View()._of_folder(tmp_path / "run")
+    page = View().of_folder(tmp_path / "run")
     assert page == View(run="r", policy=tmp_path / "run" / POLICY_FILE, recordings=tmp_path / "run")
 
 

@@ -177,7 +177,7 @@ def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
 
 
 def test_a_live_view_bounds_what_waits(monkeypatch):
-    monkeypatch.setattr("congrasp.services.record.live._BYTES", 1 << 20)
+    monkeypatch.setattr("congrasp.services.record.live.MAX_QUEUED_BYTES", 1 << 20)
     convert = Converter()
     with LiveServer(0) as server:
         # To be sent in a hundred years

@@ -228,7 +228,7 @@ def test_viewer_of_another_address_is_admitted_when_full() -> None:
 
 def test_viewer_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits for it is limited, and another viewer misses nothing."""
-    monkeypatch.setattr("congrasp.services.record.live_gate._UNREAD_S", 1.0)
+    monkeypatch.setattr("congrasp.services.record.live_gate.UNREAD_S", 1.0)
     entries = 48
     text = "x" * (1 << 20)
     channels = JsonChannels()

@@ -86,7 +86,7 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
 @pytest.fixture
 def several(monkeypatch):
     """However long ago another peer has asked, it counts."""
-    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6)
+    monkeypatch.setattr("congrasp.services.serve.batching.ALONE_S", 1e6)
 
 
 class Letters(Gate):

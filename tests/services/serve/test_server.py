@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import pathlib
 import threading
-import types
 from unittest import mock
 
 import numpy as np
@@ -22,7 +21,6 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
-from congrasp.services.serve.requests import Query
 from congrasp.services.serve.server import (
     DEPTH,
     SHARE,
@@ -30,6 +28,7 @@ from congrasp.services.serve.server import (
     PolicyServer,
     follow_file,
     follow_run,
+    join_parts,
 )
 from congrasp.services.train.command import untrained
 from tests import task
@@ -110,7 +109,7 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
     served, monkeypatch
 ):
     path, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
     policy = task.policy()
     swapped = threading.Event()
 
@@ -151,7 +150,7 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
 ):
     """Beside other clients the eleven are inferred in three parts."""
     _, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
+    monkeypatch.setattr("congrasp.services.serve.batching.ALONE_S", 1e6 if beside_others else 0.0)
     if beside_others:
         with PolicyClient(endpoint, timeout=5.0) as other:
             other.reset(episode.request)
@@ -176,18 +175,20 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
 
 
-def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
-    old = object()
+def part_of_answer(policy: object, value: float) -> Answer:
+    return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
+
+
+def test_a_query_answered_in_parts_by_two_policies_is_repeated():
+    parts = [part_of_answer(object(), 1.0), part_of_answer(object(), 2.0)]
+    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), object(), 0.25, 0.75)
+    assert join_parts(parts, lambda: repeated) is repeated
+
+
+def test_parts_of_an_answer_by_one_policy_are_joined():
     new = object()
-
-    def part(policy: object, value: float) -> Answer:
-        return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
-
-    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
-    server = types.SimpleNamespace(_infer=lambda queries, queued: [repeated])
-    query = Query(np.zeros((4, 5), np.float32), ())
-    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is repeated
-    joined = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+    parts = [part_of_answer(new, 1.0), part_of_answer(new, 2.0)]
+    joined = join_parts(parts, lambda: pytest.fail("the query is repeated"))
     np.testing.assert_array_equal(joined.inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
     assert joined.inference.active == [["x"]] * 4
     assert joined.policy is new
@@ -280,7 +281,7 @@ def test_following_a_run_pulls_only_what_is_newer():
 
 def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
     """Its policy stays until the learner answers again with a newer one."""
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
     monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
     first = task.policy()
     newer = dataclasses.replace(first, version=first.version + 1)

@@ -80,7 +80,9 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None
 def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> None:
     policy = PolicyGrasping(Source(), "file")
     studio = Studio(policy.hand, policy.task, objects().get("mug"))
-    episodes, aside = grasping._episodes(policy.hand, policy.task, studio.labelled, studio.request)
+    episodes, aside = grasping.varied_episodes(
+        policy.hand, policy.task, studio.labelled, studio.request
+    )
     goal = episodes.goal["heading"]
     np.testing.assert_allclose(goal.position[0], studio.arrow.position, atol=1e-6)
     np.testing.assert_allclose(goal.direction[0], studio.arrow.direction, atol=1e-6)
@@ -105,9 +107,9 @@ def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> N
 def test_the_drawn_grasp_is_shown_unless_a_variation_is_clearly_better(held, error, index, says):
     found = outcome(held, error)
     removal = int(found.trace.table[:, 0].sum()) - 1
-    assert grasping._best(found, (), removal, 0.0) == index
-    assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
-    assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))
+    assert grasping.best_attempt(found, (), removal, 0.0) == index
+    assert says in grasping.variation_note(found, index, np.full(ATTEMPTS, 0.004))
+    assert bool(says) == bool(grasping.variation_note(found, index, np.full(ATTEMPTS, 0.004)))
 
 
 def test_a_job_shows_its_elapsed_seconds() -> None:

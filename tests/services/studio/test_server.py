@@ -28,7 +28,7 @@ from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
+from congrasp.services.studio.server import STATIC, BoundedServer, PageServer, Routes
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
@@ -174,7 +174,7 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_hundred_simultaneous_connections_are_accepted() -> None:
     with (
-        _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server,
+        BoundedServer(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server,
         contextlib.ExitStack() as stack,
     ):
         for _ in range(100):  # none is accepted yet
@@ -203,7 +203,7 @@ def test_browser_of_another_address_is_served_when_full() -> None:
 
 def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its bytes come too often for the limit of silence."""
-    monkeypatch.setattr(server_module, "_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(server_module, "TIMEOUT_S", 0.5)
     with (
         contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
         socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as slow,

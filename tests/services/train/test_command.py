@@ -17,7 +17,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.learner.run_directory import create_run
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
-from congrasp.services.train.command import EPISODE, _next_steps, _Progress
+from congrasp.services.train.command import EPISODE, TrainingProgress, print_next_steps
 from congrasp.services.train.launch import (
     Launch,
     LaunchRecord,
@@ -26,6 +26,7 @@ from congrasp.services.train.launch import (
 )
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import ProcessDied
+from tests.waits import eventually
 
 LAUNCH = Launch(actors=1)
 # 40 steps an update
@@ -62,7 +63,7 @@ def status(update, **values):
 def test_progress_counts_the_time_left_from_the_first_update(said, clock):
     with stage("a stage"):
         pass
-    with _Progress(CONFIG) as progress:
+    with TrainingProgress(CONFIG) as progress:
         clock.seconds += 30  # compiling
         progress.show({"actors": 2})
         clock.seconds += 30
@@ -98,7 +99,7 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
 
 
 def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
-    with _Progress(CONFIG) as progress:
+    with TrainingProgress(CONFIG) as progress:
         for _ in range(22):
             clock.seconds += 1.0
             progress.show({"actors": 1})
@@ -121,17 +122,16 @@ def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
         soft_wrap=command.console.soft_wrap,
     )
     monkeypatch.setattr(command, "console", narrow)
-    with _Progress(CONFIG) as progress:
+    with TrainingProgress(CONFIG) as progress:
         progress.show(status(1))
-        progress._live._live.refresh()
-        assert "left ?" in output.getvalue()
+        eventually(lambda: "left ?" in output.getvalue())
 
 
 def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
     from congrasp.services.cli.main import COMMANDS
 
     (tmp_path / EPISODE).touch()
-    _next_steps(tmp_path)
+    print_next_steps(tmp_path)
     assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
     commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
     assert commands

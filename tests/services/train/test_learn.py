@@ -71,8 +71,10 @@ def machine(tmp_path, monkeypatch):
 
     def become(name, version="1.2"):
         folders = {kind: tmp_path / name / "caches" / kind for kind in ("jax", "warp")}
-        monkeypatch.setattr(cache_archive, "_folders", lambda: folders)
-        monkeypatch.setattr(cache_archive, "_machine", lambda: {"JAX": version, "device": "GPU"})
+        monkeypatch.setattr(cache_archive, "cache_folders", lambda: folders)
+        monkeypatch.setattr(
+            cache_archive, "machine_facts", lambda: {"JAX": version, "device": "GPU"}
+        )
         return tmp_path / name
 
     return become

@@ -221,7 +221,7 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(
     (run_dir / "mark").touch()
     first = max(int(file.stem.rpartition("_")[2]) for file in written())
 
-    monkeypatch.setattr(own_hand, "_report", lambda *arguments: None)
+    monkeypatch.setattr(own_hand, "write_report", lambda *arguments: None)
     last = first + 2
     options = ("--updates", str(last))
     policy = train_hand(request(claw, out, options=options, patience=200.0), lambda text: None)

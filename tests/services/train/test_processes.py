@@ -63,7 +63,7 @@ def supervise(tmp_path: pathlib.Path):
         for child in children:
             child.start()
         with MemoryTransport(MemoryHub()) as transport:
-            processes._supervise(
+            processes.supervise(
                 children, [], transport, "run", threading.Event(), lambda status: None, notes.append
             )
         return notes
@@ -127,7 +127,7 @@ DIES = "raise SystemExit(9)"
 @pytest.fixture
 def storm(tmp_path, monkeypatch):
     """Supervises a learner and an actor, one of which dies; progress is published or not."""
-    monkeypatch.setattr(processes, "_MAX_PAUSE_S", 1.0)
+    monkeypatch.setattr(processes, "MAX_PAUSE_S", 1.0)
     children: list[Script] = []
 
     def run(role: str, deaths: int, *, progress: bool) -> list[str]:
@@ -153,7 +153,7 @@ def storm(tmp_path, monkeypatch):
                 if role == "actor" and len(notes) == deaths:
                     stop.set()
 
-            processes._supervise(
+            processes.supervise(
                 [learner], [actor], transport, "run", stop, lambda status: None, note
             )
         return notes
@@ -176,7 +176,7 @@ def test_deaths_without_progress_end_a_run(storm, role):
 @pytest.mark.parametrize(("visible", "names"), [("", ["0", "1"]), ("4,GPU-7", ["4", "GPU-7"])])
 def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert [processes._gpu(rank) for rank in range(2)] == names
+    assert [processes.gpu_of_rank(rank) for rank in range(2)] == names
 
 
 # --- trainings of a reproduction ---
@@ -205,7 +205,7 @@ def scripts(monkeypatch):
             return [sys.executable, "-c", chosen[self.name], folder]
 
     monkeypatch.setattr(background, "Child", Training)
-    monkeypatch.setattr(lifetime, "_POLL", 0.05)
+    monkeypatch.setattr(lifetime, "POLL_S", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
 
