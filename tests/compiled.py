@@ -22,9 +22,9 @@ class Compiled:
         self._given = given
 
     def __getattr__(self, name: str) -> Any:
-        found = jax.jit(functools.partial(getattr(self._module, name), *self._given))
-        setattr(self, name, found)
-        return found
+        program = jax.jit(functools.partial(getattr(self._module, name), *self._given))
+        setattr(self, name, program)
+        return program
 
 
 def program_count(function: Any) -> int:

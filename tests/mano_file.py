@@ -78,13 +78,16 @@ def sparse(matrix: np.ndarray) -> Reduced:
     return Reduced("scipy.sparse.csc csc_matrix", (), state, new=True)
 
 
-def selection(chosen: np.ndarray, whole: np.ndarray) -> Reduced:
+def selection(chosen: np.ndarray, values: np.ndarray) -> Reduced:
     """The first columns of `whole` as chumpy keeps them: a variable, indices into it, and a
     shape.
     """
-    index = np.arange(whole.size).reshape(whole.shape)[..., : chosen.shape[-1]].ravel()
+    index = np.arange(values.size).reshape(values.shape)[..., : chosen.shape[-1]].ravel()
     inside = Reduced(
-        "chumpy.ch Ch", (), {"x": whole, "_dirty_vars": Reduced("__builtin__ set", ([],))}, new=True
+        "chumpy.ch Ch",
+        (),
+        {"x": values, "_dirty_vars": Reduced("__builtin__ set", ([],))},
+        new=True,
     )
     state = {"a": inside, "idxs": index, "preferred_shape": chosen.shape}
     return Reduced("chumpy.reordering Select", (), state, new=True)
@@ -146,9 +149,9 @@ def content(seed: int = 0) -> dict[str, Any]:
 def mano_pickle(values: dict[str, Any] | None = None) -> bytes:
     """The file's bytes."""
     values = dict(values or content())
-    whole = values.pop("all_directions")
+    directions = values.pop("all_directions")
     if "shapedirs" in values:
-        values["shapedirs"] = selection(values["shapedirs"], whole)
+        values["shapedirs"] = selection(values["shapedirs"], directions)
     if "J_regressor" in values:
         values["J_regressor"] = sparse(values["J_regressor"])
     return dumps(values)

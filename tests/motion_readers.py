@@ -237,8 +237,10 @@ def read_lerobot(path: pathlib.Path) -> list[Track]:
             else palm
         )
         poses = forward_kinematics(urdf, values, palm, links[0], base)
-        kept = {name: pose for name, pose in poses.items() if name in links} | {"object": thing}
-        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
+        link_poses = {name: pose for name, pose in poses.items() if name in links} | {
+            "object": thing
+        }
+        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], link_poses))
     return tracks
 
 

@@ -48,9 +48,9 @@ def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def pointing(z: float) -> jax.Array:
     """(4,) orientation of a human wrist whose heading points up (1) or down (-1)."""
     frame = grasp_frame(HAND)
-    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
+    hand_frame = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
     target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
-    return rotations.multiply(target, rotations.conjugate(own))
+    return rotations.multiply(target, rotations.conjugate(hand_frame))
 
 
 def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:

@@ -55,7 +55,7 @@ class FakePolicy:
         progress("grasping", 0.5)
         if self.fails:
             raise RuntimeError(self.fails)
-        found = episode(
+        drawn_episode = episode(
             STEPS,
             removal=REMOVAL,
             mask=tuple(
@@ -63,8 +63,10 @@ class FakePolicy:
                 for name in ("affordance", "pose", "pose", "trajectory")
             ),
         )
-        metrics = {**found.metrics, "held": 1.0}
-        return dataclasses.replace(found, metrics=metrics, about={**found.about, "note": ""})
+        metrics = {**drawn_episode.metrics, "held": 1.0}
+        return dataclasses.replace(
+            drawn_episode, metrics=metrics, about={**drawn_episode.about, "note": ""}
+        )
 
 
 def objects() -> Catalogue:
@@ -161,8 +163,8 @@ def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
         actor = f"a{number:03d}"
         message = actor_episode(number)
         start = int(1e9 * when)
-        shown = scene_entries(actor, Episode.from_message(message), start, 0, channels)
-        writer.write(raw_entry(actor, message, start), *shown)
+        entries = scene_entries(actor, Episode.from_message(message), start, 0, channels)
+        writer.write(raw_entry(actor, message, start), *entries)
     writer.close()
 
 

@@ -55,9 +55,9 @@ def bank() -> ConstraintBank:
 
 def bank_of(index: int, points: int) -> ConstraintBank:
     """The constraint bank of one of `OBJECTS`, with its first surface points."""
-    own = jax.tree.map(lambda rows: rows[index : index + 1], bank())
-    return own._replace(
-        **{name: getattr(own, name)[:, :points] for name in ("points", "avoid", "normals")}
+    row = jax.tree.map(lambda rows: rows[index : index + 1], bank())
+    return row._replace(
+        **{name: getattr(row, name)[:, :points] for name in ("points", "avoid", "normals")}
     )
 
 
@@ -159,10 +159,11 @@ def episodes(
       episode_bank: a bank with the shapes of that of the suite; by default, that.
       task: another task, which costs another program.
     """
-    given, keys = placed(
+    placed_bank, keys = placed(
         (episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH)))
     )
     drawn = [
-        jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys
+        jax.device_get(programs(task=task).sample(placed_bank, key, np.array(False)))
+        for key in keys
     ]
     return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

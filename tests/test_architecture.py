@@ -56,7 +56,7 @@ def graph(everything: bool) -> dict[str, set[str]]:
         for path in trees(*FOLDERS)
     }
     names = {name.removesuffix(".__init__") for name in paths.values()}
-    found = {}
+    edges = {}
     for path, name in paths.items():
         tree = trees(*FOLDERS)[path]
         body = (
@@ -65,8 +65,8 @@ def graph(everything: bool) -> dict[str, set[str]]:
             else tree.body
         )
         targets = (t if t in names else t.rpartition(".")[0] for t in imported(body))
-        found[name.removesuffix(".__init__")] = {target for target in targets if target in names}
-    return found
+        edges[name.removesuffix(".__init__")] = {target for target in targets if target in names}
+    return edges
 
 
 def test_every_import_of_ours_exists():
@@ -144,12 +144,12 @@ RUNS_DATA = re.compile(
 
 def test_one_module_imports_what_can_run_code_out_of_data():
     """The child process with an allow-list."""
-    found = [
+    modules = [
         str(path.relative_to(ROOT))
         for path in trees(*FOLDERS)
         if RUNS_DATA.search(path.read_text())
     ]
-    assert found == ["common/io/unpickle.py"]
+    assert modules == ["common/io/unpickle.py"]
 
 
 OPENINGS = re.compile(r"(What|Whether|How|Who|Whoever|That|Where|When|Which|If|So)\b")
@@ -162,18 +162,18 @@ BANNED = re.compile(
 
 def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and text of every string of several words: docstrings, messages and help."""
-    for found in ast.walk(tree):
-        if isinstance(found, ast.Constant) and isinstance(found.value, str) and " " in found.value:
-            yield found.lineno, " ".join(found.value.split())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+            yield node.lineno, " ".join(node.value.split())
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and text of the docstrings of a module, its classes and functions, and of the strings
     under fields.
     """
-    for found in ast.walk(tree):
-        if isinstance(found, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            for statement in found.body:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            for statement in node.body:
                 if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
                     yield statement.lineno, str(statement.value.value).strip()
 
@@ -189,13 +189,13 @@ def test_the_rules_find_what_they_ban():
 @pytest.mark.parametrize(("read", "wrong"), [(docstrings, OPENINGS.match), (texts, BANNED.search)])
 def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
     modules = trees(*FOLDERS).items()
-    found = [
+    faults = [
         f"{path}:{line}: {text[:100]}"
         for path, tree in modules
         for line, text in read(tree)
         if wrong(text)
     ]
-    assert not found, "\n".join(found)
+    assert not faults, "\n".join(faults)
 
 
 def test_benchmarks_need_no_pytest():

@@ -86,11 +86,13 @@ def _sample(task: TaskConfig, bank: ConstraintBank, together: float) -> InitialC
 
 
 @jax.jit
-def _begun(surface: Surface, asked: Goal, constraints: dict[str, np.ndarray]) -> tuple[Any, ...]:
+def _begun(
+    surface: Surface, requested: Goal, constraints: dict[str, np.ndarray]
+) -> tuple[Any, ...]:
     """The goal after the priority rules, the fingers at the start, and the wrist that aligns them
     with the heading.
     """
-    goal = resolve(HAND, surface, asked, constraints).goal
+    goal = resolve(HAND, surface, requested, constraints).goal
     rest = jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1))
     q = initial_hand(HAND, TASK, goal, surface, rest)[0]
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, q)))

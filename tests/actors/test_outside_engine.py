@@ -62,10 +62,10 @@ def test_it_is_prepared_once_and_in_the_background(monkeypatch):
 
 @pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    own = Experiment(
+    experiment = Experiment(
         suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps
     )
-    (result,) = own.run([Variation()])
+    (result,) = experiment.run([Variation()])
     assert result.row.episodes == 2 * BATCH
     assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)
 

@@ -106,9 +106,9 @@ def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     np.testing.assert_allclose(np.min(ages, 0), 0.0, atol=1e-5)
     scene = worker.env.seen(state)
     np.testing.assert_array_equal(scene.state.object_position, 0.0)
-    own = evaluated(observation.observe, scene)
+    observation_vector = evaluated(observation.observe, scene)
     start = sum(size for name, size in observation.layout(HAND, TASK)[:1])
-    block = np.asarray(own[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
+    block = np.asarray(observation_vector[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
     features = scene.features
     expected = rotations.inverse_transform(
         features.wrist_position, features.wrist_quaternion, points

@@ -458,9 +458,11 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
             u=u, u_velocity=v, wrist_load=load, table=jnp.zeros(1, bool)
         )
         far = jnp.full(1, task.control.guidance_position_limit)
-        given = Guided(-u, far, v, state.table)
+        guided = Guided(-u, far, v, state.table)
         return (
-            u + wrist_lead(hand, task.control, given, jnp.zeros((1, 6))) + carried_lead(hand, state)
+            u
+            + wrist_lead(hand, task.control, guided, jnp.zeros((1, 6)))
+            + carried_lead(hand, state)
         )
 
     after = jax.jit(lambda momentum, u, v, target: track_load(hand, task, momentum, u, v, target))

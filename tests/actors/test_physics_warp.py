@@ -267,9 +267,9 @@ def test_rows_are_what_mujoco_compiles():
         filled = rows["geom_dataid"][n] >= 0 if meshed else rows["geom_rbound"][n] > 0.002
         assert filled.sum() == len(used)
         for name in ("geom_size", "geom_rbound", "geom_aabb"):
-            mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
+            row = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
             np.testing.assert_allclose(
-                mine, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6
+                row, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6
             )
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
@@ -297,10 +297,10 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
     *_, (x, y, _) = side_by_side(native(OBJECTS), step, mixed, started, targets)
     assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
     for name in ("contact_force", "object_position", "q"):
-        given = getattr(y, name)[mask]
+        of_warp = getattr(y, name)[mask]
         expected = getattr(x, name)[mask]
         np.testing.assert_allclose(
-            given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
+            of_warp, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
         )
     assert program_count(step) == 1
 
@@ -405,12 +405,12 @@ def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
     engine = native(OBJECTS)
     targets = [grasp(start, i) for i in range(5)]
     for _, after, _ in side_by_side(engine, warp.step, start, warp.start(start), targets):
-        found = [
+        counts = [
             sum(instance.data.ncon for instance in engine.instances),
             max(instance.data.nefc for instance in engine.instances),
         ]
         room = [4 * CONTACTS_PER_ENVIRONMENT, CONSTRAINTS_PER_ENVIRONMENT]
-        np.testing.assert_allclose(after.occupancy[:2], np.divide(found, room), rtol=1e-5)
+        np.testing.assert_allclose(after.occupancy[:2], np.divide(counts, room), rtol=1e-5)
 
 
 def test_what_had_no_room_is_counted(start, monkeypatch):

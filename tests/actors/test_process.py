@@ -69,7 +69,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         "errors": (T, len(metrics.specs(CONFIG.task))),
     }
     flags = {"table": np.zeros(T, bool), "terminal": np.arange(T) == T - 1}
-    given = {
+    arrays = {
         **FORM.zeros(),
         "episodes": episodes,
         "occupancy": np.zeros((T, 3), np.float32),
@@ -79,7 +79,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         ),
     }
     defaults = dict.fromkeys(Rollout._fields, np.zeros((T, B), np.float32))
-    return Rollout(**{**defaults, **given})
+    return Rollout(**{**defaults, **arrays})
 
 
 class InventedWorker:
@@ -129,14 +129,16 @@ def heard(monkeypatch):
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
         invented = types.SimpleNamespace(weight=np.ones(len(objects)))
-        found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
+        training = TrainingSet(
+            objects, lambda: pytest.fail("nothing is compiled"), lambda: invented
+        )
         numbers = []
         prepared = []
         monkeypatch.setattr(
             process, "prepare_physics", lambda *engine: prepared.append(len(numbers))
         )
         monkeypatch.setattr(
-            process, "training_set", lambda hand, config, number: numbers.append(number) or found
+            process, "training_set", lambda hand, config, number: numbers.append(number) or training
         )
         broker = MemoryHub()
         stop = threading.Event()
@@ -293,21 +295,21 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     # The first episode goes on from before, the next one begins with the third step.
     assert follower.add(rollout(8, 9, 0, ended=[1]), None, state("next", 3), due=True) is None
     assert follower.add(rollout(1, 2, 3), None, state("none"), due=False) is None
-    found = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
-    assert found.goal == "next"
-    assert found.object_index == 3
-    assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
+    traced = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
+    assert traced.goal == "next"
+    assert traced.object_index == 3
+    assert traced.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
     # It follows nothing then, until one is due again.
     assert (
         follower.add(rollout(0, 1, 2, 3, 4, 5, ended=[5]), state("fresh"), state("none"), due=False)
         is None
     )
-    found = follower.add(
+    traced = follower.add(
         rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True
     )
-    assert found.goal == "fresh"
-    assert found.object_index == 2
-    assert len(found.trace.q) == 6
+    assert traced.goal == "fresh"
+    assert traced.object_index == 2
+    assert len(traced.trace.q) == 6
     # What a rollout says of its last episode is not said of another.
     assert (
         follower.add(rollout(0, 1, 0, 1, 2, ended=[1, 4]), state("fresh"), state("none"), due=True)

@@ -215,13 +215,15 @@ def _touched(first, force, fallen, drop=0.06):
     """A readout in which one link presses with a force, and objects fell by more than the 5 cm that
     count.
     """
-    found = np.zeros_like(first.contact_found)
+    contact_found = np.zeros_like(first.contact_found)
     forces = np.zeros_like(first.contact_force)
-    found[:, 0, 0] = True
+    contact_found[:, 0, 0] = True
     forces[:, 0, 0, 0] = force
     position = first.object_position.copy()
     position[fallen, 2] -= drop
-    return first._replace(contact_found=found, contact_force=forces, object_position=position)
+    return first._replace(
+        contact_found=contact_found, contact_force=forces, object_position=position
+    )
 
 
 def test_a_lifted_object_that_stays_is_a_success(follow):
@@ -332,11 +334,11 @@ class _Touching:
 
 def _compiled(caplog):
     """Names of the programs that this thread lowered or compiled."""
-    found = [
+    compiled = [
         re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage())
         for record in caplog.records
     ]
-    return {match[2] for match in found if match}
+    return {match[2] for match in compiled if match}
 
 
 def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplog):

@@ -48,39 +48,37 @@ def protocol(height: float = 0.15, start: int = 0, masses: tuple[float, ...] = M
 def frames(height: float) -> Frame:
     """The carried frame at every step from the table's removal to the end of the lift."""
     time = TASK.approach_steps + np.arange(200, dtype=np.float32)
-    found = _frame(protocol(height), time)
-    return Frame(*(np.asarray(field)[: protocols.lift_steps(TASK, height) + 1] for field in found))
+    frame = _frame(protocol(height), time)
+    return Frame(*(np.asarray(field)[: protocols.lift_steps(TASK, height) + 1] for field in frame))
 
 
 _frame = jax.jit(lambda protocol, time: protocols.frame(protocol, TASK, time))
 
 
 def test_the_lift_is_of_15_cm_at_30_cm_a_second():
-    found = frames(0.15)
+    lift = frames(0.15)
     # 3 m/s^2 for 0.1 s (1.5 cm), 0.3 m/s for 0.4 s, 3 m/s^2 downwards for 0.1 s; then 0.1 s of
     # rest.
-    assert len(found.height) == 71
+    assert len(lift.height) == 71
     at = [0, 5, 10, 30, 50, 55, 60, 70]
     heights = [0, 0.00375, 0.015, 0.075, 0.135, 0.14625, 0.15, 0.15]
-    np.testing.assert_allclose(found.height[at], heights, atol=1e-6)
-    np.testing.assert_allclose(found.speed[at], [0, 0.15, 0.3, 0.3, 0.3, 0.15, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(lift.height[at], heights, atol=1e-6)
+    np.testing.assert_allclose(lift.speed[at], [0, 0.15, 0.3, 0.3, 0.3, 0.15, 0, 0], atol=1e-5)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.005, 0.5))
 def test_every_lift_is_smooth_and_ends_where_it_should(height):
-    found = frames(height)
-    assert found.height[-1] == pytest.approx(height, abs=1e-5)
-    assert abs(found.speed[-1]) < 1e-4
-    assert found.speed.max() <= protocols.LIFT_SPEED + 1e-5
-    assert (np.diff(found.height) > -1e-6).all()
-    assert (
-        np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
-    )
-    way = 0.5 * TASK.control_dt * (found.speed[1:] + found.speed[:-1])
+    lift = frames(height)
+    assert lift.height[-1] == pytest.approx(height, abs=1e-5)
+    assert abs(lift.speed[-1]) < 1e-4
+    assert lift.speed.max() <= protocols.LIFT_SPEED + 1e-5
+    assert (np.diff(lift.height) > -1e-6).all()
+    assert np.abs(np.diff(lift.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+    way = 0.5 * TASK.control_dt * (lift.speed[1:] + lift.speed[:-1])
     # Where the speed has a kink within a step, the trapezoid is off by a dt^2 / 8 at most.
     kink = protocols.LIFT_ACCELERATION * TASK.control_dt**2 / 8
-    np.testing.assert_allclose(np.diff(found.height), way, atol=kink + 1e-6)
+    np.testing.assert_allclose(np.diff(lift.height), way, atol=kink + 1e-6)
 
 
 _push = jax.jit(
@@ -200,26 +198,26 @@ class Seen(NamedTuple):
 
 def seen(scene, index, data) -> Seen:
     state = scene.state
-    found = plausibility.sample(scene, index, data)
+    sample = plausibility.sample(scene, index, data)
     return Seen(
-        found, scene.features.wrist_position, state.u, state.u_velocity, state.object_position
+        sample, scene.features.wrist_position, state.u, state.u_velocity, state.object_position
     )
 
 
-def under(given: Protocol, conditions, time: int = 0):
+def under(stress: Protocol, conditions, time: int = 0):
     """Environments under a protocol from a step of their episodes on; they have programs of their
     own.
     """
     worker = suite.worker(probe=seen, renewed=False)
     worker.begin(conditions)
     worker.state = worker.state._replace(time=jnp.full_like(worker.state.time, time))
-    worker.adjust(protocol=given, probe_data=distance_field(OBJECTS))
+    worker.adjust(protocol=stress, probe_data=distance_field(OBJECTS))
     return worker
 
 
-def released(given: Protocol, steps: int):
+def released(stress: Protocol, steps: int):
     """A rollout from the table's removal on, in which the wrist comes to its guidance."""
-    worker = under(given, start(), TASK.approach_steps)
+    worker = under(stress, start(), TASK.approach_steps)
     rollout = worker.collect(suite.command(), steps)
     worker.physics.close()
     return rollout
@@ -239,8 +237,8 @@ def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
         ("u", 6, 5e-4),
         ("u_velocity", 3, 0.01),
     ):
-        shown = (getattr(rollout.probed, name)[..., :size] for rollout in (moving, still))
-        np.testing.assert_allclose(*shown, atol=tolerance, err_msg=name)
+        both = (getattr(rollout.probed, name)[..., :size] for rollout in (moving, still))
+        np.testing.assert_allclose(*both, atol=tolerance, err_msg=name)
     height = np.zeros(215)
     height[145:] = frames(0.15).height[1:71]
     up = height[:, None, None] * np.array([0.0, 0.0, 1.0])
@@ -294,12 +292,12 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypa
     assert rest.terminal[-1].all()
     assert not rest.terminal[:-1].any()
     samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed.sample, rest.probed.sample)
-    found = protocols.assess(samples, np.ones(BATCH, bool), TASK, TASK.hold_steps)
-    assert set(found) == WITHOUT_MESHES
-    assert all(np.isfinite(value).all() for value in found.values())
+    measures = protocols.assess(samples, np.ones(BATCH, bool), TASK, TASK.hold_steps)
+    assert set(measures) == WITHOUT_MESHES
+    assert all(np.isfinite(value).all() for value in measures.values())
     short = protocols.assess(other.probed.sample, np.ones(BATCH, bool), TASK, TASK.hold_steps)
     assert np.isnan(short["push_survival"]).all()
-    assert short["wrist_speed"] == pytest.approx(found["wrist_speed"])
+    assert short["wrist_speed"] == pytest.approx(measures["wrist_speed"])
     for each in (plain, ended, measured):
         each.physics.close()
 
@@ -339,8 +337,8 @@ def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     ],
 )
 def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
-    found = protocols.survival(*path(**moves), np.array([True]), TASK)
-    assert tuple(found[name][0] for name in protocols.SURVIVAL) == survived
+    survival = protocols.survival(*path(**moves), np.array([True]), TASK)
+    assert tuple(survival[name][0] for name in protocols.SURVIVAL) == survived
     lost = protocols.survival(*path(**moves), np.array([False]), TASK)
     assert not any(lost[name][0] for name in protocols.SURVIVAL)
 
@@ -359,9 +357,9 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     surface = Surface(
         np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1))
     )
-    asked = {constraint.name: np.zeros(2, bool) for constraint in optional(TASK)}
+    inactive = {constraint.name: np.zeros(2, bool) for constraint in optional(TASK)}
     attempts = Attempts(HAND, TASK, suite.policy(), threads=1, phases=Phases(lift=0.06, hold=0.0))
-    outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
+    outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, inactive, surface, rest))
     attempts.close()
     approach = TASK.approach_steps
     lift = protocols.lift_steps(TASK, 0.06)

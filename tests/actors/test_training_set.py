@@ -160,9 +160,9 @@ def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
     ],
 )
 def test_what_cannot_be_trained_on_is_said(folders, objects, text):
-    given = {name: folders[0] if value == 0 else value for name, value in objects.items()}
+    options = {name: folders[0] if value == 0 else value for name, value in objects.items()}
     with pytest.raises(CongraspError, match=text):
-        training_set(HAND, _run(**given), 0)
+        training_set(HAND, _run(**options), 0)
 
 
 def test_sets_of_another_hand_are_refused(folders):
@@ -215,9 +215,9 @@ def test_objects_are_drawn_as_often_as_their_weights_say():
 
 def test_weights_by_hand():
     """Two mugs and a box, four episodes each: 4, 0 and 0 failures."""
-    found = FailureWeights(np.array([1.0, 1.0, 3.0]), ["mug", "mug", "box"])
-    np.testing.assert_array_equal(found.weights, [1, 1, 3])
-    found.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
+    weights = FailureWeights(np.array([1.0, 1.0, 3.0]), ["mug", "mug", "box"])
+    np.testing.assert_array_equal(weights.weights, [1, 1, 3])
+    weights.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
     # Nothing was counted before, so that nothing is forgotten. All: 4/12. Mugs: (4 + 5/3) / (8 +
     # 5), boxes: (5/3) / 9.
     mugs = 17 / 39
@@ -225,28 +225,28 @@ def test_weights_by_hand():
     rates = np.array([(4 + 5 * mugs) / 9, 5 * mugs / 9, 5 * boxes / 9])
     variance = rates * (1 - rates)
     factors = (variance + variance.mean()) / (2 * variance.mean())
-    np.testing.assert_allclose(found.weights, [1.0, 1.0, 3.0] * factors, rtol=1e-6)
-    assert found.metrics()["failure/mug"] == pytest.approx(mugs)
-    assert found.metrics()["failure/box"] == pytest.approx(boxes)
+    np.testing.assert_allclose(weights.weights, [1.0, 1.0, 3.0] * factors, rtol=1e-6)
+    assert weights.metrics()["failure/mug"] == pytest.approx(mugs)
+    assert weights.metrics()["failure/box"] == pytest.approx(boxes)
 
 
 def test_old_outcomes_are_forgotten():
     """After 50 episodes of each object what came before counts e times less."""
-    found = FailureWeights(np.ones(2), ["box", "mug"])
-    found.add(np.zeros(100, int), np.zeros(100))
-    assert found.metrics()["failure/box"] == pytest.approx(1.0)
-    found.add(np.zeros(100, int), np.ones(100))
+    weights = FailureWeights(np.ones(2), ["box", "mug"])
+    weights.add(np.zeros(100, int), np.zeros(100))
+    assert weights.metrics()["failure/box"] == pytest.approx(1.0)
+    weights.add(np.zeros(100, int), np.ones(100))
     old = 100 * np.exp(-1)
     mean = old / (100 + old)
-    assert found.metrics()["failure/box"] == pytest.approx((old + 5 * mean) / (100 + old + 5))
+    assert weights.metrics()["failure/box"] == pytest.approx((old + 5 * mean) / (100 + old + 5))
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.booleans()), max_size=200))
 def test_weights_stay_within_a_factor_of_four_and_follow_uncertainty(episodes):
-    found = FailureWeights(np.ones(5), ["a", "a", "a", "b", "b"])
+    failures = FailureWeights(np.ones(5), ["a", "a", "a", "b", "b"])
     index = np.array([i for i, _ in episodes], int)
     success = np.array([s for _, s in episodes], float)
-    found.add(index, success)
-    weights = found.weights
+    failures.add(index, success)
+    weights = failures.weights
     assert weights.min() >= 0.5
     assert weights.max() <= 2.0

@@ -57,13 +57,13 @@ def dexgraspbench(
         grasps, left_out = read_grasps(paths, track("Reading", None))
         for grasp in grasps:
             write_grasp(grasp, out)
-        found = replayed(grasps, track("Replaying", len(grasps))) if replay else []
+        replays = replayed(grasps, track("Replaying", len(grasps))) if replay else []
     for reason in left_out:
         print(f"Left out: {reason}")
     print(f"{out}: {len(grasps)} grasps")
-    if found:
-        save_replay(out, found)
-        print(summary(found))
+    if replays:
+        save_replay(out, replays)
+        print(summary(replays))
     return 0
 
 

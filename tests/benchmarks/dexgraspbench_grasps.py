@@ -164,10 +164,10 @@ def squeezed(hand: Hand, motion: Episode, t: int, kp: float) -> np.ndarray:
     of the hand's own servos, mean over ten frames up to this one. A motor of several joints turns
     them by their coefficients.
     """
-    own = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
+    motors = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
     frames = slice(max(t + 1 - _STEADY, 0), t + 1)
     ahead = motor_positions(hand, motion.joint_target[frames] - motion.joint_position[frames])
-    further = np.clip(own[:, 0] * ahead, -own[:, 1], own[:, 1]).mean(0) / kp
+    further = np.clip(motors[:, 0] * ahead, -motors[:, 1], motors[:, 1]).mean(0) / kp
     q = motion.joint_position[t].astype(float)
     for motor, way in zip(hand.motors, further, strict=True):
         coefficients = np.array([*motor.joints.values()])
@@ -204,8 +204,8 @@ def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     vertices = np.asarray(body.vertices)
     faces = np.asarray(body.faces)
     try:
-        found = decompose(vertices, faces, volume=volume, max_pieces=most)
-        hulls = [simplify(piece) for piece in found.pieces]
+        pieces = decompose(vertices, faces, volume=volume, max_pieces=most)
+        hulls = [simplify(piece) for piece in pieces.pieces]
     except QhullError:
         return []
     return [Piece("mesh", (0.0, 0.0, 0.0), vertices=hull.astype(float)) for hull in hulls]
@@ -243,7 +243,7 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
     fingers = [model.joint(joint.name).qposadr[0] for joint in hand.joints]
     body = model.body("object").id
     free = model.jnt_qposadr[model.body_jntadr[body]]
-    mine = np.flatnonzero(model.geom_bodyid == body)
+    geoms = np.flatnonzero(model.geom_bodyid == body)
     theirs = [
         g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]
     ]
@@ -259,7 +259,7 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
         gap = min(
             mujoco.mj_geomDistance(model, data, a, b, 2 * CLEARANCE, None)
             for a in theirs
-            for b in mine
+            for b in geoms
         )
         if gap > farthest:
             best = t

@@ -128,7 +128,7 @@ class Match(NamedTuple):
         palm = Rotation.from_quat(self.hand.quaternion, scalar_first=True)
         turn = self.rotation.inv() * palm  # from the palm's frame to the wrist's
         place = self.rotation.inv().apply(self.hand.position - self.position)
-        found: dict[int, tuple[Solid, ...]] = {}
+        solids_of: dict[int, tuple[Solid, ...]] = {}
         for shape in self.hand.shapes:
             link = (
                 int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
@@ -139,8 +139,8 @@ class Match(NamedTuple):
             solid = Solid(
                 shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z)
             )
-            found[link] = (*found.get(link, ()), solid)
-        return found
+            solids_of[link] = (*solids_of.get(link, ()), solid)
+        return solids_of
 
 
 def match_hand(motion: Episode) -> Match:
@@ -160,9 +160,9 @@ def match_hand(motion: Episode) -> Match:
             if [len(chain) for chain in pairing] != lengths:
                 continue
             order = np.concatenate(pairing)
-            found = _laid_over(name, hand, order, motion)
-            if found[0] < best[0]:
-                best = found
+            laid_over = _laid_over(name, hand, order, motion)
+            if laid_over[0] < best[0]:
+                best = laid_over
     error, match = best
     if match is None or error > PLACES_MM:
         near = f"; the nearest, {match.name}, has a joint {error:.2g} mm off" if match else ""
@@ -206,17 +206,19 @@ def _chains(motion: Episode) -> list[np.ndarray]:
     """
     parents = motion.link_parent
     links = motion.joint_link
-    found = []
+    chains = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
         chain: list[int] = []
         link = tip
         while parents[link] >= 0:
             chain = [*np.flatnonzero(links == link).tolist(), *chain]
             link = int(parents[link])
-        found.append(np.array(chain, int))
-    found = [chain for chain in found if len(chain)]
-    joints = np.concatenate(found) if found else np.zeros(0)
-    return found if len(np.unique(joints)) == len(joints) == len(links) and len(found) <= 5 else []
+        chains.append(np.array(chain, int))
+    chains = [chain for chain in chains if len(chain)]
+    joints = np.concatenate(chains) if chains else np.zeros(0)
+    return (
+        chains if len(np.unique(joints)) == len(joints) == len(links) and len(chains) <= 5 else []
+    )
 
 
 def _laid_over(

@@ -69,32 +69,34 @@ def replayed(
 ) -> list[Replayed]:
     """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
-    found: list[Replayed] = []
+    replays: list[Replayed] = []
     for first in range(0, len(grasps), _TOGETHER):
-        found += _replay(hand, grasps[first : first + _TOGETHER])
-        progress(len(found))
-    return found
+        replays += _replay(hand, grasps[first : first + _TOGETHER])
+        progress(len(replays))
+    return replays
 
 
-def summary(found: Sequence[Replayed]) -> str:
+def summary(replays: Sequence[Replayed]) -> str:
     """Summary of replayed grasps in one line."""
     held, closed = (
-        100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS
+        100 * np.mean([getattr(one, f"from_{start}") for one in replays]) for start in STARTS
     )
-    depth, own, pushed = np.array([(one.depth_mm, one.self_mm, one.pushed_mm) for one in found]).T
+    depth, self_depth, pushed = np.array(
+        [(one.depth_mm, one.self_mm, one.pushed_mm) for one in replays]
+    ).T
     return (
         f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from "
         f"the pregrasp; "
         f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm "
         f"(most) in the object and "
-        f"{own.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
+        f"{self_depth.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
     )
 
 
-def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
+def save_replay(folder: pathlib.Path, replays: Sequence[Replayed]) -> None:
     """Writes the result of each grasp to `replay.json`."""
     write_atomically(
-        folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode()
+        folder / "replay.json", json.dumps([one._asdict() for one in replays], indent=2).encode()
     )
 
 
@@ -122,15 +124,15 @@ def _pushed(
     """
     _begin(physics, grasps, start)
     origin = physics.read(physics)
-    kept: np.ndarray = np.ones(6 * len(grasps), bool)
+    in_place: np.ndarray = np.ones(6 * len(grasps), bool)
     deepest = np.zeros(6 * len(grasps))
     script = _script(hand, grasps, STATES[STATES.index(start) :])
     for step, (target, force) in enumerate(script):
-        _, state = physics.step(physics, target, np.zeros(len(kept), bool), force)
-        kept &= _near(origin, state)
+        _, state = physics.step(physics, target, np.zeros(len(in_place), bool), force)
+        in_place &= _near(origin, state)
         if force.any() and step % _LOOK == 0:
             deepest = np.maximum(deepest, [_depths(instance)[0] for instance in physics.instances])
-    return np.all(kept.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
+    return np.all(in_place.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
 
 
 def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
@@ -169,11 +171,11 @@ def _harden(model: mujoco.MjModel) -> None:
     """Removes gravity, and sets the benchmark's contact parameters."""
     model.opt.gravity[:] = 0.0
     model.opt.noslip_iterations = 2
-    mine = model.geom_bodyid == model.body("object").id
-    model.geom_condim[mine] = 4
-    model.geom_friction[mine, 1] = TORSION
+    of_object = model.geom_bodyid == model.body("object").id
+    model.geom_condim[of_object] = 4
+    model.geom_friction[of_object, 1] = TORSION
     model.geom_solmix[:] = 1.0
-    for geoms, (solref, solimp) in ((~mine, _HAND), (mine, _OBJECT)):
+    for geoms, (solref, solimp) in ((~of_object, _HAND), (of_object, _OBJECT)):
         model.geom_solref[geoms] = solref
         model.geom_solimp[geoms, :3] = solimp
 

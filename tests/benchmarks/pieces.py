@@ -69,16 +69,16 @@ def pieces(
       python -m tests.benchmarks pieces --objects my-objects
       python -m tests.benchmarks pieces --objects my-objects --counts 8 32 --vertices 32
     """
-    found = objects_of(objects)
+    loaded = objects_of(objects)
     task = TaskConfig(hand=hand)
     budgets = [(p, v) for p in counts for v in vertices]
-    variants = [[coarser(obj, p, v) for obj in found] for p, v in budgets]
+    variants = [[coarser(obj, p, v) for obj in loaded] for p, v in budgets]
     held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
     seconds = np.array(
         [[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)]
     )
-    per_step = np.median(seconds, axis=0).sum(-1) / (len(found) * _STEPS * task.substeps)
-    table = Table(title=f"{len(found)} objects, {hand} hand, {repeats} repeats")
+    per_step = np.median(seconds, axis=0).sum(-1) / (len(loaded) * _STEPS * task.substeps)
+    table = Table(title=f"{len(loaded)} objects, {hand} hand, {repeats} repeats")
     for column in (
         "pieces",
         "vertices",

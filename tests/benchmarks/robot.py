@@ -83,9 +83,9 @@ class DepthCamera:
         that arrives, m.
         """
         self._steps += 1
-        known = {name: state[name] for name in SceneState._fields if name in state} | self._base
-        time, known = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), known))
-        self._camera = _look(self._task, self._parameters, self._camera, time, known, self._surface)
+        scene = {name: state[name] for name in SceneState._fields if name in state} | self._base
+        time, scene = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), scene))
+        self._camera = _look(self._task, self._parameters, self._camera, time, scene, self._surface)
         before, self._shown = self._shown, np.asarray(self._camera.cloud.points[0])
         return None if np.array_equal(before, self._shown) else self._shown
 
@@ -96,7 +96,7 @@ def _look(
     parameters: SensorParameters,
     camera: Any,
     time: Any,
-    known: dict[str, Any],
+    scene: dict[str, Any],
     surface: Surface,
 ) -> Any:
     unknown: dict[str, Any] = dict.fromkeys(SceneState._fields)
@@ -104,8 +104,8 @@ def _look(
         hand=get_hand(task.hand),
         task=task,
         time=time,
-        state=SceneState(**{**unknown, **known}),
-        object_position=known["object_position"],
+        state=SceneState(**{**unknown, **scene}),
+        object_position=scene["object_position"],
         lift=None,
         surface=surface,
     )

@@ -62,7 +62,7 @@ def _served(*arguments: str) -> Iterator[str]:
         assert server.stdout
         try:
             yield next(
-                found[0] for line in server.stdout if (found := re.search(r"http://\S+", line))
+                address[0] for line in server.stdout if (address := re.search(r"http://\S+", line))
             )
         finally:
             server.terminate()

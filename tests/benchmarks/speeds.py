@@ -90,21 +90,21 @@ def speeds(
         raise CongraspError(
             f"There is no {MOTION} in the folders of {grasps}.", "Run the gallery first."
         )
-    found = {file.parent.parent.name: profile(load_motion(file)) for file in files}
-    rows = -(-len(found) // _COLUMNS)
+    profiles = {file.parent.parent.name: profile(load_motion(file)) for file in files}
+    rows = -(-len(profiles) // _COLUMNS)
     figure = new_figure(
         12,
         2.3 * rows + 0.6,
         "Wrist speed from the start of the reach to the lift; human reaches green",
     )
-    for i, (name, one) in enumerate(found.items(), 1):
+    for i, (name, one) in enumerate(profiles.items(), 1):
         _draw(figure.add_subplot(rows, _COLUMNS, i), name, one)
     save(figure, out.with_suffix(""), [out.suffix[1:]])
     print(
         "| grasp | way | peak | at | peaks | after the handover | arrival "
         "|\n|---|---|---|---|---|---|---|"
     )
-    for name, one in found.items():
+    for name, one in profiles.items():
         print(
             f"| {name} | {one.way:.2f} m | {one.peak:.2f} m/s | {100 * one.at:.0f} % | {one.peaks} "
             f"| "

@@ -196,8 +196,10 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_pat
     turn = Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True)
     place = arrays["obj_pose"][:3]
     point = np.array([0.1, -0.2, 0.3])
-    own = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
-    expected = own.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
+    object_rotation = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
+    expected = (
+        object_rotation.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
+    )
     np.testing.assert_allclose(
         turn.apply(float(arrays["obj_scale"]) * point) + place, expected, atol=1e-6
     )
@@ -208,16 +210,16 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
     for link, theirs in match.solids(
         HAND.joint_links
     ).items():  # the hand that grasps has them, too
-        for mine, solid in zip(HAND.links[link].solids, theirs, strict=True):
-            assert mine.kind == solid.kind
-            assert mine.size == pytest.approx(solid.size)
-            np.testing.assert_allclose(mine.position, solid.position, atol=2e-6)
+        for our_solid, solid in zip(HAND.links[link].solids, theirs, strict=True):
+            assert our_solid.kind == solid.kind
+            assert our_solid.size == pytest.approx(solid.size)
+            np.testing.assert_allclose(our_solid.position, solid.position, atol=2e-6)
             turns = [
                 Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix()
-                for x in (mine, solid)
+                for x in (our_solid, solid)
             ]
             np.testing.assert_allclose(
-                *(turn @ np.diag(mine.size) ** 2 @ turn.T for turn in turns), atol=1e-8
+                *(turn @ np.diag(our_solid.size) ** 2 @ turn.T for turn in turns), atol=1e-8
             )
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -249,10 +251,10 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
         return rows[np.lexsort(np.round(rows[:, :3], 5).T)]
 
     palm = [ours.geom("palm_0").id]
-    found = outlines(ours, here, palm)
+    our_outlines = outlines(ours, here, palm)
     expected = outlines(theirs, there, [])
-    assert len(found) == len(expected) == 20
-    np.testing.assert_allclose(found, expected, atol=2e-6)
+    assert len(our_outlines) == len(expected) == 20
+    np.testing.assert_allclose(our_outlines, expected, atol=2e-6)
     np.testing.assert_allclose(ours.geom_size[palm[0]], (0.0204, 0.0565, 0.0475))
     np.testing.assert_allclose(here.geom_xpos[palm[0]], (-0.0093, 0, 0.095 - 0.0475), atol=1e-6)
 
@@ -265,25 +267,25 @@ def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called(
         [(f"x{n}", p, q, tuple(-x for x in axis)) for n, p, q, axis in finger]
         for finger in SHADOW[::-1]
     ]
-    own = mujoco.MjModel.from_xml_string(
+    renamed = mujoco.MjModel.from_xml_string(
         benchmark_model(turned, "pos='0.01 0.02 0.03' quat='1 1 0 0'", root=False)
     )
-    data = mujoco.MjData(own)
-    mujoco.mj_kinematics(own, data)
+    data = mujoco.MjData(renamed)
+    mujoco.mj_kinematics(renamed, data)
     motion = dataclasses.replace(
         motion,
-        joint_names=np.array([own.joint(j).name for j in range(own.njnt)]),
+        joint_names=np.array([renamed.joint(j).name for j in range(renamed.njnt)]),
         joint_anchor=data.xanchor.copy(),
         joint_axis=data.xaxis.copy(),
-        joint_link=own.jnt_bodyid - 2,  # the world and the root are no links
-        link_parent=np.maximum(own.body_parentid[2:] - 2, -1),
+        joint_link=renamed.jnt_bodyid - 2,  # the world and the root are no links
+        link_parent=np.maximum(renamed.body_parentid[2:] - 2, -1),
     )
     match = match_hand(motion)
     assert match.name == "shadow"
     assert (match.sign == -1).all()
     rng = np.random.default_rng(0)
-    data.qpos[:] = q = rng.uniform(*own.jnt_range.T)
-    mujoco.mj_kinematics(own, data)
+    data.qpos[:] = q = rng.uniform(*renamed.jnt_range.T)
+    mujoco.mj_kinematics(renamed, data)
     model = mujoco.MjModel.from_xml_string(benchmark_model(SHADOW, "pos='0 0 0.034'"))
     theirs = mujoco.MjData(model)
     assert tuple(model.joint(i).name for i in range(1, model.njnt)) == match.hand.joints
@@ -419,9 +421,9 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         )
     out = tmp_path / "bench"
     assert dexgraspbench((tmp_path / "grasps",), out) == 0
-    said = capsys.readouterr().out
-    assert "lost/grasp.npz: The object is not held." in said
-    assert "1 grasps" in said
+    printed = capsys.readouterr().out
+    assert "lost/grasp.npz: The object is not held." in printed
+    assert "1 grasps" in printed
     script = [
         sys.executable,
         str(ROOT / "examples" / "dexgraspbench.py"),

@@ -47,8 +47,8 @@ def test_indices_are_equally_likely_and_below_the_count():
 
 def test_weighted_indices_have_their_shares_and_skip_zeros():
     """By hand: weights 0, 1, 0, 3: a quarter and three quarters."""
-    found = np.asarray(chance.weighted(UNIFORM, np.float32([0, 1, 0, 3])))
-    assert np.bincount(found, minlength=4) / MANY == pytest.approx([0, 0.25, 0, 0.75], abs=0.01)
+    indices = np.asarray(chance.weighted(UNIFORM, np.float32([0, 1, 0, 3])))
+    assert np.bincount(indices, minlength=4) / MANY == pytest.approx([0, 0.25, 0, 0.75], abs=0.01)
     assert chance.weighted(np.float32([0.0, LAST]), np.float32([0, 1, 0, 3])).tolist() == [1, 3]
 
 

@@ -42,8 +42,8 @@ def _pose(hand, closures):
 @pytest.mark.parametrize("name", HANDS)
 def test_the_shipped_wide_pose_is_the_one_that_is_found(name):
     hand = get_hand(name)
-    found = hand.posed(widest_pose(hand))
-    np.testing.assert_allclose(wide_angles(hand), found, atol=0.03)
+    widest = hand.posed(widest_pose(hand))
+    np.testing.assert_allclose(wide_angles(hand), widest, atol=0.03)
     assert (wide_angles(hand) >= hand.lower - 1e-6).all()
     assert (wide_angles(hand) <= hand.upper + 1e-6).all()
 
@@ -80,8 +80,8 @@ def test_closures_meet_the_three_poses_and_mix_between_them():
     np.testing.assert_allclose(half, (wide_angles(hand) + hand.q_open) / 2, atol=1e-6)
     apart = np.linspace(-1, 1, len(hand.joints), dtype=np.float32)
     for joint, closure in enumerate(apart):
-        own = _pose(hand, [closure])[joint]
-        assert _pose(hand, apart)[joint] == pytest.approx(own, abs=1e-6)
+        angles = _pose(hand, [closure])[joint]
+        assert _pose(hand, apart)[joint] == pytest.approx(angles, abs=1e-6)
 
 
 _preshape = jax.jit(functools.partial(preshape, get_hand("human")))

@@ -55,23 +55,23 @@ each_optional = pytest.mark.parametrize(
 
 
 @pytest.fixture(scope="module")
-def whole():
+def full_scene():
     """A scene in which every constraint is active."""
     return scene_of(TASK, *scene(9))
 
 
-def _without(whole, constraint):
+def _without(full_scene, constraint):
     """The scene with this constraint's blocks inactive."""
     others = (block for other in OPTIONAL if other is not constraint for block in other.blocks)
-    return whole._replace(goal=dataclasses.replace(whole.goal, active=active(*others)))
+    return full_scene._replace(goal=dataclasses.replace(full_scene.goal, active=active(*others)))
 
 
 @each
-def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
+def test_blocks_are_as_wide_as_their_fields_say(constraint, full_scene):
     described = fields(HAND, TASK)
     sizes = dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
-    observed = evaluated(constraint.observe, whole)
+    observed = evaluated(constraint.observe, full_scene)
     assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
     for name, parts in zip(names, observed, strict=True):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
@@ -106,9 +106,9 @@ def test_names_are_unique_over_all_constraints():
 
 
 @each
-def test_terms_and_errors_match_declarations(constraint, whole):
-    paid = evaluated(constraint.reward, whole)
-    measured = evaluated(constraint.measure, whole)
+def test_terms_and_errors_match_declarations(constraint, full_scene):
+    paid = evaluated(constraint.reward, full_scene)
+    measured = evaluated(constraint.measure, full_scene)
     assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
     assert sorted(measured) == sorted(error.name for error in constraint.errors)
     for error in constraint.errors:
@@ -126,11 +126,11 @@ def test_terms_and_errors_match_declarations(constraint, whole):
 
 
 @each_optional
-def test_inactive_constraint_has_no_effect(constraint, whole):
-    off = _without(whole, constraint)
+def test_inactive_constraint_has_no_effect(constraint, full_scene):
+    off = _without(full_scene, constraint)
     start = 0
     mask = dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
-    on_observation = evaluated(observe, whole)
+    on_observation = evaluated(observe, full_scene)
     off_observation = evaluated(observe, off)
     for name, size in layout(HAND, TASK):
         block = slice(start, start + size)
@@ -148,17 +148,22 @@ def test_inactive_constraint_has_no_effect(constraint, whole):
                 on_observation[:, block], off_observation[:, block], err_msg=name
             )
     assert not any(np.any(value) for value in evaluated(constraint.reward, off).values())
-    touching = whole.features.touching
-    force = whole.features.force
+    touching = full_scene.features.touching
+    force = full_scene.features.force
     for before, after in zip(
         (touching, force), constraint.earning(off, touching, force), strict=True
     ):
         np.testing.assert_array_equal(before, after)
     # Nor does it change what the others are paid, but for contacts that it forbids and what it
     # declares.
-    others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (whole, off))
-    own = {weight.name for weight in constraint.weights}
-    for name in set(terms(TASK)) - own - {"contact", "force"} - CHANGES.get(constraint.name, set()):
+    others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (full_scene, off))
+    terms_of_constraint = {weight.name for weight in constraint.weights}
+    for name in (
+        set(terms(TASK))
+        - terms_of_constraint
+        - {"contact", "force"}
+        - CHANGES.get(constraint.name, set())
+    ):
         np.testing.assert_array_equal(others[name], paid[name], err_msg=name)
 
 
@@ -306,7 +311,7 @@ def test_active_blocks():
     """
     for flags in itertools.product([False, True], repeat=5):
         affordance, pose, trajectory, fingers, force = flags
-        found = active_blocks(
+        active = active_blocks(
             {c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)}
         )
         expected = {
@@ -317,7 +322,7 @@ def test_active_blocks():
             "fingers": fingers and not pose,
             "force_limit": force,
         }
-        assert {name: flags.tolist() for name, flags in found.items()} == {
+        assert {name: flags.tolist() for name, flags in active.items()} == {
             n: [x, x] for n, x in expected.items()
         }
 
@@ -356,10 +361,13 @@ def _same(
     )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]
-    own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
+    excluded = {
+        *get_constraint(but).blocks,
+        *(f"{but}_{name}" for name in get_constraint(but).arrays),
+    }
     assert goals[0]
-    assert set(goals[1]) - set(goals[0]) <= own
-    assert set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
+    assert set(goals[1]) - set(goals[0]) <= excluded
+    assert set(actives[1]) - set(actives[0]) == excluded & {*blocks(TASK)}
     for one, other in (goals, actives):
         for name in one:
             check(one[name], other[name], err_msg=name)

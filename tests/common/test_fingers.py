@@ -287,13 +287,13 @@ def test_features_of_a_whole_step_reach_it():
     ((_, room, _),) = evaluated(FINGERS.observe, made)
     skin = np.linalg.norm(made.features.nearest, axis=-1) - HAND.keypoint_radii
     for finger in range(5):
-        own = [
+        per_step = [
             i
             for i, link in enumerate(HAND.keypoint_links)
             if (link - 1) // 3 == finger and link > 0
         ]
-        assert len(own) == 4  # three joints and a tip
+        assert len(per_step) == 4  # three joints and a tip
         expected = np.where(
-            goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, own].min(-1), 0.1)
+            goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, per_step].min(-1), 0.1)
         )
         np.testing.assert_allclose(room[:, finger], expected, atol=1e-6)

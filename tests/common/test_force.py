@@ -94,8 +94,8 @@ def test_the_least_limit_carries_half_of_the_weight():
     """By hand: 1 kg under friction 1 and 0.5, 100 g, and 10 kg: 9.81 / 2, 9.81, 1 (not 0.49) and 20
     (not 49) N.
     """
-    found = least_force(np.array([1.0, 1.0, 0.1, 10.0]), np.array([1.0, 0.5, 1.0, 1.0]))
-    np.testing.assert_allclose(found, [4.905, 9.81, 1.0, 20.0], rtol=1e-6)
+    limits = least_force(np.array([1.0, 1.0, 0.1, 10.0]), np.array([1.0, 0.5, 1.0, 1.0]))
+    np.testing.assert_allclose(limits, [4.905, 9.81, 1.0, 20.0], rtol=1e-6)
 
 
 def _uniform(batch, seed):
@@ -112,11 +112,11 @@ def test_draws_are_log_uniform():
         ).limit
     )
     for least in (1.0, 5.0):
-        own = limit[low == least]
-        assert own.min() >= least * 0.999
-        assert own.max() <= 20.001
-        assert np.median(own) == pytest.approx(np.sqrt(20 * least), rel=0.1)
-        assert np.log(own).std() == pytest.approx(np.log(20 / least) / np.sqrt(12), rel=0.1)
+        of_group = limit[low == least]
+        assert of_group.min() >= least * 0.999
+        assert of_group.max() <= 20.001
+        assert np.median(of_group) == pytest.approx(np.sqrt(20 * least), rel=0.1)
+        assert np.log(of_group).std() == pytest.approx(np.log(20 / least) / np.sqrt(12), rel=0.1)
 
 
 @settings(max_examples=40, deadline=None)
@@ -125,10 +125,10 @@ def test_a_drawn_limit_is_valid_and_enough(mass, friction, seed):
     weight = (np.full(3, mass), np.full(3, friction))
     zero = np.zeros(3, int)
     low = np.asarray(least_force(*weight))
-    own = FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, *weight), _uniform(3, seed))
-    assert np.asarray(FORCE.valid(Surface(np.zeros((3, 1, 3)), np.zeros((3, 1), bool)), own)).all()
-    assert (np.asarray(own.limit) >= low * 0.999).all()
-    assert (np.asarray(own.limit) <= 20.001).all()
+    goal = FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, *weight), _uniform(3, seed))
+    assert np.asarray(FORCE.valid(Surface(np.zeros((3, 1, 3)), np.zeros((3, 1), bool)), goal)).all()
+    assert (np.asarray(goal.limit) >= low * 0.999).all()
+    assert (np.asarray(goal.limit) <= 20.001).all()
 
 
 @settings(max_examples=25, deadline=None)
@@ -151,10 +151,10 @@ def test_limits_that_no_hand_keeps_are_not_valid():
 
 def test_words():
     mug = procedural.generate(1, "mug")
-    given = read_request(mug, HAND, 15, force="3").given("force", "limit")
-    assert given.shape == ()
-    assert given.dtype == np.float32
-    assert given == 3.0
+    limit = read_request(mug, HAND, 15, force="3").given("force", "limit")
+    assert limit.shape == ()
+    assert limit.dtype == np.float32
+    assert limit == 3.0
     assert read_request(mug, HAND, 15, force=2.5).given("force", "limit") == 2.5
     heavy = dataclasses.replace(mug, mass=1.0)
     assert read_request(heavy, HAND, 15, gentle=True).given("force", "limit") == pytest.approx(

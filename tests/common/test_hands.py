@@ -123,9 +123,9 @@ def test_joint_limits_torques_and_masses_are_the_makers():
 )
 def test_joints_are_where_the_makers_have_them(name, joint, tip, anchor, axis):
     hand = get_hand(name)
-    found = next(x for x in hand.joints if x.name == joint)
-    np.testing.assert_allclose(np.subtract(found.anchor, ORIGIN[name]), anchor, atol=1e-4)
-    np.testing.assert_allclose(found.axis, axis, atol=1e-3)
+    actual = next(x for x in hand.joints if x.name == joint)
+    np.testing.assert_allclose(np.subtract(actual.anchor, ORIGIN[name]), anchor, atol=1e-4)
+    np.testing.assert_allclose(actual.axis, axis, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ("human", *ROBOTS))
@@ -183,13 +183,13 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle
     carry 400 g.
     """
-    found = next(
+    held = next(
         obj
         for i in range(99)
         if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03
     )
     task = TaskConfig(hand=hand.name)
-    (cylinder,) = scale_objects(hand, task, [found])
+    (cylinder,) = scale_objects(hand, task, [held])
     frame = grasp_frame(hand)
     tips = _tips(hand, hand.q_open + 0.5 * (hand.q_closed - hand.q_open))
     center = 0.5 * (tips[0] + tips[1:].mean(0)) - 0.01 * frame.heading

@@ -374,8 +374,8 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
     v, w = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0].transpose(0, 2, 1)[:, :2].transpose(1, 0, 2)
     up = np.stack([v[:, 2], w[:, 2], np.cross(v, w)[:, 2]], -1)
     frame = grasp_frame(hand)
-    own = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
-    turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), own)
+    axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
+    turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), axes)
     ends = jax.jit(lambda q: capsules(hand, link_transforms(hand, q)))(hand.q_open)
     ends = np.asarray(ends).reshape(-1, 3) - frame.center
     opened = CLOSURES.tolist().index(0.0)
@@ -462,12 +462,12 @@ def covered(obj, hand):
     graspable region.
     """
     widest = max_width(hand, 1.0)
-    found = sample_headings(
+    headings = sample_headings(
         obj, np.random.default_rng(0), use_affordance=True, options=HeadingOptions(max_width=widest)
     )
-    if found is None:
+    if headings is None:
         return [], np.zeros((len(obj.rest_poses), 0), bool)
-    return within_reach(found, obj, obj.rest_poses, hand, obj.non_graspable_points)
+    return within_reach(headings, obj, obj.rest_poses, hand, obj.non_graspable_points)
 
 
 @pytest.mark.parametrize("families", ["all", "scans"])

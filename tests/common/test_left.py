@@ -123,11 +123,11 @@ def test_mirrored_inputs_give_mirrored_actions():
 
 def test_angular_velocities_are_mirrored_as_rotations():
     """A wheel that rolls forwards does so in the mirror too, where x is the axle."""
-    found = mirror.fields(
+    mirrored = mirror.fields(
         {"object_angular_velocity": [1.0, 2.0, 3.0], "object_velocity": [1.0, 2.0, 3.0]}
     )
-    np.testing.assert_array_equal(found["object_angular_velocity"], [1, -2, -3])
-    np.testing.assert_array_equal(found["object_velocity"], [-1, 2, 3])
+    np.testing.assert_array_equal(mirrored["object_angular_velocity"], [1, -2, -3])
+    np.testing.assert_array_equal(mirrored["object_velocity"], [-1, 2, 3])
 
 
 def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
@@ -138,22 +138,22 @@ def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
     upper = [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
     limits = {"lower": lower, "upper": upper, "palm": [[0.01, 0.02, 0.03, 0.04]]}
     right = mock.Mock(metadata=lambda: {"hand": "human", "limits": limits, "period": 0.01})
-    found = LeftPolicy(right).metadata()
-    assert found["hand"] == "human:left"
-    assert found["period"] == 0.01
+    metadata = LeftPolicy(right).metadata()
+    assert metadata["hand"] == "human:left"
+    assert metadata["period"] == 0.01
     np.testing.assert_array_equal(
-        found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
+        metadata["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
     )
-    np.testing.assert_array_equal(found["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
-    assert found["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
+    np.testing.assert_array_equal(metadata["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
+    assert metadata["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
 
 
 def test_everything_that_a_camera_sees_is_mirrored():
     points = np.array([[1.0, 2.0, 3.0]])
     request = GraspRequest({}, cloud=points, normals=points, camera=points[0])
     mirrored = mirrored_request(request)
-    for found in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
-        np.testing.assert_array_equal(found, [-1.0, 2.0, 3.0])
+    for vectors in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
+        np.testing.assert_array_equal(vectors, [-1.0, 2.0, 3.0])
     state = mirror.fields(
         {"cloud": points, "surface_normals": points, "camera_position": points[0]}
     )

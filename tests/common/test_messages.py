@@ -149,8 +149,8 @@ def test_empty_rollout_is_refused():
 
 
 def test_zeros_have_the_forms_sizes_and_dtypes():
-    whole = RolloutForm(T, B, D, A, half=False).zeros(rollouts=3)
-    assert {name: (array.shape, str(array.dtype)) for name, array in whole.items()} == {
+    zeros = RolloutForm(T, B, D, A, half=False).zeros(rollouts=3)
+    assert {name: (array.shape, str(array.dtype)) for name, array in zeros.items()} == {
         "observation": ((T, 3 * B, D), "float32"),
         "action": ((T, 3 * B, A), "float32"),
         "log_probability": ((T, 3 * B), "float32"),

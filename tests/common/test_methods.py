@@ -160,10 +160,12 @@ def label(teacher, ahead, limit, velocity, table, own):
     rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own), *lag], np.float32)
     assert len(rows) == extra(ALLEGRO)
     action = np.append(np.full(16, 0.3), along(teacher)).astype(np.float32)
-    found = np.asarray(_student_action(rows, action))
-    np.testing.assert_allclose(found[:16], action[:16] + lag / 0.1, atol=1e-6)  # alpha_f = 0.1 rad
-    np.testing.assert_allclose(found[17:], 0.0, atol=1e-6)
-    return found[16]
+    student = np.asarray(_student_action(rows, action))
+    np.testing.assert_allclose(
+        student[:16], action[:16] + lag / 0.1, atol=1e-6
+    )  # alpha_f = 0.1 rad
+    np.testing.assert_allclose(student[17:], 0.0, atol=1e-6)
+    return student[16]
 
 
 def test_label_reaches_the_teacher_s_target():
@@ -205,16 +207,17 @@ def test_labelled_student_moves_like_its_teacher():
     @jax.jit
     def targets(action):
         true = scene_of(HAND, task, state, surface, goal)
-        shown = scene_of(HAND, tracked, seen, surface, goal)
-        rows = observe_for_teacher(true, shown, task.control)
-        own = student_action(HAND, task.control, rows, action)
+        tracked_scene = scene_of(HAND, tracked, seen, surface, goal)
+        rows = observe_for_teacher(true, tracked_scene, task.control)
+        label = student_action(HAND, task.control, rows, action)
         one, two, copied = (
-            decode(s, task.control, a) for s, a in ((true, action), (shown, own), (shown, action))
+            decode(s, task.control, a)
+            for s, a in ((true, action), (tracked_scene, label), (tracked_scene, action))
         )
         return rows, observe(true), one, two, copied
 
-    rows, whole, teacher, student, copied = targets(action)
-    np.testing.assert_array_equal(rows[:, : -extra(HAND)], whole)
+    rows, full_target, teacher, student, copied = targets(action)
+    np.testing.assert_array_equal(rows[:, : -extra(HAND)], full_target)
     np.testing.assert_allclose(student.u_target, teacher.u_target, atol=1e-5)
     np.testing.assert_array_equal(student.q_target, teacher.q_target)
     # What the teacher's residual would have given

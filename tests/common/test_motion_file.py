@@ -119,12 +119,12 @@ def test_blocks_of_a_motion_are_those_of_its_constraints(tmp_path: pathlib.Path)
 
 
 def test_rounded_quaternions_need_normalising(tmp_path: pathlib.Path) -> None:
-    whole = episode_message()
+    message = episode_message()
     rounded = {
-        name: 1.002 * np.asarray(whole.arrays[name])
+        name: 1.002 * np.asarray(message.arrays[name])
         for name in ("link_quaternion", "object_quaternion")
     }
-    recorded = Episode.from_message(Message({**whole.arrays, **rounded}, whole.meta))
+    recorded = Episode.from_message(Message({**message.arrays, **rounded}, message.meta))
     save_motion(tmp_path / "a.npz", recorded)
     with pytest.raises(CongraspError, match=r"a\.npz's wrist_quaternion .* not normalised"):
         load_motion(tmp_path / "a.npz")

@@ -211,5 +211,5 @@ def test_a_tendon_goes_on_where_one_of_its_joints_is_held_and_couplings_do_not_g
     now = data.qpos[leader.qposadr][0]
     assert data.qpos[follower.qposadr][0] == pytest.approx(0.9 * now, abs=5e-3)
     # Virtual work: the leader's motor holds 0.9 times what acts on the follower.
-    wanted = data.ctrl[model.actuator("index_2").id] - 0.9 * 0.2 / 3.0
-    assert now == pytest.approx(wanted, abs=5e-3)
+    expected = data.ctrl[model.actuator("index_2").id] - 0.9 * 0.2 / 3.0
+    assert now == pytest.approx(expected, abs=5e-3)

@@ -42,11 +42,11 @@ def piece(request):
 def test_mass_properties_of_a_union_with_densities_equal_mujocos():
     pieces = tuple(PIECES.values())
     densities = np.array([500.0, 900.0, 300.0, 2000.0, 1100.0])
-    found = mass_properties(pieces, densities)
+    actual = mass_properties(pieces, densities)
     expected = mujoco_mass_properties(pieces, densities)
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-7)
-    np.testing.assert_allclose(found[2], expected[2], atol=1e-5 * np.abs(expected[2]).max())
+    np.testing.assert_allclose(actual[0], expected[0], rtol=1e-5)
+    np.testing.assert_allclose(actual[1], expected[1], atol=1e-7)
+    np.testing.assert_allclose(actual[2], expected[2], atol=1e-5 * np.abs(expected[2]).max())
 
 
 def test_surface_samples_have_supporting_planes_and_separate_inside_from_outside(piece):

@@ -82,10 +82,10 @@ class Level(Constraint):
     def measure(self, scene):
         return {"level_m": jnp.abs(self._height(scene))}
 
-    def parse(self, given, hand, obj):
-        if given["levelled"]:
-            return {"wrist": np.abs(np.diff(given["levelled"]["position"][-2:, 2])) < 1e-3}
-        return {"wrist": np.array([given["level"] == "wrist"])} if given["level"] else None
+    def parse(self, text, hand, obj):
+        if text["levelled"]:
+            return {"wrist": np.abs(np.diff(text["levelled"]["position"][-2:, 2])) < 1e-3}
+        return {"wrist": np.array([text["level"] == "wrist"])} if text["level"] else None
 
     def _height(self, scene):
         features = scene.features
@@ -158,8 +158,8 @@ def episodes(task):
     wrist = goal["level"].wrist[:, 0]
     assert 0.25 < active.mean() < 0.75
     assert 0.25 < wrist.mean() < 0.75
-    found = finished_episodes(rollout, task)
-    np.testing.assert_array_equal(found["episode/mask_level"], active)
+    metrics = finished_episodes(rollout, task)
+    np.testing.assert_array_equal(metrics["episode/mask_level"], active)
 
     # What the engine shows, worked out from the traces; in `final` the steps after the table's
     # removal.
@@ -168,12 +168,12 @@ def episodes(task):
     assert final.all()
     assert task.hold_steps == 1
     np.testing.assert_allclose(
-        found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
+        metrics["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
     )
     paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
-    np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
-    assert (found["term/level_height"][active] < 0).all()
-    assert not found["term/level_height"][~active].any()
+    np.testing.assert_allclose(-metrics["term/level_height"][wrist], paid[wrist], atol=1e-4)
+    assert (metrics["term/level_height"][active] < 0).all()
+    assert not metrics["term/level_height"][~active].any()
     assert layout(hand, task)[-2:] == (("level", 2), ("mask", 1))
     block = np.asarray(rollout.observation)[..., -3:-1]
     np.testing.assert_array_equal(block[0, :, 0], active & wrist)
@@ -181,7 +181,7 @@ def episodes(task):
     assert not block[:, ~active].any()
     return {
         name.removeprefix("episode/"): values
-        for name, values in found.items()
+        for name, values in metrics.items()
         if name.startswith("episode/")
     }
 
@@ -244,11 +244,11 @@ def command_line():
         "Per metre of rise.",
     ]
     for command, words in {"grasp": ["--level"], "train": train}.items():
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
             main.load(command)(["--help"])
         for word in words:
-            assert word in said.getvalue(), word
+            assert word in printed.getvalue(), word
     parsed = parse_errors.parse("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
@@ -314,10 +314,12 @@ def onnx(task):
     from congrasp.services.export.policy import describe
     from congrasp.services.train.command import untrained
 
-    said = describe(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2))))
-    assert said["masks"][-1] == "level"
-    assert ["level", 2] in said["layout"]
-    fields = [entry for entry in said["observation"] if entry["block"] == "level"]
+    description = describe(
+        untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2)))
+    )
+    assert description["masks"][-1] == "level"
+    assert ["level", 2] in description["layout"]
+    fields = [entry for entry in description["observation"] if entry["block"] == "level"]
     assert [(entry["field"], entry["size"], entry["meaning"]) for entry in fields] == [
         ("level_wrist", 1, "1 for the wrist"),
         ("level_height", 1, "m, world"),

@@ -56,7 +56,7 @@ def test_several_files_are_read_in_one_process_and_the_wrong_one_is_named(monkey
     data = [(f"{i}.pkl", pickle.dumps({"x": np.full(3, i)})) for i in range(1500)]
     read = read_pickles(data)
     assert len(read) == 1500
-    assert all((found["x"] == i).all() for i, found in enumerate(read))
+    assert all((arrays["x"] == i).all() for i, arrays in enumerate(read))
     data[7] = "7.pkl", pickle.dumps(print)
     with pytest.raises(CongraspError, match=r"^7\.pkl names 'builtins\.print'"):
         read_pickles(data)
@@ -80,12 +80,12 @@ def test_the_process_imports_no_package_but_numpy(tmp_path):
 
 def test_sparse_matrices_and_chumpys_selections_are_arrays(tmp_path):
     matrix = scipy.sparse.random(7, 5, 0.4, "csc", random_state=0)
-    whole = np.arange(24.0).reshape(2, 3, 4)
-    chosen = selection(whole[..., :2], whole)
+    array = np.arange(24.0).reshape(2, 3, 4)
+    chosen = selection(array[..., :2], array)
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(matrix, 2))
     (tmp_path / "b.pkl").write_bytes(dumps({"x": chosen}))
     np.testing.assert_array_equal(read_pickle(tmp_path / "a.pkl")[""], matrix.toarray())
-    np.testing.assert_array_equal(read_pickle(tmp_path / "b.pkl")["x"], whole[..., :2])
+    np.testing.assert_array_equal(read_pickle(tmp_path / "b.pkl")["x"], array[..., :2])
 
 
 class _Runs:
@@ -244,9 +244,9 @@ _TENSOR = Reduced(
 def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
     monkeypatch.setattr(pickles, "MAX_PROCESSOR_S", 1)
     monkeypatch.setattr(pickles, "MAX_MEMORY_BYTES", 1 << 30)
-    said = limited(parse, data)
-    assert said.startswith("CongraspError: a.pkl"), said
-    assert re.search(word, said), said
+    message = limited(parse, data)
+    assert message.startswith("CongraspError: a.pkl"), message
+    assert re.search(word, message), message
 
 
 def parse(data):
@@ -318,10 +318,10 @@ def test_arrays_come_back(tmp_path):
 def test_what_is_larger_than_it_looks_is_refused_before_it_is_in_memory(tmp_path, members, why):
     _zip(tmp_path / "a.npz", members)
     read = functools.partial(read_npz, largest=4 << 20)
-    said = limited(read, tmp_path / "a.npz", "Get it again.", memory=24 << 20)
-    assert said.startswith(f"CongraspError: {tmp_path / 'a.npz'}")
-    assert why in said
-    assert said.endswith("Get it again.")
+    message = limited(read, tmp_path / "a.npz", "Get it again.", memory=24 << 20)
+    assert message.startswith(f"CongraspError: {tmp_path / 'a.npz'}")
+    assert why in message
+    assert message.endswith("Get it again.")
 
 
 def test_a_directory_that_lies_about_sizes_inflates_no_further(tmp_path):

@@ -70,8 +70,8 @@ def deepest_contact(name: str, q: np.ndarray) -> float:
     ],
 )
 def test_distances_of_segments_worked_out_by_hand(a, b, c, d, distance):
-    found = _distance(*(np.array(x, np.float32) for x in (a, b, c, d)))
-    assert float(found) == pytest.approx(distance, abs=1e-6)
+    computed = _distance(*(np.array(x, np.float32) for x in (a, b, c, d)))
+    assert float(computed) == pytest.approx(distance, abs=1e-6)
 
 
 @settings(max_examples=50, deadline=None)
@@ -93,11 +93,11 @@ def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
         hand.q_closed,
         *rng.uniform(hand.lower, hand.upper, (8, len(hand.joints))),
     ]
-    found = np.asarray(measured(np.array(poses, np.float32)))
-    np.testing.assert_allclose(found, [deepest_contact(name, q) for q in poses], atol=1e-5)
+    depths = np.asarray(measured(np.array(poses, np.float32)))
+    np.testing.assert_allclose(depths, [deepest_contact(name, q) for q in poses], atol=1e-5)
     # Open hands are free of themselves, some poses are not
-    assert found[0] == 0.0
-    assert found.max() > 0.002
+    assert depths[0] == 0.0
+    assert depths.max() > 0.002
 
 
 def test_hand_in_table_is_the_lowest_point_of_a_capsule():
@@ -105,8 +105,10 @@ def test_hand_in_table_is_the_lowest_point_of_a_capsule():
     # At zero the lowest capsule is the thumb's last: its tip's centre at z = -0.0403, its radius
     # 6.5 mm.
     for height, depth in ((0.0, 0.0468), (0.04, 0.0068), (0.05, 0.0)):
-        found = hand_table(hand, transforms, np.array([[0.0, 0.0, height]], np.float32), UPRIGHT)
-        assert float(found[0]) == pytest.approx(depth, abs=1e-6)
+        penetration = hand_table(
+            hand, transforms, np.array([[0.0, 0.0, height]], np.float32), UPRIGHT
+        )
+        assert float(penetration[0]) == pytest.approx(depth, abs=1e-6)
     over = (
         Rotation.from_euler("x", 180, degrees=True)
         .as_quat(scalar_first=True)[None]
@@ -114,8 +116,8 @@ def test_hand_in_table_is_the_lowest_point_of_a_capsule():
     )
     # Turned over, the middle finger's last joint is lowest: z = 0.0197, and the radius of its
     # middle link 8 mm.
-    found = hand_table(hand, transforms, np.zeros((1, 3), np.float32), over)
-    assert float(found[0]) == pytest.approx(0.0197 + 0.008, abs=1e-6)
+    penetration = hand_table(hand, transforms, np.zeros((1, 3), np.float32), over)
+    assert float(penetration[0]) == pytest.approx(0.0197 + 0.008, abs=1e-6)
 
 
 def test_hand_in_object_is_the_radius_less_the_axis_distance():
@@ -130,8 +132,8 @@ def test_hand_in_object_is_the_radius_less_the_axis_distance():
     along /= np.linalg.norm(along)
     for gap in (0.010, 0.0, -0.004):
         centre = (tip + (radius + 0.03 + gap) * along)[None].astype(np.float32)
-        found = _in_object(transforms, centre, UPRIGHT, index, field)
-        assert float(found[0]) == pytest.approx(max(-gap, 0.0), abs=2e-4)
+        depth = _in_object(transforms, centre, UPRIGHT, index, field)
+        assert float(depth[0]) == pytest.approx(max(-gap, 0.0), abs=2e-4)
 
 
 def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
@@ -146,7 +148,7 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     middle = 0.5 * np.add(
         *[np.array(getattr(hand.links[8].capsules[0], end)) for end in ("start", "end")]
     )
-    found = _in_object(
+    depth = _in_object(
         transforms,
         middle[None].astype(np.float32),
         UPRIGHT,
@@ -155,7 +157,7 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     )
     # The plate lies across the middle finger; the points on the axis are at most 4 mm apart.
     thickest = max(capsule.radius for capsule in hand.links[8].capsules)
-    assert thickest - 0.001 < float(found[0]) < thickest + 0.0025
+    assert thickest - 0.001 < float(depth[0]) < thickest + 0.0025
 
 
 def motion(steps: int, **arrays: np.ndarray) -> Sample:
@@ -189,8 +191,8 @@ def test_measures_of_a_motion_worked_out_by_hand():
         torque_share=torque,
         hand_hand=depth,
     )
-    found = measures(samples, 0.01)
-    assert set(found) == set(plausibility.MEASURES)
+    measured = measures(samples, 0.01)
+    assert set(measured) == set(plausibility.MEASURES)
     expected = {
         "hand_hand_mm": 4.0,
         "hand_table_mm": 0.0,
@@ -206,12 +208,12 @@ def test_measures_of_a_motion_worked_out_by_hand():
         "torque_share_peak": 1.0,
     }
     for name, value in expected.items():
-        assert found[name][0] == pytest.approx(value, rel=1e-5), name
+        assert measured[name][0] == pytest.approx(value, rel=1e-5), name
 
 
 def test_hand_without_meshes_has_no_mesh_measure():
-    found = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
-    assert set(found) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
+    measured = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
+    assert set(measured) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
 
 
 def test_clean_is_held_and_shallow_everywhere():
@@ -228,7 +230,7 @@ def test_clean_is_held_and_shallow_everywhere():
         ("hand_object_mm", 3.0),
         ("hand_mesh_mm", 3.0),
     ):
-        found = {**shallow, name: value}
+        values = {**shallow, name: value}
         assert is_clean(
-            np.array([True]), {name: np.array([x]) for name, x in found.items()}
+            np.array([True]), {name: np.array([x]) for name, x in values.items()}
         ).tolist() == [False]

@@ -293,22 +293,24 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
         for field in fields(get_hand("human"), normals)["state"]
         for _ in range(field.size)
     ]
-    kept = np.ones(sum(size for _, size in wider.layout), bool)
-    kept[: len(names)] = [name not in ("normal", "height") for name in names]
+    is_observed = np.ones(sum(size for _, size in wider.layout), bool)
+    is_observed[: len(names)] = [name not in ("normal", "height") for name in names]
     count = 1e9
-    size = np.count_nonzero(kept)
+    size = np.count_nonzero(is_observed)
     seen = Statistics(np.float64(count), rng.normal(size=size), count * rng.uniform(0.5, 2.0, size))
     params = network.init(5, spec.layout, spec.action_size, sizes, spec.privileged_size)
     less = PolicyBundle(spec, plain, params, seen, normalizer.empty(), 3, "ab", 4)
     more = bundles.with_inputs_of(wider, normals, less)
-    raw = rng.normal(size=(6, len(kept))).astype(np.float32)
-    before = bundles.mean_action(spec.layout, less.inference_parameters, raw[:, kept])
+    raw = rng.normal(size=(6, len(is_observed))).astype(np.float32)
+    before = bundles.mean_action(spec.layout, less.inference_parameters, raw[:, is_observed])
     after = bundles.mean_action(wider.layout, more.inference_parameters, raw)
     np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-6)
     batch = normalizer.moments(raw, 1)
     news = normalizer.merge(
         more.observation, batch._replace(count=np.float64(1e6), m2=batch.m2 * 1e6 / 6)
     )
-    np.testing.assert_allclose(news.mean[~kept], raw[:, ~kept].mean(0), rtol=0.1, atol=1e-3)
+    np.testing.assert_allclose(
+        news.mean[~is_observed], raw[:, ~is_observed].mean(0), rtol=0.1, atol=1e-3
+    )
     with pytest.raises(CongraspError, match="is for hand 'human'"):
         bundles.with_inputs_of(spec, plain, more)

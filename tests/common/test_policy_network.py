@@ -147,8 +147,8 @@ def test_new_inputs_leave_results_unchanged(params):
     )
     layout = (("state", len(states) + 1), *LAYOUT[1:])
     means = [
-        network.policy(tree, *given)[0]
-        for tree, given in ((params, (LAYOUT, x)), (swapped, (layout, wider)))
+        network.policy(tree, *arguments)[0]
+        for tree, arguments in ((params, (LAYOUT, x)), (swapped, (layout, wider)))
     ]
     np.testing.assert_allclose(*means, rtol=1e-5, atol=1e-7)
 
@@ -191,11 +191,11 @@ def test_merging_any_partition_gives_the_whole(samples, cuts):
     one_by_one = normalizer.empty((3,))
     for part in parts:
         one_by_one = normalizer.merge(one_by_one, exact(part))
-    whole = exact(samples)
+    of_all = exact(samples)
     for got in (merged, one_by_one):
-        assert got.count == whole.count
-        np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(got.m2, whole.m2, rtol=1e-9, atol=1e-7)
+        assert got.count == of_all.count
+        np.testing.assert_allclose(got.mean, of_all.mean, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(got.m2, of_all.m2, rtol=1e-9, atol=1e-7)
 
 
 def test_merging_ranks_in_order_gives_every_rank_the_same_bits():

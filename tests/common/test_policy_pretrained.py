@@ -30,8 +30,8 @@ ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
 def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "FOLDER", tmp_path)
-    given = tmp_path / "mine.safetensors"
-    assert policy_file(given) == given
+    custom = tmp_path / "mine.safetensors"
+    assert policy_file(custom) == custom
     with pytest.raises(
         CongraspError, match=r"this installation has none for the hand 'human'.*--policy"
     ):
@@ -46,8 +46,8 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
 def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path))
     get_hand.cache_clear()
-    mine = dataclasses.replace(get_hand("human"), name="mine")
-    (tmp_path / "mine.json").write_text(hand_text(mine))
+    hand = dataclasses.replace(get_hand("human"), name="mine")
+    (tmp_path / "mine.json").write_text(hand_text(hand))
     assert pretrained_file("mine") is None
     assert hands_with_policy() == pretrained_hands()
     with pytest.raises(CongraspError, match=r"for the hand 'mine'.*congrasp hands train"):
@@ -66,7 +66,7 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     assert pretrained_file(str(tmp_path / "human.json")) is None
     assert pretrained_file("human").parent == module.FOLDER
     # Nor has a hand that was changed since the policy of the hand as it was before.
-    (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(mine, object_scale=0.9)))
+    (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.9)))
     get_hand.cache_clear()
     with pytest.raises(CongraspError, match=r"for an earlier version of the hand's file.*--policy"):
         policy_file(None, "mine")

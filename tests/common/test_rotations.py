@@ -94,12 +94,12 @@ def test_euler_angles_go_on_where_y_passes_ninety_degrees():
 @given(st.floats(-0.5, 0.5), st.sampled_from((1.0, -1.0)))
 def test_a_path_of_two_and_a_half_radians_about_y_is_followed_without_a_jump(x, sign):
     """Every angle of the steps is worked out by hand: x stays, y grows."""
-    wanted = np.stack([np.full(51, x), sign * np.linspace(0.0, 2.5, 51), np.zeros(51)], -1).astype(
+    angles = np.stack([np.full(51, x), sign * np.linspace(0.0, 2.5, 51), np.zeros(51)], -1).astype(
         np.float32
     )
-    near = wanted[0]
+    near = angles[0]
     for quaternion, expected in zip(
-        rotations.euler_to_quaternion(jnp.array(wanted)), wanted, strict=True
+        rotations.euler_to_quaternion(jnp.array(angles)), angles, strict=True
     ):
         near = rotations.quaternion_to_euler(quaternion, near)
         np.testing.assert_allclose(near, expected, atol=5e-3)

@@ -43,15 +43,17 @@ def to_capsules(
     """(n,) distances of points to the surface of the nearest capsule of some links."""
     position, quaternion = mujoco_link_poses(hand, q)
     turns = Rotation.from_quat(quaternion, scalar_first=True)
-    found = []
+    distances = []
     for ends, radius, link in zip(
         hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True
     ):
         if links is None or link in links:
             a, b = turns[int(link)].apply(ends - skin_of(hand).origins[link]) + position[link]
             share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
-            found.append(np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - radius)
-    return np.min(found, 0)
+            distances.append(
+                np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - radius
+            )
+    return np.min(distances, 0)
 
 
 def test_a_surface_net_of_a_ball_is_a_ball() -> None:
@@ -95,9 +97,9 @@ def test_a_skin_is_a_surface_with_weights(name: str) -> None:
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("fi,fi->f", flat, skin.normals[skin.faces].mean(1)) > 0).mean() > 0.995
     links, weights = skin.influences()
-    whole = np.zeros_like(skin.weights)
-    np.add.at(whole, (np.arange(len(links))[:, None], links), weights)
-    np.testing.assert_allclose(whole, skin.weights, atol=1e-6)
+    dense = np.zeros_like(skin.weights)
+    np.add.at(dense, (np.arange(len(links))[:, None], links), weights)
+    np.testing.assert_allclose(dense, skin.weights, atol=1e-6)
 
 
 def test_flesh_is_closed_and_fingers_have_no_webs() -> None:
@@ -133,9 +135,9 @@ def test_flesh_lies_on_the_capsules_of_the_fingers(closure: float) -> None:
     skin = skin_of(hand)
     for finger in range(len(hand.fingers)):
         links = set(np.flatnonzero(hand.link_fingers == finger))
-        own = points[skin.weights[:, sorted(links)[1:]].max(1) > 0.8]
-        assert len(own) > 40
-        distance = to_capsules(hand, q, own, links)
+        flesh = points[skin.weights[:, sorted(links)[1:]].max(1) > 0.8]
+        assert len(flesh) > 40
+        distance = to_capsules(hand, q, flesh, links)
         assert distance.max() < 2e-3
         assert distance.min() > -2e-3 - 2e-3 * closure
 
@@ -163,13 +165,13 @@ def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
     np.testing.assert_allclose(turned, turn.apply(normals), atol=1e-5)
     # A tip's own points move with its frame alone.
     tip = hand.tip_links[1]
-    own = skin.weights[:, tip] > 0.999
+    of_tip = skin.weights[:, tip] > 0.999
     position, quaternion = mujoco_link_poses(hand, hand.q_closed)
     expected = Rotation.from_quat(quaternion[tip], scalar_first=True).apply(
-        skin.points[own] - skin.origins[tip]
+        skin.points[of_tip] - skin.origins[tip]
     )
     np.testing.assert_allclose(
-        posed(hand, hand.q_closed)[0][own], expected + position[tip], atol=5e-5
+        posed(hand, hand.q_closed)[0][of_tip], expected + position[tip], atol=5e-5
     )
 
 

@@ -118,9 +118,9 @@ def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(
     )
     points, _ = near(of_mesh(mesh))
     exact = np.linalg.norm(points - trimesh.proximity.closest_point(mesh, points)[0], axis=-1)
-    found = at(distance_field([obj]), points)
+    interpolated = at(distance_field([obj]), points)
     # At the hole's axis it has a kink
-    error = np.abs(found - exact)[(exact > 0.002) & (exact < 0.017)]
+    error = np.abs(interpolated - exact)[(exact > 0.002) & (exact < 0.017)]
     assert error.mean() < 1e-4
     assert np.percentile(error, 99) < 5e-4
     hole, wall = at(distance_field([obj]), np.array([[0.005, 0.0, 0.0], [0.0275, 0.0, 0.0]]))
@@ -131,10 +131,10 @@ def test_grids_of_meshes_are_near_the_exact_distance_whichever_way_faces_wind(
 def test_each_object_has_its_own_grid_and_far_points_are_far():
     objects = [procedural.generate(1, "ball"), procedural.generate(2, "box")]
     field = distance_field(objects)
-    own = [distance_field([obj]) for obj in objects]
+    fields = [distance_field([obj]) for obj in objects]
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (40, 3))
     both = _at(field, np.array([1, 0]), np.stack([points, points]).astype(np.float32))
-    np.testing.assert_allclose(both, [at(own[1], points), at(own[0], points)], atol=1e-7)
+    np.testing.assert_allclose(both, [at(fields[1], points), at(fields[0], points)], atol=1e-7)
     far = np.array([[objects[1].visual_vertices[:, 0].max() + MARGIN + 0.1, 0.0, 0.0]])
     np.testing.assert_allclose(
         at(field, far, 1), primitive_distance(objects[1].pieces, far), atol=1e-3
@@ -198,8 +198,8 @@ def bowl(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return np.where(outer, 0.07, 0.067) * down, np.where(outer, down, -down)
 
 
-def degrees(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip(np.sum(np.asarray(found) * exact, -1), -1, 1)))
+def degrees(estimated: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(np.sum(np.asarray(estimated) * exact, -1), -1, 1)))
 
 
 @pytest.mark.parametrize(
@@ -217,9 +217,9 @@ def test_estimated_normals_are_near_the_exact_ones(shape, median, most, inward):
     """
     rng = np.random.default_rng(0)
     clouds, exact = map(np.stack, zip(*(shape(rng) for _ in range(20)), strict=True))
-    found = np.asarray(estimate(clouds.astype(np.float32)))
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-5)
-    errors = degrees(found, exact)
+    estimated = np.asarray(estimate(clouds.astype(np.float32)))
+    np.testing.assert_allclose(np.linalg.norm(estimated, axis=-1), 1.0, atol=1e-5)
+    errors = degrees(estimated, exact)
     assert np.median(errors) < median
     assert np.percentile(errors, 90) < most
     assert np.mean(errors > 90) <= inward
@@ -239,9 +239,9 @@ def test_normals_turn_with_the_cloud_whatever_its_unit_and_place():
 def test_repeated_points_count_once():
     points, exact = sphere(np.random.default_rng(3))
     twice = np.concatenate([points[:128], points[:128]])[None].astype(np.float32)
-    found = np.asarray(estimate(twice))[0]
-    np.testing.assert_allclose(found[:128], found[128:], atol=1e-6)
-    assert np.median(degrees(found[:128], exact[:128])) < 12.0
+    estimated = np.asarray(estimate(twice))[0]
+    np.testing.assert_allclose(estimated[:128], estimated[128:], atol=1e-6)
+    assert np.median(degrees(estimated[:128], exact[:128])) < 12.0
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
@@ -250,8 +250,8 @@ def test_any_cloud_has_unit_normals(count):
     line = np.linspace(0, 1, count)[:, None] * [[1, 0, 0]]
     clouds = np.stack([np.zeros((count, 3)), rng.normal(size=(count, 3)), line])
     for eye in (None, jnp.ones((3, 3))):
-        found = np.asarray(estimate(clouds, eye))
-        np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-5)
+        estimated = np.asarray(estimate(clouds, eye))
+        np.testing.assert_allclose(np.linalg.norm(estimated, axis=-1), 1.0, atol=1e-5)
 
 
 def test_normals_of_a_camera_point_toward_it():
@@ -262,10 +262,10 @@ def test_normals_of_a_camera_point_toward_it():
     eye = np.array([0.4, 0.5, 0.6])
     seen = np.sum(exact * (eye - points), -1) > 0
     cloud, exact = points[seen], exact[seen]
-    found = np.asarray(estimate(cloud[None], jnp.asarray(eye)[None]))[0]
-    assert (np.sum(found * (eye - cloud), -1) >= 0).all()
-    assert np.median(degrees(found, exact)) < 3.0
+    estimated = np.asarray(estimate(cloud[None], jnp.asarray(eye)[None]))[0]
+    assert (np.sum(estimated * (eye - cloud), -1) >= 0).all()
+    assert np.median(degrees(estimated, exact)) < 3.0
     sheet = np.random.default_rng(5).uniform(-0.05, 0.05, (COUNT, 3)) * [1, 1, 0]
     for side in (1.0, -1.0):
-        found = np.asarray(estimate(sheet[None], jnp.array([[0.0, 0.0, side]])))[0]
-        np.testing.assert_allclose(found, np.tile([0, 0, side], (COUNT, 1)), atol=1e-3)
+        estimated = np.asarray(estimate(sheet[None], jnp.array([[0.0, 0.0, side]])))[0]
+        np.testing.assert_allclose(estimated, np.tile([0, 0, side], (COUNT, 1)), atol=1e-3)

@@ -160,7 +160,7 @@ def test_normals_belong_to_the_nearest_points():
     before = np.asarray(OBSERVE(state, surface, goal))
     exact = surface._replace(normals=units(np.random.default_rng(0), 4, surface.points.shape[1]))
     task = dataclasses.replace(TASK, surface_normals=True)
-    found = np.asarray(
+    observed = np.asarray(
         jax.jit(lambda *given: observe(scene_of(HAND, task, *given)))(state, exact, goal)
     )
     described = fields(HAND, task)["state"]
@@ -169,11 +169,11 @@ def test_normals_belong_to_the_nearest_points():
     start = sum(field.size for field in described[: names.index("normal")])
     points = HAND.keypoints.shape[0]
     np.testing.assert_allclose(
-        np.delete(found, np.s_[start : start + 4 * points], 1), before, atol=1e-6
+        np.delete(observed, np.s_[start : start + 4 * points], 1), before, atol=1e-6
     )
     b = 2
-    normal = found[b, start : start + 3 * points].reshape(-1, 3)
-    height = found[b, start + 3 * points : start + 4 * points]
+    normal = observed[b, start : start + 3 * points].reshape(-1, 3)
+    height = observed[b, start + 3 * points : start + 4 * points]
     wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
     origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
     body = _rotation(state.object_quaternion[b])
@@ -455,10 +455,10 @@ def test_a_wrist_at_rest_starts_towards_its_guidance():
 def test_metrics_against_numpy():
     state, surface, goal = scene(18)
     geometry = FEATURES(state, surface, goal)
-    found = {}
+    expected_metrics = {}
     weights = {}
     for name, (numerator, denominator) in ERRORS(state, surface, goal).items():
-        found[name] = np.asarray(numerator)
+        expected_metrics[name] = np.asarray(numerator)
         weights[name] = np.asarray(denominator)
     b = 0
     wrist_position, wrist_quaternion = (np.asarray(x)[b] for x in WRIST(state))
@@ -467,23 +467,25 @@ def test_metrics_against_numpy():
     v = wrist.apply(grasp_frame(HAND).heading)
     target = body.apply(goal["heading"].direction[b])
     np.testing.assert_allclose(
-        found["heading_rad"][b], np.arccos(np.clip(v @ target, -1, 1)), atol=1e-4
+        expected_metrics["heading_rad"][b], np.arccos(np.clip(v @ target, -1, 1)), atol=1e-4
     )
     points = np.asarray(points_of(state.q[b]))
     center = wrist.apply(np.asarray(CENTER(points))) + wrist_position
     off = center - body.apply(goal["heading"].position[b]) - state.object_position[b]
     np.testing.assert_allclose(
-        found["heading_m"][b], np.linalg.norm(off - (off @ target) * target), atol=1e-4
+        expected_metrics["heading_m"][b], np.linalg.norm(off - (off @ target) * target), atol=1e-4
     )
     pose = body.apply(goal["pose"].position[b]) + state.object_position[b]
-    np.testing.assert_allclose(found["pose_m"][b], np.linalg.norm(wrist_position - pose), atol=1e-4)
+    np.testing.assert_allclose(
+        expected_metrics["pose_m"][b], np.linalg.norm(wrist_position - pose), atol=1e-4
+    )
     base = _rotation(state.base_quaternion[b])
     turn = base.inv() * body * _rotation(goal["pose"].quaternion[b])
     hinges = _joint_differences(turn, state.u[b, 3:])
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
-    np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
+    np.testing.assert_allclose(expected_metrics["pose_rad"][b], expected, atol=1e-3)
     links = np.sum(np.asarray(geometry.by_constraint["affordance"].touching)[b])
-    np.testing.assert_allclose(found["affordance_ratio"][b], links)
+    np.testing.assert_allclose(expected_metrics["affordance_ratio"][b], links)
     np.testing.assert_allclose(
         weights.pop("affordance_ratio")[b], np.sum(np.asarray(geometry.touching)[b])
     )
@@ -545,7 +547,7 @@ def test_an_error_is_divided_by_the_steps_that_were_summed(steps):
     accumulate = jax.jit(functools.partial(metrics.accumulate, TASK))
     for _ in range(steps):
         sums = accumulate(sums, step, approach=one > 0, hold=one < 0)
-    found = metrics.episode_errors(TASK, sums)
-    np.testing.assert_allclose(found["trajectory_m"], 0.2, rtol=1e-5)
-    np.testing.assert_allclose(found["trajectory_rad"], 0.2, rtol=1e-5)
-    np.testing.assert_allclose(found["heading_m"], 0.0)
+    errors = metrics.episode_errors(TASK, sums)
+    np.testing.assert_allclose(errors["trajectory_m"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(errors["trajectory_rad"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(errors["heading_m"], 0.0)

@@ -230,9 +230,9 @@ def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
     server.publish(KEYS.log("metrics", "learner", "0"), Message(meta={"n": -1}))
     last = None
     while last != -1:
-        found = subscription.receive(60)
-        assert found is not None
-        last = found[1].meta["n"]
+        newest = subscription.receive(60)
+        assert newest is not None
+        last = newest[1].meta["n"]
     dropped = subscription.dropped
     for n in range(10):
         server.publish(KEYS.log("event", "learner", "0"), Message({"x": np.zeros(3)}, {"n": n}))
@@ -376,8 +376,8 @@ def test_damaged_and_oversized_messages_are_refused():
             on_damage=lambda key, error: damaged.append(str(error)),
         )
         session = client.session(KEYS.act)
-        whole = encode(Message({"x": np.zeros(8)}))
-        for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
+        intact = encode(Message({"x": np.zeros(8)}))
+        for payload in (b"", intact[:-1], b"\xff" * 8 + intact[8:], intact[:-1] + b"\x01"):
             reply = next(iter(session.get(KEYS.act, payload=payload, timeout=60)))
             assert reply.err is not None
             assert b"message" in reply.err.payload.to_bytes().lower()

@@ -210,11 +210,11 @@ def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
         one = taker()
         other = taker()
         taken = take(one, 20)
-        given = take(other, 20)
-        assert len({*taken, *given}) == 40
+        ports = take(other, 20)
+        assert len({*taken, *ports}) == 40
         one.stdin.close()
         assert one.wait(20) == 0
         # Twenty were left: those of the process that ended are free again.
-        assert len({*given, *take(other, 30)}) == 50
+        assert len({*ports, *take(other, 30)}) == 50
         other.stdin.close()
         assert other.wait(20) == 0

@@ -29,13 +29,15 @@ VERSIONS = ("1.29", "1.37")  # of Kubernetes: the oldest and the newest
 
 def manifests(text=None):
     files = [text] if text else [path.read_text() for path in KUBERNETES.glob("*.yaml")]
-    found = [
+    documents = [
         document
         for file in files
         for document in yaml.safe_load_all(file)
         if "apiVersion" in document
     ]
-    return [document for document in found if not document["apiVersion"].startswith("kustomize")]
+    return [
+        document for document in documents if not document["apiVersion"].startswith("kustomize")
+    ]
 
 
 def compose_commands():
@@ -105,11 +107,11 @@ def test_compose_file_fits_the_schema_of_compose():
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_manifests_fit_the_schemas_of_kubernetes(version):
-    found = manifests()
-    for document in found:
+    documents = manifests()
+    for document in documents:
         kubernetes_validate.validate(document, version, strict=True)
     assert {"StatefulSet", "Deployment", "Service", "HorizontalPodAutoscaler", "NetworkPolicy"} < {
-        document["kind"] for document in found
+        document["kind"] for document in documents
     }
 
 
@@ -121,11 +123,11 @@ def test_a_mistake_in_a_manifest_is_found():
 
 
 def test_manifests_name_one_another_rightly():
-    found = manifests()
-    names = {(document["kind"], document["metadata"]["name"]) for document in found}
+    documents = manifests()
+    names = {(document["kind"], document["metadata"]["name"]) for document in documents}
     labels = {}
     ports = {}
-    for document in found:
+    for document in documents:
         if document["kind"] in ("StatefulSet", "Deployment"):
             template = document["spec"]["template"]
             labels[document["metadata"]["name"]] = template["metadata"]["labels"]
@@ -141,7 +143,7 @@ def test_manifests_name_one_another_rightly():
             }
             assert mounted == {volume["name"] for volume in template["spec"]["volumes"]} | claims
             assert template["spec"]["securityContext"]["runAsNonRoot"]
-    for document in found:
+    for document in documents:
         if document["kind"] == "Service":
             assert document["spec"]["selector"] == labels[document["metadata"]["name"]]
             assert {port["port"] for port in document["spec"]["ports"]} <= ports[
@@ -267,14 +269,14 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path, variables, port):
     )
     for rank in range(2):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
-        given = load(arguments[0])(arguments[1:]).keywords
-        options = given["options"]
+        keywords = load(arguments[0])(arguments[1:]).keywords
+        options = keywords["options"]
         assert options.rank == rank
         assert options.ranks == 2
         assert options.coordinator == f"node-7:{port}"
         assert options.listen == f"tcp/127.0.0.1:{port + 2}"
         assert options.run_dir == tmp_path / "a run"
-        assert given["config"].updates == 9
+        assert keywords["config"].updates == 9
         assert options.inside
 
 
@@ -340,9 +342,9 @@ def test_every_expression_names_metrics_that_are_exposed():
     server.answer("answered", 0.01)
     server.batch(3)
     with exposed(port, "127.0.0.1", learner, actor, server):
-        found = scrape(port)
-    names = {name for name, *_ in found}
-    labels = {label for _, *rest in found for label in rest}
+        metrics = scrape(port)
+    names = {name for name, *_ in metrics}
+    labels = {label for _, *rest in metrics for label in rest}
     expressions = [
         target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])
     ]

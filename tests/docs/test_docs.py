@@ -39,8 +39,8 @@ def command_lines():
     for page in PAGES:
         for block in blocks(page, "sh", "text", "console"):
             for line in block.replace("\\\n", " ").splitlines():
-                if found := re.match(r"^(?:\$ )?(?:\.venv/bin/)?congrasp (.*)", line):
-                    yield pytest.param(found[1], id=f"{page.stem}: {found[1][:60]}")
+                if match := re.match(r"^(?:\$ )?(?:\.venv/bin/)?congrasp (.*)", line):
+                    yield pytest.param(match[1], id=f"{page.stem}: {match[1][:60]}")
 
 
 def commands_of_modules():

@@ -73,8 +73,8 @@ def test_a_users_page_is_short(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_a_page_is_written_in_plain_english(page):
-    found = {match[0].lower() for match in BANNED.finditer(prose(page))}
-    assert not found
+    banned = {match[0].lower() for match in BANNED.finditer(prose(page))}
+    assert not banned
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -115,7 +115,7 @@ def test_links_lead_somewhere(page):
 def test_the_functions_that_the_architecture_lists_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
     file = ""
-    found = 0
+    functions = 0
     for path, name in re.findall(r"^(\S+/\S*)? +(?:(?:[A-Z]\w+)\.)?(\w+) {2,}\S.*$", page, re.M):
         file = path or file
         if file:
@@ -127,8 +127,8 @@ def test_the_functions_that_the_architecture_lists_exist():
                 file,
                 name,
             )
-            found += 1
-    assert found >= 20
+            functions += 1
+    assert functions >= 20
 
 
 def glossary():

@@ -50,7 +50,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     hub = MemoryHub()
     journal = tmp_path / "actor.jsonl"
     actor = MadeUpActor(MemoryTransport(hub), journal=lambda run_id: Journal(journal))
-    said = []
+    lines = []
     complaints = []
     filler = []
     warnings = []
@@ -75,20 +75,20 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
             outputs=Outputs(
                 recorder=recorder,
                 on_update=on_update,
-                on_event=lambda level, text: said.append((level, text)),
+                on_event=lambda level, text: lines.append((level, text)),
             ),
         )
     actor.join(10.0)
     assert last.version == 12
     assert actor.ended == "The run is finished."
-    errors = [text for level, text in said if level == "error"]
+    errors = [text for level, text in lines if level == "error"]
     # Although every update tries again
     (error,) = (text for text in errors if "checkpoint_" in text)
     assert "checkpoint_000000004.safetensors could not be written" in error
     assert "A kill now would lose 2 update(s), those since update 2." in error
     (warning,) = (text for text in warnings if "checkpoint_000000005" in text)
     assert "A kill now would lose 3 update(s), those since update 2." in warning
-    assert ("info", "Checkpoints can be written again; the newest is of update 8.") in said
+    assert ("info", "Checkpoints can be written again; the newest is of update 8.") in lines
     assert not any("\n" in text for text in errors)
     assert complaints == [recorder.error]
     assert "No space left" in recorder.error

@@ -71,15 +71,15 @@ def test_a_killed_learner_costs_no_rollout(cluster):
     for name in ("a", "b"):
         outcomes = cluster.outcomes(name)
         assert sorted(entry["sequence"] for entry in outcomes) == list(range(len(outcomes)))
-        asked = {entry["sequence"] for entry in outcomes if entry["outcome"] == "unknown"}
+        undecided = {entry["sequence"] for entry in outcomes if entry["outcome"] == "unknown"}
         taken = {
             entry["sequence"] for entry in outcomes if entry["outcome"] in ("accepted", "duplicate")
         }
-        assert len(asked) <= 2  # on their way when the learner ended
+        assert len(undecided) <= 2  # on their way when the learner ended
         assert {
             sequence for actor, _, sequence in final["history"] if actor == name
-        } <= taken | asked
-        made, unknown = made + len(outcomes), unknown + len(asked)
+        } <= taken | undecided
+        made, unknown = made + len(outcomes), unknown + len(undecided)
     ledger = final["counters"]
     assert (
         made - unknown

@@ -177,23 +177,23 @@ def mutated(rng, message):
 @contextlib.contextmanager
 def no_tracebacks():
     """Fails if anything is logged with a traceback, or a thread dies, while the block runs."""
-    found = []
+    tracebacks = []
 
     class Handler(logging.Handler):
         def emit(self, record):
             if record.exc_info:
-                found.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
+                tracebacks.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
 
     handler = Handler()
     before = threading.excepthook
     logging.getLogger().addHandler(handler)
-    threading.excepthook = lambda arguments: found.append(repr(arguments.exc_value))
+    threading.excepthook = lambda arguments: tracebacks.append(repr(arguments.exc_value))
     try:
         yield
     finally:
         logging.getLogger().removeHandler(handler)
         threading.excepthook = before
-    assert not found, found[:3]
+    assert not tracebacks, tracebacks[:3]
 
 
 def memory():
@@ -209,7 +209,7 @@ def requests():
     who = {"actor": "NAME", "incarnation": "01"}
     made = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
     named = {**made.arrays, "episode/success": np.ones(1, np.float32)}
-    asked = {
+    queries = {
         KEYS.config: Message(),
         KEYS.status: Message(),
         KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
@@ -233,7 +233,7 @@ def requests():
             meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}
         ),
     }
-    return list(asked.items()), list(told.items())
+    return list(queries.items()), list(told.items())
 
 
 LAYOUT = Layout(get_hand("human"), TaskConfig(surface_points=8, trajectory_points=3))
@@ -267,7 +267,7 @@ def served(endpoint, folder):
 def test_mutated_messages_at_every_key(tmp_path):
     rng = random.Random(SEED)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    asked, told = requests()
+    queries, told = requests()
     with (
         no_tracebacks(),
         served(endpoint, tmp_path) as (hub, rollouts, recorder),
@@ -277,7 +277,7 @@ def test_mutated_messages_at_every_key(tmp_path):
         first = 0
         sent = 0
         while (now := time.monotonic()) < began + SECONDS:
-            key, message = rng.choice(asked if rng.random() < 0.7 else told)
+            key, message = rng.choice(queries if rng.random() < 0.7 else told)
             name = f"{rng.randrange(2000)}.x"
             meta = {k: name if v == "NAME" else v for k, v in message.meta.items()}
             session = raw.session(key)
@@ -303,8 +303,8 @@ def test_mutated_messages_at_every_key(tmp_path):
                     )
             sent += 1
             if sent % 50 == 0:
-                shown = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
-                token = raw.session(KEYS.status).liveliness().declare_token(shown)
+                token_key = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
+                token = raw.session(KEYS.status).liveliness().declare_token(token_key)
                 token.undeclare() if rng.random() < 0.5 else None
                 assert hub.status()["run"] == "chaos"
             if not first and time.monotonic() > began + SECONDS / 3:
@@ -440,10 +440,10 @@ def test_mutated_files_at_every_loader(tmp_path):
                 assert "\n" not in str(error)
                 assert len(str(error)) < 3000
             except Exception as error:
-                kept = tmp_path / "failed"
-                kept.write_bytes(data)
+                failures = tmp_path / "failed"
+                failures.write_bytes(data)
                 raise AssertionError(
-                    f"{path.name}, seed {SEED}, number {count}: {error!r}, see {kept}"
+                    f"{path.name}, seed {SEED}, number {count}: {error!r}, see {failures}"
                 ) from error
             assert time.monotonic() - now < LONGEST, path.name
             count += 1

@@ -52,14 +52,14 @@ def rollout(number, bundle):
 def feed(hub, ended):
     """Sends every update the rollouts of its number, and no others."""
     keys = Keys(RUN.name)
-    known = None
+    version = None
     transport = MemoryTransport(hub)
     while not ended.is_set():
         try:
             bundle = transport.query(
                 keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5
             )
-            if not bundle.arrays or bundle.meta["version"] == known:
+            if not bundle.arrays or bundle.meta["version"] == version:
                 time.sleep(0.005)
                 continue
             update = bundle.meta["transitions"] // (BATCH * STEPS * WORLDS)
@@ -72,7 +72,7 @@ def feed(hub, ended):
                     not in arrived
                 ):
                     time.sleep(0.005)
-            known = bundle.meta["version"]
+            version = bundle.meta["version"]
         except TransportError:
             time.sleep(0.01)
 

@@ -69,11 +69,11 @@ class Run:
 
     def connect(self, name, endpoint=None, **options):
         """A session of whoever has the certificate of this name."""
-        mine = Credentials(self.certs / name, name.split(".")[0])
+        credentials = Credentials(self.certs / name, name.split(".")[0])
         options = {"flows": ("policy",)} | options if endpoint == self.policy else options
         endpoint = endpoint or self.endpoint
         return self.stack.enter_context(
-            ZenohTransport(connect=[endpoint], credentials=mine, **options)
+            ZenohTransport(connect=[endpoint], credentials=credentials, **options)
         )
 
 
@@ -118,12 +118,12 @@ def run(shared):
 
 def heard(subscription, seconds=0.7):
     """Keys of all that arrives within a while."""
-    found = []
+    messages = []
     deadline = time.monotonic() + seconds
     while (rest := deadline - time.monotonic()) > 0:
         if received := subscription.receive(rest):
-            found.append(received[0])
-    return found
+            messages.append(received[0])
+    return messages
 
 
 def answers(transport, key, message=None):
@@ -186,11 +186,11 @@ def test_an_actor_whose_certificate_came_later_works_at_once(run):
 
 def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    mine = Credentials(certs / "actor.0", "actor")
+    credentials = Credentials(certs / "actor.0", "actor")
     learner = Credentials(certs / "learner.0", "learner")
     flows = ("control",)
     server = ZenohTransport(listen=[endpoint], credentials=learner, flows=flows)
-    with ZenohTransport(connect=[endpoint], credentials=mine, flows=flows) as actor:
+    with ZenohTransport(connect=[endpoint], credentials=credentials, flows=flows) as actor:
         server.close()
         with ZenohTransport(listen=[endpoint], credentials=learner, flows=flows) as server:
             for keys in (KEYS.tickets, KEYS.status):
@@ -248,8 +248,8 @@ def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(r
         assert {name for name, key in EVERYTHING.items() if answered(transport, key)} == may, who
     for who, may in MAY_ASK_THE_POLICY.items():
         session = run.connect(who, run.policy)
-        asked = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
-        assert {key for key in asked if answers(session, key)} == may, who
+        policy_keys = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
+        assert {key for key in policy_keys if answers(session, key)} == may, who
 
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
@@ -266,7 +266,7 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
         run.transport.subscribe("congrasp/safe/**", depth=64),
         run.transport.subscribe(KEYS.logs, depth=64),
     )
-    asked = []
+    queries = []
     for key in (
         KEYS.weights,
         KEYS.status,
@@ -275,7 +275,7 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
         KEYS.rollout(OTHER),
         KEYS.act,
     ):
-        thief.serve(key, lambda key, request: asked.append(key) or Message(meta={"forged": True}))
+        thief.serve(key, lambda key, request: queries.append(key) or Message(meta={"forged": True}))
     time.sleep(0.3)
     for key in (
         KEYS.announcement,
@@ -294,7 +294,7 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
         ).meta
     )
     assert answers(run.transport, KEYS.act) is None
-    assert asked == []
+    assert queries == []
 
 
 def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
@@ -394,14 +394,14 @@ def test_every_right_is_a_key_of_a_run():
         KEYS.log("x", "actor", "name"),
     }
     real = {key.removeprefix("congrasp/safe/").replace("/x", "/*") for key in real}
-    given = {
+    keys_of_rights = {
         key.replace("{name}", "name")
         for listener in RIGHTS.values()
         for rights in listener.values()
         for keys in dataclasses.asdict(rights).values()
         for key in keys
     }
-    assert given == real
+    assert keys_of_rights == real
 
 
 # --- who does not get in ---
@@ -444,8 +444,8 @@ def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
     no connection.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    mine = Credentials(request.getfixturevalue(folder) / who, "learner")
-    with ZenohTransport(listen=[endpoint], credentials=mine):
+    credentials = Credentials(request.getfixturevalue(folder) / who, "learner")
+    with ZenohTransport(listen=[endpoint], credentials=credentials):
         _refused(endpoint, Credentials(certs / "actor.1", "actor"), "not trusted")
 
 
@@ -453,11 +453,11 @@ def test_a_certificate_serves_the_run_that_it_names(run, certs):
     """Another run's certificates of the same authority open the connection, and nothing behind
     it.
     """
-    mine = {
+    credentials = {
         "actor": (KEYS.config, KEYS.ticket("20.a"), KEYS.rollout("20.a"), Keys("other").config),
         "observer": (KEYS.config, KEYS.status, Keys("other").status),
     }
-    for role, keys in mine.items():
+    for role, keys in credentials.items():
         folder = issue(certs, role, run="other", number=20, force=True)
         with pytest.raises(CongraspError, match=r"safe.learner.0', which may not listen for other"):
             run.connect(folder.name)
@@ -507,17 +507,17 @@ def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
     ) as actor:
         assert answers(actor, KEYS.config)
         learner.close()
-        asked = []
+        queries = []
         with ZenohTransport(
             listen=[endpoint], credentials=Credentials(certs / "server.0", "server")
         ) as thief:
             for key in (KEYS.config, KEYS.ticket(ME)):
-                thief.serve(key, lambda key, request: asked.append(key) or Message())
+                thief.serve(key, lambda key, request: queries.append(key) or Message())
             eventually(lambda: list(thief.session(KEYS.config).info.links()))
             time.sleep(0.3)
             assert answers(actor, KEYS.config) is None
             assert answers(actor, KEYS.ticket(ME)) is None
-            assert asked == []
+            assert queries == []
 
 
 def test_who_is_revoked_is_out_and_the_others_stay(fresh):
@@ -623,12 +623,13 @@ def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(
         with PolicyClient(fresh.policy, "safe", certs=certs / "client.0") as client:
             revoke(certs, "learner", 0)
             for process in processes:
-                _, said = process.communicate(timeout=40)
+                _, errors = process.communicate(timeout=40)
                 assert process.returncode
                 assert (
-                    "congrasp: error: The listener's certificate safe.learner.0 is revoked" in said
+                    "congrasp: error: The listener's certificate safe.learner.0 is revoked"
+                    in errors
                 )
-                assert "Traceback" not in said
+                assert "Traceback" not in errors
             assert client.health()["ready"]  # the policy server is another
     finally:
         for process in processes:

@@ -61,13 +61,13 @@ or JAX itself.
 def die_in(phase: str) -> None:
     """Kills this process at that call, as the kernel would."""
     place, name, number = PHASES[phase]
-    given = getattr(place, name)
+    function = getattr(place, name)
     calls = iter(range(1, number))
 
     def last(*args: object, **options: object) -> object:
         if next(calls, None) is None:
             os.kill(os.getpid(), signal.SIGKILL)
-        return given(*args, **options)
+        return function(*args, **options)
 
     setattr(place, name, last)
 

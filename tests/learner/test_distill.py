@@ -51,18 +51,19 @@ def batch(run, seed, worlds=WORLDS):
     can learn from.
     """
     rng = np.random.default_rng(seed)
-    own, whole = (
+    student_seen, teacher_seen = (
         sum(size for _, size in policy_spec(task, NETWORK).layout)
         for task in (run.task, dataclasses.replace(run.task, observation="full"))
     )
-    seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
+    seen = rng.normal(size=(STEPS, worlds, max(student_seen, teacher_seen))).astype(np.float32)
     # One for all: it can be learnt
-    given = (
-        np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
-    )
-    given = np.broadcast_to(given, (STEPS, worlds, len(given)))
-    taught = np.concatenate([seen[..., :whole], given], -1)
-    return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": taught}
+    mean = np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
+    mean = np.broadcast_to(mean, (STEPS, worlds, len(mean)))
+    taught = np.concatenate([seen[..., :teacher_seen], mean], -1)
+    return {
+        "observation": seen[..., :student_seen].astype(np.float16),
+        "teacher_observation": taught,
+    }
 
 
 def algorithm(run):
@@ -81,13 +82,15 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
         jnp.zeros_like, state.params["actor"]["network"]["output"]
     )
     bundle = bundles.load(teacher)
-    wanted = mean_action(
+    teacher_action = mean_action(
         bundle.spec.layout,
         bundle.inference_parameters,
         rows["teacher_observation"][..., : -extra(get_hand("allegro"))],
     )
     labels = np.asarray(
-        student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted)
+        student_action(
+            get_hand("allegro"), TASK.control, rows["teacher_observation"], teacher_action
+        )
     )
     deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
     after, metrics = student.update(state, rows)

@@ -132,8 +132,8 @@ def test_tickets_run_out_and_return(bench):
 
 
 def test_death_returns_tickets_and_is_told(bench):
-    said = []
-    b = bench(version=0, max_staleness=0, batch=1, on_event=lambda *event: said.append(event))
+    logged = []
+    b = bench(version=0, max_staleness=0, batch=1, on_event=lambda *event: logged.append(event))
     events = b.peer.subscribe(KEYS.logs, depth=8)
     actor = MemoryTransport(b.memory)
     actor.declare_alive(KEYS.alive("actor", "a", "01"))
@@ -143,7 +143,7 @@ def test_death_returns_tickets_and_is_told(bench):
     key, event = events.receive(60)
     assert key == KEYS.log("event", "learner", "0")
     assert event.meta["text"] == "The actor a left; 1 of its tickets returned."
-    assert said == [("info", event.meta["text"])]
+    assert logged == [("info", event.meta["text"])]
     assert b.ledger()["returned"] == 1
     assert b.ticket("u")["granted"]
     assert _roles(b) == {("learner", "0")}
@@ -226,9 +226,9 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
 def test_nobody_speaks_for_another(bench):
     b = bench(version=0)
     assert b.ticket("t")["granted"]
-    asked = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
+    request = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
     with pytest.raises(RefusedError, match=r"Actor 'a' published on .*/ticket/b'"):
-        b.ask(KEYS.ticket("b"), asked)
+        b.ask(KEYS.ticket("b"), request)
     reply = b.peer.query(KEYS.rollout("b"), rollout(), timeout=60).meta
     assert reply["outcome"] == "refused"
     assert "the key of another actor" in reply["why"]
@@ -278,10 +278,10 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
     answers = [b.send(0, actor="1.b", steps=1) for _ in range(4)]
     assert [answer["outcome"] for answer in answers] == ["refused", "refused", "retry", "retry"]
     assert 0.5 < answers[-1]["retry_after"] <= 1.0
-    asked = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
+    reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
     # Another name of the same certificate
-    assert not asked["granted"]
-    assert asked["retry_after"] > 0.5
+    assert not reply["granted"]
+    assert reply["retry_after"] > 0.5
     assert b.ticket()["granted"]
     assert b.send(0)["outcome"] == "accepted"
     time.sleep(1.0)
@@ -479,27 +479,27 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 40), st.booleans()), max_size=120))
 def test_deduplication_is_exact_within_its_window(arrivals):
-    known = Sequences()
+    decisions = Sequences()
     decided = {}
     for sequence, accepted in arrivals:
-        assert (sequence in known) == (sequence in decided)
-        assert (sequence in known.refused) == (decided.get(sequence) is False)
+        assert (sequence in decisions) == (sequence in decided)
+        assert (sequence in decisions.refused) == (decided.get(sequence) is False)
         if sequence not in decided:
-            known.add(_header(sequence), accepted)
+            decisions.add(_header(sequence), accepted)
             decided[sequence] = accepted
-        assert known.missing == max(decided) + 1 - len(decided)
-    assert known.rollouts == sum(decided.values())
+        assert decisions.missing == max(decided) + 1 - len(decided)
+    assert decisions.rollouts == sum(decided.values())
 
 
 def test_deduplication_stays_small_whatever_is_missing():
-    known = Sequences(granted=20_000)
+    decisions = Sequences(granted=20_000)
     for sequence in range(1, 20_000, 2):
-        known.add(_header(sequence), sequence % 3 > 0)
-        assert len(known.ahead) <= 64
-        assert len(known.refused) <= 64
-    assert 19_999 in known
-    assert 20_001 not in known
-    assert known.missing == 10_000
+        decisions.add(_header(sequence), sequence % 3 > 0)
+        assert len(decisions.ahead) <= 64
+        assert len(decisions.refused) <= 64
+    assert 19_999 in decisions
+    assert 20_001 not in decisions
+    assert decisions.missing == 10_000
 
 
 def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
@@ -646,7 +646,7 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, lo
 
 
 def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log, folder):
-    said = []
+    logged = []
     b = bench(version=0, log=log())
     for i in range(4):
         assert b.send(i)["outcome"] == "accepted"
@@ -659,9 +659,9 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log, folder)
     # Which would keep a reader waiting for ever
     os.mkfifo(folder / "000000000008~a~01~7.safetensors")
     (folder / "notes.txt").write_text("not ours")
-    resumed = bench(version=1, log=log(), on_event=lambda *event: said.append(event))
+    resumed = bench(version=1, log=log(), on_event=lambda *event: logged.append(event))
     assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 3]
-    assert ("error", "3 accepted rollouts are damaged on disk and were ignored.") in said
+    assert ("error", "3 accepted rollouts are damaged on disk and were ignored.") in logged
     kinds = sorted(path.suffix for path in folder.iterdir())
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
@@ -680,13 +680,13 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
 
 
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
-    said = []
+    logged = []
     (tmp_path / "file").touch()
     folder = tmp_path / "file" / "log"
-    b = bench(version=0, batch=3, log=WriteAheadLog(folder, 1, log_error=said.append))
+    b = bench(version=0, batch=3, log=WriteAheadLog(folder, 1, log_error=logged.append))
     assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
-    assert len(said) == 1
-    assert "they do not survive the learner" in said[0]
+    assert len(logged) == 1
+    assert "they do not survive the learner" in logged[0]
     (tmp_path / "file").unlink()
     assert b.send(3)["outcome"] == "accepted"
     assert on_disk(folder) == [3]

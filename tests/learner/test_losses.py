@@ -214,8 +214,8 @@ ROWS = {"observation": (12,), "action": (2,), "log_probability": (), "reward": (
 def evaluate(batch):
     params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(64,), encoder=2))
     one = normalizer.Affine(jnp.float32(0.0), jnp.float32(1.0))
-    given = losses.Inputs(batch, one, None, one, {**HYPER, "decoupled": True})
-    return losses.evaluate(params, given, Collectives(None), LAYOUT)
+    inputs = losses.Inputs(batch, one, None, one, {**HYPER, "decoupled": True})
+    return losses.evaluate(params, inputs, Collectives(None), LAYOUT)
 
 
 def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
@@ -227,10 +227,12 @@ def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
         "lag": np.zeros(3, np.int32),
         "last_observation": rng.normal(size=(3, 12)).astype(np.float32),
     }
-    whole = evaluate(batch)
+    at_once = evaluate(batch)
     monkeypatch.setattr(losses, "MAX_TOGETHER", 6)
     jax.tree.map(
-        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), evaluate(batch), whole
+        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5),
+        evaluate(batch),
+        at_once,
     )
 
 

@@ -192,8 +192,8 @@ def test_divergence_and_noise_are_bounded_as_the_run_settles():
     targets = [settings.kl_target_at(version, 1000) for version in (0, 800, 900, 1000, 1200)]
     np.testing.assert_allclose(targets, [0.01, 0.01, 0.0055, 0.001, 0.001], rtol=1e-9)
     settings = PPOConfig(settling=0.3, final_std=0.1, least_std=0.35)
-    kept = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
-    np.testing.assert_allclose(kept, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
+    noise = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
+    np.testing.assert_allclose(noise, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
     assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [
         0.35,
         0.35,

@@ -152,22 +152,22 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     learn(
         tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set()
     )
-    kept = tmp_path / "checkpoints"
-    (kept / "latest").unlink()
-    (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
+    checkpoints = tmp_path / "checkpoints"
+    (checkpoints / "latest").unlink()
+    (checkpoints / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
     with pytest.raises(CongraspError, match=r"has checkpoints of a run\. Pass --resume"):
         learn(tmp_path, hub)
     seen = []
-    said = []
+    logged = []
     learn(
         tmp_path,
         hub,
         dataclasses.replace(CONFIG, updates=7),
         resume=True,
         on_update=lambda values: seen.append((values["update"], values["version"])),
-        on_event=lambda level, text: said.append(text),
+        on_event=lambda level, text: logged.append(text),
     )
     # Versions up to 5 are out, and 6 is what the resume begins with
     assert seen == [
@@ -175,9 +175,9 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
         (6, 8),
         (7, 9),
     ]
-    assert f"Resuming from the checkpoint {kept}/checkpoint_000000004.safetensors." in said
-    assert any("000000005.safetensors is damaged" in text for text in said)
-    assert (kept / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
+    assert f"Resuming from the checkpoint {checkpoints}/checkpoint_000000004.safetensors." in logged
+    assert any("000000005.safetensors is damaged" in text for text in logged)
+    assert (checkpoints / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
@@ -199,8 +199,8 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
         "batch.safetensors",
     }
     # What waited is taken up by a resume, the batch itself is not.
-    kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
-    assert not kept & {0, 1}
+    stored = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
+    assert not stored & {0, 1}
 
 
 def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
@@ -210,22 +210,22 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
     actor = act(reward=1e37)
-    said = []
+    logged = []
     seen = []
 
     def on_event(level, text):
         if "The batch was dropped" in text:
-            said.append((level, text))
+            logged.append((level, text))
             actor.reward = 1.0
 
     last = learn(tmp_path, hub, config, on_event=on_event, on_update=seen.append)
     dropped = [values["batches_dropped"] for values in seen]
-    assert 1 <= len(said) == dropped[-1] < 5
-    assert said[0][0] == "error"
+    assert 1 <= len(logged) == dropped[-1] < 5
+    assert logged[0][0] == "error"
     assert [values["update"] for values in seen] == list(range(1, 9))
     assert last.version == 8
     learnt = [values for values in seen if "policy_loss" in values]
-    assert len(learnt) == 8 - len(said)
+    assert len(learnt) == 8 - len(logged)
     assert np.isfinite([values["policy_loss"] for values in learnt]).all()
     assert np.isfinite(last.value.mean)
     assert abs(last.value.mean) < 100
@@ -269,13 +269,13 @@ def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
     stopped = threading.Event()
     stopped.set()
-    given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
-    create_run(tmp_path / "two", CONFIG, given)
+    initial = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
+    create_run(tmp_path / "two", CONFIG, initial)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)
     assert begun.version == 0
-    assert begun.run_id != given.run_id
-    jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
-    other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
+    assert begun.run_id != initial.run_id
+    jax.tree.map(np.testing.assert_array_equal, begun.params, initial.params)
+    other = dataclasses.replace(initial, spec=dataclasses.replace(initial.spec, hand="claw"))
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
         create_run(tmp_path / "three", CONFIG, other)
     assert not (tmp_path / "three").exists()

@@ -267,9 +267,9 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     words = job.kill(0)
     assert "Rank 0 ended. Rank 1 cannot continue alone: start all ranks with --resume." in words
 
-    kept = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
-    assert kept >= 5  # the first update after a resume has a checkpoint of its own
-    job.start(kept + 3, "resume")
+    saved = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
+    assert saved >= 5  # the first update after a resume has a checkpoint of its own
+    job.start(saved + 3, "resume")
     first, second = job.finish()
     steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
     (said,), (other,) = (
@@ -278,36 +278,36 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     )
     # Weights, normalisers and versions, bit for bit, though the rollouts were not the same
     assert said == other
-    assert int(said[1]) == steps * (kept + 3)
+    assert int(said[1]) == steps * (saved + 3)
 
-    job.start(kept + 5, "resume", count=1)
+    job.start(saved + 5, "resume", count=1)
     (alone,) = job.finish()
     assert "The checkpoint has 2 rank(s), this run has 1" in alone
-    assert int(alone.split()[-1]) == steps * (kept + 3) + steps // 2 * 2
+    assert int(alone.split()[-1]) == steps * (saved + 3) + steps // 2 * 2
 
 
 @pytest.mark.timeout(900)
 @pytest.mark.slow
 def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_resumes(job):
-    kept = 0
+    saved = 0
     mode = "fresh"
     for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):
         victim = int(doom[0])
-        job.start(kept + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
+        job.start(saved + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
         assert f"Rank {victim} ended. Rank {1 - victim} cannot continue alone" in job.last_words(
             victim
         ), doom
         checkpoints = sorted((job.run_dir / "checkpoints").glob("checkpoint_*.safetensors"))
         assert bool(checkpoints) == (doom != "1:join")
-        kept, mode = (
+        saved, mode = (
             (int(checkpoints[-1].stem.removeprefix("checkpoint_")), "resume")
             if checkpoints
             else (0, "fresh")
         )
-    job.start(kept + 2, "resume", 3)
+    job.start(saved + 2, "resume", 3)
     (bundle,) = {text.split("bundle")[1] for text in job.finish()}
     steps = CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
-    assert int(bundle.split()[1]) == steps * (2 * kept + 3 * 2)
+    assert int(bundle.split()[1]) == steps * (2 * saved + 3 * 2)
 
 
 # --- collectives ---

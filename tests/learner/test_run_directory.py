@@ -155,8 +155,8 @@ def test_one_learner_at_a_time_until_it_dies(run):
         assert other.stdout.readline() == b"mine\n"
         with listening(folder, "tcp/127.0.0.1:7"), pytest.raises(CongraspError) as refused:
             continue_run(folder, dataclasses.replace(config, updates=9))
-        said = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
-        assert said in str(refused.value)
+        error = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
+        assert error in str(refused.value)
         assert open_run(folder) == config
         other.kill()
         assert other.wait() == -signal.SIGKILL
@@ -279,10 +279,10 @@ def test_no_checkpoint_a_damaged_one_and_one_of_another_shape(tmp_path):
 
 def lines_of(checkpoints: Checkpoints) -> tuple[float, list[str]]:
     """The value in the checkpoint that is found, and what was said."""
-    said: list[str] = []
-    loaded, _ = checkpoints.load(tree(0.0), lambda level, text: said.append(text))
-    assert not any("\n" in text for text in said)
-    return loaded["host"][0], said
+    lines: list[str] = []
+    loaded, _ = checkpoints.load(tree(0.0), lambda level, text: lines.append(text))
+    assert not any("\n" in text for text in lines)
+    return loaded["host"][0], lines
 
 
 @pytest.mark.parametrize("link", ["missing", "dangling", "of an older one"])
@@ -294,9 +294,9 @@ def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
     if link != "missing":
         name = "nothing" if link == "dangling" else "checkpoint_000000008.safetensors"
         (tmp_path / "latest").symlink_to(name)
-    value, said = lines_of(checkpoints)
+    value, lines = lines_of(checkpoints)
     assert value == 10.0
-    assert said == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
+    assert lines == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
 
 
 def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
@@ -304,11 +304,11 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     paths = [checkpoints.save(tree(version), {}, version) for version in (1, 2, 3)]
     paths[2].write_bytes(paths[2].read_bytes()[:-3])
     paths[1].write_bytes(b"")
-    value, said = lines_of(checkpoints)
+    value, lines = lines_of(checkpoints)
     assert value == 1.0
-    assert len(said) == 3
-    assert "000000003.safetensors is damaged: The message" in said[0]
-    assert "000000002.safetensors is damaged" in said[1]
+    assert len(lines) == 3
+    assert "000000003.safetensors is damaged: The message" in lines[0]
+    assert "000000002.safetensors is damaged" in lines[1]
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0

@@ -201,12 +201,12 @@ class Admission(RuleBasedStateMachine):
         elif (
             must_fit
             or capacity > 0
-            or (mine := [held for held in self.tickets if held[0] == key[0]])
+            or (tickets := [held for held in self.tickets if held[0] == key[0]])
         ):
             assert verdict == "accepted"
             if not must_fit and capacity <= 0:  # under the oldest of its owner's tickets
-                del self.tickets[mine[0]]
-                key = mine[0]
+                del self.tickets[tickets[0]]
+                key = tickets[0]
                 must_fit = True
             if must_fit:
                 self.delivered.append(key[0])
@@ -232,9 +232,9 @@ class Admission(RuleBasedStateMachine):
 
     @rule(owner=owners)
     def die(self, owner):
-        mine = [key for key in self.tickets if key[0] == owner]
-        assert self.staleness.forget(owner) == len(mine)
-        for key in mine:
+        tickets = [key for key in self.tickets if key[0] == owner]
+        assert self.staleness.forget(owner) == len(tickets)
+        for key in tickets:
             del self.tickets[key]
 
     @rule(seconds=st.floats(0, 6))
@@ -261,8 +261,8 @@ class Admission(RuleBasedStateMachine):
         twice as long.
         """
         usual = statistics.median(self.useful) if self.useful else math.inf
-        own = statistics.median(self.needed[key[0][0]][-16:] or [0.0])
-        return self.now - self.granted[key] <= 4 * usual and own <= 2 * usual
+        duration = statistics.median(self.needed[key[0][0]][-16:] or [0.0])
+        return self.now - self.granted[key] <= 4 * usual and duration <= 2 * usual
 
     @invariant()
     def bound_and_books(self):

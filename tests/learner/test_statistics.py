@@ -132,23 +132,23 @@ def test_pace_forgets_what_is_outside_its_window():
 def first_alarm(success, links, patience=20):
     watch = CollapseWatch(patience)
     for update, (rate, touching) in enumerate(zip(success, links, strict=True), 1):
-        if said := watch.add({"episode/success": rate, "episode/links_at_removal": touching}):
-            return update, said
+        if alarm := watch.add({"episode/success": rate, "episode/links_at_removal": touching}):
+            return update, alarm
     return None
 
 
 def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
     # Ten updates at 80 % and then none: the mean of ten is below 40 % from the sixth on, so the
     # twentieth is the 25th.
-    update, said = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
+    update, alarm = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
     assert update == 10 + 6 + 19
-    assert "fell from 80% to 0%" in said
+    assert "fell from 80% to 0%" in alarm
 
 
 def test_a_hand_that_never_touches_is_said():
-    update, said = first_alarm([0.0] * 50, [0.05] * 50)
+    update, alarm = first_alarm([0.0] * 50, [0.05] * 50)
     assert update == 20
-    assert "hardly touched" in said
+    assert "hardly touched" in alarm
 
 
 @pytest.mark.parametrize(

@@ -36,12 +36,12 @@ congrasp = functools.partial(python, "-m", "congrasp")
 """Runs the command line in a process of its own."""
 
 
-def is_one_line(code: int, said: str, words: str) -> None:
+def is_one_line(code: int, printed: str, words: str) -> None:
     """What was said on the standard error is one line with these words, and the exit code tells of
     bad input.
     """
-    assert code not in (0, 1), said
-    (line,) = errors(said)
+    assert code not in (0, 1), printed
+    (line,) = errors(printed)
     assert line.startswith("congrasp: error: ")
     assert re.search(words, line), line
 
@@ -287,8 +287,8 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     monkeypatch.setenv(name or "JAX_PLATFORMS", "abacus")
     with pytest.raises(SystemExit, match="2"):
         cli.main([])
-    said = f"{name} is 'abacus', which does not work here (invalid value for {name})"
-    line = said if name else "JAX_PLATFORMS is 'abacus', which does not work here"
+    expected = f"{name} is 'abacus', which does not work here (invalid value for {name})"
+    line = expected if name else "JAX_PLATFORMS is 'abacus', which does not work here"
     assert capsys.readouterr().err == f"congrasp: error: {line}. Correct or unset it.\n"
 
 

@@ -51,20 +51,20 @@ def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
     request = example.request
     state = example.state
-    given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
-    given |= {
+    arrays = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
+    arrays |= {
         "q_target": request.q,
         "q_initial": request.q,
         "u_target": np.zeros(6),
         "time": np.float32(0),
     }
-    given |= {
+    arrays |= {
         "base_position": request.wrist[0],
         "base_quaternion": request.wrist[1],
         "table": np.bool_(True),
     }
-    given |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
-    return {**given, **state, "surface_points": request.surface}
+    arrays |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
+    return {**arrays, **state, "surface_points": request.surface}
 
 
 # A policy that does not know it.
@@ -106,13 +106,13 @@ def test_the_studio_refuses_it_in_one_line() -> None:
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
-    own = Experiment(
+    experiment = Experiment(
         untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))),
         [MUG],
         episodes=1,
     )
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
-        own.run([Variation("fingers")])
+        experiment.run([Variation("fingers")])
 
 
 # A policy that knows it.
@@ -122,18 +122,18 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     policy: PolicyBundle, tmp_path: pathlib.Path
 ) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
+    grasp = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert found.motion.constraints == ("heading", "fingers", "force")
-    assert "fingers_ratio" in found.facts()
-    assert 0.0 <= found.facts()["force_ratio"] <= 1.0
-    save_motion(tmp_path / "grasp.npz", found.motion)
+    assert grasp.motion.constraints == ("heading", "fingers", "force")
+    assert "fingers_ratio" in grasp.facts()
+    assert 0.0 <= grasp.facts()["force_ratio"] <= 1.0
+    save_motion(tmp_path / "grasp.npz", grasp.motion)
     goal = load_motion(tmp_path / "grasp.npz").goal
     np.testing.assert_array_equal(goal["fingers_allowed"], PINCH)
     assert goal["force_limit"] == 3.0
-    assert "Only the named fingers may touch the object." in found.active
-    assert "No link may press harder than the force limit." in found.active
-    made = found.episode
+    assert "Only the named fingers may touch the object." in grasp.active
+    assert "No link may press harder than the force limit." in grasp.active
+    made = grasp.episode
     errors = made.require_recorded().errors
     steps = made.steps
     other = np.isin(HAND.link_fingers, (2, 3, 4))
@@ -142,8 +142,8 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     np.testing.assert_array_equal(errors["force_ratio"] > 0, (links > 3.0).any(-1))
     assert made.active["fingers"]
     assert not made.active["pose_finger"]
-    assert lanes(found.episode)["fingers"].met.shape == (steps,)
-    assert "lane/fingers/share" in for_page(found.episode).arrays
+    assert lanes(grasp.episode)["fingers"].met.shape == (steps,)
+    assert "lane/fingers/share" in for_page(grasp.episode).arrays
 
 
 @pytest.fixture

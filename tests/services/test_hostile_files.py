@@ -500,7 +500,7 @@ def test_recordings_of_others_are_one_line(tmp_path):
             lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'"
         )
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
-    whole = episode_message()
+    message = episode_message()
     for number, (change, why) in enumerate(
         (
             ({"hand": "/etc/hosts.json"}, "not a built-in hand"),
@@ -508,12 +508,12 @@ def test_recordings_of_others_are_one_line(tmp_path):
             ({"metrics": []}, r"'metrics' is \[\]"),
         )
     ):
-        data = encode(Message(whole.arrays, {**whole.meta, **change}))
+        data = encode(Message(message.arrays, {**message.meta, **change}))
         path = _recording(tmp_path / f"e{number}", Entry(raw, 1, data))
         refused(read_episodes, path, why)
         refused(lambda path: pick_episode(path, -1), path, why)
-    lost = {name: array for name, array in whole.arrays.items() if name != "visual_faces"}
-    path = _recording(tmp_path / "lost", Entry(raw, 1, encode(Message(lost, whole.meta))))
+    lost = {name: array for name, array in message.arrays.items() if name != "visual_faces"}
+    path = _recording(tmp_path / "lost", Entry(raw, 1, encode(Message(lost, message.meta))))
     refused(read_episodes, path, "lacks the array 'visual_faces'")
-    path = _recording(tmp_path / "fine", Entry(raw, 1, encode(whole)))
-    np.testing.assert_array_equal(next(read_episodes(path)).joint_position, whole.arrays["q"])
+    path = _recording(tmp_path / "fine", Entry(raw, 1, encode(message)))
+    np.testing.assert_array_equal(next(read_episodes(path)).joint_position, message.arrays["q"])

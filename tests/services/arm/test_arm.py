@@ -265,10 +265,10 @@ def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
     robot = types.SimpleNamespace(
         entry_names=("scene.xml", "panda.xml", "panda_nohand.xml"), xml=xml
     )
-    known = types.SimpleNamespace(
+    descriptions = types.SimpleNamespace(
         names=lambda: ["franka_panda", "ur5e"], get=lambda name: robot, MenagerieError=Unreachable
     )
-    monkeypatch.setitem(sys.modules, "mujoco_menagerie", known)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", descriptions)
     with pytest.raises(
         CongraspError, match="'franka_panda' of MuJoCo Menagerie could not be downloaded"
     ):

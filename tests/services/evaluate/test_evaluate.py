@@ -166,20 +166,20 @@ def test_rows_by_the_hand_centre_and_under_loads(experiment):
 
 def test_shares_of_the_rules_for_headings(experiment):
     """They add up, and agree with the bank."""
-    found = heading_rules(experiment)
+    rules = heading_rules(experiment)
     bank = experiment.bank
-    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0)
-    assert 0 <= found.moved <= 1
-    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9
-    assert 0 < found.opposed <= 1
-    kept = sum(
+    assert rules.kept + rules.from_below + rules.no_room == pytest.approx(1.0)
+    assert 0 <= rules.moved <= 1
+    assert 0 < rules.kept < rules.kept_by_center <= 1 - rules.from_below + 1e-9
+    assert 0 < rules.opposed <= 1
+    unchanged = sum(
         len(set(np.asarray(bank.heading_index)[n, 0, r]))
         for n in range(len(OBJECTS))
         for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
     )
-    assert found.kept * 256 * sum(
+    assert rules.kept * 256 * sum(
         len(obj.rest_poses) for obj in experiment.scaled
-    ) == pytest.approx(kept)
+    ) == pytest.approx(unchanged)
 
 
 def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
@@ -248,21 +248,21 @@ def test_rows_of_fingers_and_of_a_force_limit(experiment):
 def test_a_constraint_that_no_object_allows(experiment):
     bank = experiment.bank
     none = bank._replace(has_affordance=np.zeros_like(bank.has_affordance))
-    own = dataclasses.replace(experiment, constraints=none)
+    without_constraint = dataclasses.replace(experiment, constraints=none)
     heading, affordance, composed = map(
         Variation, ("heading", "affordance", "trajectory+affordance")
     )
     with pytest.raises(
         CongraspError, match="None of the 4 objects allows the constraint 'affordance'"
     ):
-        own.run([heading, affordance])
-    allowed, errors = own.allowed([heading, affordance])
+        without_constraint.run([heading, affordance])
+    allowed, errors = without_constraint.allowed([heading, affordance])
     assert allowed == [heading]
     assert "'affordance'" in str(errors[0])
     with pytest.raises(CongraspError, match="'affordance'"):
-        own.allowed([affordance, composed])
+        without_constraint.allowed([affordance, composed])
     with pytest.raises(CongraspError, match="trajectory\\+affordance"):
-        own.plan(composed)
+        without_constraint.plan(composed)
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,12 @@ def test_nominal_mass_and_friction_and_two_seconds():
         gain_range=(0.8, 1.2),
         sensing=TRACKERS,
     )
-    found = Experiment(dataclasses.replace(task.policy(), task=ranged), []).task
-    assert found.mass_range == found.friction_range == found.gain_range == (1.0, 1.0)
-    assert found.sensing == task.TASK.sensing, "a perfect tracker"
+    evaluated_task = Experiment(dataclasses.replace(task.policy(), task=ranged), []).task
+    assert (
+        evaluated_task.mass_range
+        == evaluated_task.friction_range
+        == evaluated_task.gain_range
+        == (1.0, 1.0)
+    )
+    assert evaluated_task.sensing == task.TASK.sensing, "a perfect tracker"
     assert Experiment(task.policy(), [], friction=3.0).task.friction_range == (3.0, 3.0)

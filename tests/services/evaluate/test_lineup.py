@@ -48,10 +48,10 @@ def test_hands_are_those_with_a_pretrained_policy_unless_policies_are_named(save
 
 
 def test_a_method_without_a_policy_is_named_and_no_error(saved):
-    given = read_entrants([f"no-feedforward={saved('no-feedforward')}"])
-    found = line_up(["ablation"], given, "human")
-    assert who(found) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
-    absent = [(one.hand, one.method, one.reason) for one in found.missing]
+    entrants = read_entrants([f"no-feedforward={saved('no-feedforward')}"])
+    lineup = line_up(["ablation"], entrants, "human")
+    assert who(lineup) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
+    absent = [(one.hand, one.method, one.reason) for one in lineup.missing]
     assert absent == [
         ("human", name, "not trained")
         for name in ABLATION
@@ -64,17 +64,17 @@ def test_a_student_stands_beside_the_pretrained_policy_of_its_hand(saved):
     both = [("human", "ours", ("sensing",)), ("human", "student", ("sensing",))]
     assert who(line_up(["sensing"], student, "human")) == both
     assert who(line_up(["sensing"], [], "allegro")) == [("allegro", "ours", ("sensing",))]
-    found = line_up(["single", "sensing"], student, "human")
-    assert dict((name, tables) for _, name, tables in who(found)) == {
+    lineup = line_up(["single", "sensing"], student, "human")
+    assert dict((name, tables) for _, name, tables in who(lineup)) == {
         "student": ("single", "sensing"),
         "ours": ("sensing",),
     }
 
 
 def test_a_policy_is_evaluated_once_for_all_its_tables(saved):
-    given = read_entrants([str(saved("ours"))])
-    found = line_up(["single", "composed", "hands", "ablation", "single"], given, "human")
-    assert who(found) == [("human", "ours", ("single", "composed"))]
+    entrants = read_entrants([str(saved("ours"))])
+    lineup = line_up(["single", "composed", "hands", "ablation", "single"], entrants, "human")
+    assert who(lineup) == [("human", "ours", ("single", "composed"))]
     assert who(line_up(["composed"], [], "allegro")) == [("allegro", "ours", ("composed",))]
 
 

@@ -31,8 +31,8 @@ def test_reference_policies_never_had_poses_or_trajectories():
             "heading",
             "affordance",
         }
-        found, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
-        assert found.task == bundle.task
+        policy, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
+        assert policy.task == bundle.task
 
 
 @pytest.mark.parametrize("count", range(1, POSES + 1))
@@ -63,14 +63,17 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
         Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0])
         for rest in bank.rest[:, 0]
     ]
-    own, *below = (
+    of_policy, *below = (
         low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down)
     )
     made = references.with_references(
-        policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2]
+        policy,
+        task.TASK,
+        bank,
+        [[[of_policy, below[0], of_policy], []], [[below[1]], []], *[[[], []]] * 2],
     )
     np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
-    np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))
+    np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(of_policy.q, (POSES, 1)))
     closed = np.asarray(bank.pose_q)[1, 0]
     assert all(
         any(np.array_equal(q, other) for other in closed)

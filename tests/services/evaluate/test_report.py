@@ -67,8 +67,8 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
         [Picture("Learning", png)],
     )
     write_report(out, content)
-    found = Reader(text := out.read_text())
-    cells = {content: kind for kind, content in found.cells}
+    report = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in report.cells}
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
     assert cells["99.0 % (97.5-99.5)"] == "better"
     assert cells["90.0 % (85.0-95.0)"] == "worse"
@@ -85,9 +85,9 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     )
     assert "slipped &lt;b&gt;" in text
     assert "--policy &lt;mine&gt;" in text
-    assert len(found.sources) == 2
-    assert not found.links
-    for source in found.sources:
+    assert len(report.sources) == 2
+    assert not report.links
+    for source in report.sources:
         kind, content = source.split(",")
         assert kind == "data:image/png;base64"
         assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
@@ -125,12 +125,12 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         str(tmp_path / "rows.json"),
     ]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
-    found = Reader(text := out.read_text())
-    cells = {content: kind for kind, content in found.cells}
+    report = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in report.cells}
     assert cells["passed"] == "better"
     assert cells["failed"] == "worse"
     assert "close &lt;it&gt;" in text
-    assert len(found.sources) == 1
+    assert len(report.sources) == 1
     written = json.loads((tmp_path / "rows.json").read_text())
     assert written["content"] == bundles.content_hash(
         (tmp_path / "policy.safetensors").read_bytes()
@@ -149,8 +149,8 @@ def test_the_command_evaluates_draws_and_writes(tmp_path):
     bundles.save(untrained(config), tmp_path / "mine.safetensors")
     command = ["report", str(tmp_path / "mine.safetensors"), "--out", str(tmp_path / "report.html")]
     assert main.run([*command, "--episodes", "1", "--pool", "2", "--physics", "native"]) == 0
-    found = Reader(text := (tmp_path / "report.html").read_text())
-    assert len(found.sources) == 1
+    report = Reader(text := (tmp_path / "report.html").read_text())
+    assert len(report.sources) == 1
     assert "--episodes 1 " in text
     assert "2 episodes" in text
 
@@ -206,8 +206,10 @@ def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
     (observed,) = [text for text in card["limits"] if text.startswith("It observes")]
     assert "last 8 control steps" in observed
     assert "no velocities and no contact forces" in observed
-    said = "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."
-    assert card["data"][1].endswith(f"; mass x 1, sliding friction 0.5 to 1.2, {said}")
+    disturbances = (
+        "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."
+    )
+    assert card["data"][1].endswith(f"; mass x 1, sliding friction 0.5 to 1.2, {disturbances}")
 
 
 def test_few_episodes_are_a_warning(tmp_path, policy):

@@ -159,8 +159,8 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
     assert spread.distinct == 16
     assert row.success_low < spread.success_low < spread.success_high < row.success_high
     # Sequences of one object are the clusters where references are.
-    own = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
-    row = summarised("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
+    clustered = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
+    row = summarised("pose", "human", clustered, held_2s=True, objects=["a"], by_reference=True)
     assert row.independent == pytest.approx(1.0)
 
 
@@ -203,13 +203,13 @@ def test_joined_samples_keep_forces_beside_their_episodes():
         _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5)),
     ]
     parts[0].link_force[:] = 1.0
-    whole = joined(parts)
-    assert len(whole.values["success"]) == PROBED_EPISODES + 7
-    assert len(whole.link_force) == PROBED_EPISODES
-    assert whole.link_force[:2].min() == 1.0
-    assert whole.link_force[2:].max() == 0.0
+    sample = joined(parts)
+    assert len(sample.values["success"]) == PROBED_EPISODES + 7
+    assert len(sample.link_force) == PROBED_EPISODES
+    assert sample.link_force[:2].min() == 1.0
+    assert sample.link_force[2:].max() == 0.0
     # What follows a sample without all its forces must not move up to another episode's place.
-    late = joined([whole, parts[0]])
+    late = joined([sample, parts[0]])
     assert len(late.values["success"]) == PROBED_EPISODES + 9
     assert len(late.link_force) == PROBED_EPISODES
     odd = late.where(np.arange(PROBED_EPISODES + 9) % 2 == 1)
@@ -295,21 +295,21 @@ def test_a_terminal_shows_every_figure_of_several_policies():
     ]
     console = Console(width=160, file=io.StringIO())
     console.print(tables_of(rows, "title")[0].terminal())
-    shown = console.file.getvalue()
-    assert "\N{HORIZONTAL ELLIPSIS}" not in shown
-    assert "episodes" in shown
-    assert "objects" in shown
-    assert shown.count("100.0 % (34.2-100.0)") == 4
-    assert shown.count("0.000 rad") >= 2
+    printed = console.file.getvalue()
+    assert "\N{HORIZONTAL ELLIPSIS}" not in printed
+    assert "episodes" in printed
+    assert "objects" in printed
+    assert printed.count("100.0 % (34.2-100.0)") == 4
+    assert printed.count("0.000 rad") >= 2
 
 
 def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
     sample = _sample(
         [1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0]
     )
-    found = summarised("heading", "human", sample, held_2s=True, objects=["box"])
+    row = summarised("heading", "human", sample, held_2s=True, objects=["box"])
     # Standard deviation 0.1 of three values: 1.96 x 0.1 / sqrt(3).
-    assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
+    assert row.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
     only = summarised("heading", "human", sample.first(1), held_2s=True, objects=["box"])
     assert only.margins == {}
     assert only.errors["heading_rad"] == pytest.approx(0.1)
@@ -361,12 +361,17 @@ def lost(heights, **metrics) -> Episode:
     count = len(heights)
     position = np.zeros((count, 3), np.float32)
     position[:, 2] = heights
-    known = {"diverged": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
+    episode_metrics = {
+        "diverged": 0.0,
+        "held": 0.0,
+        "moved_at_removal": 0.01,
+        "links_at_removal": 3.0,
+    }
     return dataclasses.replace(
         episode(count),
         object_position=position,
         table=np.arange(count) < 2,
-        metrics=known | metrics,
+        metrics=episode_metrics | metrics,
         control_dt=0.01,
         about={},
     )

@@ -104,9 +104,9 @@ def test_a_level_is_what_it_says(bank):
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
     sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
     drawn = sample(task.HAND, sensed, one, jax.random.key(0), 4)
-    found = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
-    assert len(found) == len(SENSING)
-    true, nominal = (found[level.label] for level in SENSING[:2])
+    episodes = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
+    assert len(episodes) == len(SENSING)
+    true, nominal = (episodes[level.label] for level in SENSING[:2])
     errors = set(true.sensors._fields) - {"key", "period", "phase", "eye"}
     assert not any(np.any(getattr(true.sensors, name)) for name in errors)
     assert (true.sensors.period == 1.0).all()
@@ -115,12 +115,12 @@ def test_a_level_is_what_it_says(bank):
     np.testing.assert_allclose(nominal.sensors.period, 10 / 3, rtol=1e-6)
     np.testing.assert_allclose(nominal.sensors.position_noise, 0.005)
     np.testing.assert_allclose(nominal.sensors.rotation_noise, math.pi / 60, rtol=1e-6)
-    assert (found["100 ms"].sensors.delay == 10).all()
+    assert (episodes["100 ms"].sensors.delay == 10).all()
     assert longest(sensed.sensing, sensed.control_dt) == 11, "room for the longest delay"
-    np.testing.assert_allclose(found["10 Hz"].sensors.period, 10.0)
-    np.testing.assert_allclose(found["30 % dropped"].sensors.dropout, 0.3)
-    np.testing.assert_allclose(found["friction 0.5"].reset_state.friction, 0.5)
-    np.testing.assert_allclose(found["gains -20 %"].reset_state.gain_scale, 0.8)
+    np.testing.assert_allclose(episodes["10 Hz"].sensors.period, 10.0)
+    np.testing.assert_allclose(episodes["30 % dropped"].sensors.dropout, 0.3)
+    np.testing.assert_allclose(episodes["friction 0.5"].reset_state.friction, 0.5)
+    np.testing.assert_allclose(episodes["gains -20 %"].reset_state.gain_scale, 0.8)
     for level in SENSING[2:]:
         changed = [
             name
@@ -128,7 +128,7 @@ def test_a_level_is_what_it_says(bank):
             for name, a, b in zip(
                 getattr(nominal, part)._fields,
                 getattr(nominal, part),
-                getattr(found[level.label], part),
+                getattr(episodes[level.label], part),
                 strict=True,
             )
             if not np.array_equal(a, b)
@@ -185,10 +185,10 @@ def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes()
 @pytest.mark.parametrize("constant_mass", [True, False])
 def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass):
     """Objects of 1.4 times the length are 2.744 times as heavy at the same density."""
-    *masses, own, literal = payload(1.4, constant_mass=constant_mass)
+    *masses, scaled, literal = payload(1.4, constant_mass=constant_mass)
     assert [load.mass for load in masses] == [(mass, mass) for mass in MASSES]
-    assert literal.factor / own.factor == pytest.approx(2.744)
-    assert (own if constant_mass else literal).factor == pytest.approx(1.0)
+    assert literal.factor / scaled.factor == pytest.approx(2.744)
+    assert (scaled if constant_mass else literal).factor == pytest.approx(1.0)
     assert len(payload(1.0, constant_mass=constant_mass)) == len(MASSES) + 1
 
 
@@ -267,13 +267,13 @@ def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
         np.testing.assert_array_equal(back.pose_valid[n, :, :rests], bank.pose_valid[n, :, :rests])
         for v, r in np.ndindex(2, rests):
             if v == 0 or bank.has_affordance[n, r]:
-                asked = bank.heading_index[n, v, r]
-                found = back.heading_index[n, v, r]
-                assert set(np.asarray(asked)) == set(np.asarray(found))
+                before = bank.heading_index[n, v, r]
+                after = back.heading_index[n, v, r]
+                assert set(np.asarray(before)) == set(np.asarray(after))
                 back_of = dict(
-                    zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True)
+                    zip(np.asarray(before), np.asarray(bank.heading_back[n, v, r]), strict=True)
                 )
-                np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
+                np.testing.assert_allclose([back_of[i] for i in after], back.heading_back[n, v, r])
         np.testing.assert_array_equal(
             back.has_affordance[n, :rests], bank.has_affordance[n, :rests]
         )

@@ -63,10 +63,12 @@ def simulated(monkeypatch):
     return done
 
 
-def evaluated(pools, episodes, kept=None, *, seed=0, track=lambda label, total: lambda done: None):
+def evaluated(
+    pools, episodes, folder=None, *, seed=0, track=lambda label, total: lambda done: None
+):
     """Rows of the test's policy."""
     return evaluate_pools(
-        dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, kept
+        dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, folder
     )
 
 
@@ -82,20 +84,20 @@ def pools_of(*groups, left_out=()):
 def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
     told = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
-    whole, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
-    assert {obj["episodes"] for obj in whole.objects} == {2}
-    assert [obj["name"] for obj in whole.objects] == [obj.name for obj in OBJECTS]
-    assert whole.episodes == 10
-    assert whole.covered == 5
-    assert whole.pool == 6
-    assert whole.success == 1.0
+    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
+    assert {obj["episodes"] for obj in all_pools.objects} == {2}
+    assert [obj["name"] for obj in all_pools.objects] == [obj.name for obj in OBJECTS]
+    assert all_pools.episodes == 10
+    assert all_pools.covered == 5
+    assert all_pools.pool == 6
+    assert all_pools.success == 1.0
     assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
     assert sum(row.episodes for row in by_size) == 10
     assert {row.success_all for row in by_size} == {1.0}
-    assert whole.success_all == pytest.approx(5 / 6)
+    assert all_pools.success_all == pytest.approx(5 / 6)
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
-    assert whole.paper.success == 0.927
+    assert all_pools.paper.success == 0.927
     assert [stressed for _, stressed in simulated] == [200, 194]
 
 
@@ -111,7 +113,7 @@ def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
 
 
 def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
-    whole = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
+    complete = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
     simulated.clear()
 
     def stop():
@@ -123,7 +125,7 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
     assert len(simulated) == 1
     again = first._replace(make=[stop, first.make[1]])  # the first is not even made
     rows = evaluated(again, 8, tmp_path)
-    assert [row.to_json() for row in rows] == [row.to_json() for row in whole]
+    assert [row.to_json() for row in rows] == [row.to_json() for row in complete]
     assert [names for names, _ in simulated] == [
         [o.name for o in OBJECTS[:2]],
         [o.name for o in OBJECTS[2:4]],
@@ -171,10 +173,10 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
 
     monkeypatch.setattr(experiment, "build_bank", build_bank)
     monkeypatch.setattr(of_objects, "headings_of", headings_of)
-    whole, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
-    assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
-    assert whole.covered == 2
-    assert whole.pool == 4
+    all_pools, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
+    assert [obj["name"] for obj in all_pools.objects] == [OBJECTS[0].name, OBJECTS[2].name]
+    assert all_pools.covered == 2
+    assert all_pools.pool == 4
     assert lost in caplog.text
     with pytest.raises(CongraspError, match="None of the objects can be approached"):
         evaluated(pools_of(OBJECTS[1:2]), 6)

@@ -247,24 +247,24 @@ def test_other_readers_find_meshes_and_colours(motion: Episode, tmp_path: pathli
     sledge = stage.GetPrimAtPath("/grasp/odd_base/sledge")
     pose = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(sledge)).T
     np.testing.assert_allclose(pose[:3, 3], arm.link_position[3, 1], atol=1e-6)
-    shown = [
+    drawn_colours = [
         UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)
     ]
-    np.testing.assert_allclose(shown, linear, atol=1e-6)
+    np.testing.assert_allclose(drawn_colours, linear, atol=1e-6)
 
 
 def test_the_camera_sees_the_arm(motion: Episode) -> None:
     alone = dataclasses.replace(motion, arm=None)
     camera = camera_for([alone])
-    shown, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
-    assert (np.abs(shown - blank).sum(-1) > 60).mean() > 0.02
+    with_arm, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
+    assert (np.abs(with_arm - blank).sum(-1) > 60).mean() > 0.02
 
 
 def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: Episode) -> None:
     arm = motion.arm
     assert arm is not None
-    whole = decode(encode(arm.add_to(episode_message(T))))
-    recorded = Episode.from_message(whole)
+    message = decode(encode(arm.add_to(episode_message(T))))
+    recorded = Episode.from_message(message)
     again = recorded.arm
     assert "rail" in urdf.robot_urdf(recorded)
     assert again is not None
@@ -278,18 +278,20 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: Episode) -
         for entry in entries
         if entry.channel.topic == "/episode/a0/scene"
     ]
-    shown = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
-    assert [entity.frame_id for entity in shown.values()] == [
+    entities = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
+    assert [entity.frame_id for entity in entities.values()] == [
         f"a0/arm/{name}" for name in ("odd_base", "sledge", "sledge", "arm_palm")
     ]
-    assert shown["arm/1"].triangles[0].color.r == pytest.approx(1.0)
-    assert len(shown["arm/1"].triangles[0].indices) == 36
+    assert entities["arm/1"].triangles[0].color.r == pytest.approx(1.0)
+    assert len(entities["arm/1"].triangles[0].indices) == 36
     frame = next(
         FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf"
     )
     sledge = next(t.translation for t in frame.transforms if t.child_frame_id == "a0/arm/sledge")
     np.testing.assert_allclose([sledge.x, sledge.y, sledge.z], arm.link_position[0, 1], atol=1e-6)
-    short = Message({**whole.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, whole.meta)
+    short = Message(
+        {**message.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, message.meta
+    )
     with pytest.raises(
         CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"
     ):

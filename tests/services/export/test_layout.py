@@ -47,19 +47,19 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
         ("event/learner/0", Message({}, {"time": 0.0, "level": "info", "text": "hello"})),
     )
     count = export_layout(tmp_path / "logs", tmp_path / "layout.json")
-    shown = panels(json.loads((tmp_path / "layout.json").read_text())["content"])
-    assert count == len(shown)
+    layout_panels = panels(json.loads((tmp_path / "layout.json").read_text())["content"])
+    assert count == len(layout_panels)
     fields: dict[str, set[str]] = {}
     for file in (tmp_path / "logs").iterdir():
         for entry in read_records(file):
-            known = fields.setdefault(entry.topic, set())
+            recorded = fields.setdefault(entry.topic, set())
             if entry.encoding == "json":
-                known |= {path.replace("/", ".") for path in flatten(json.loads(entry.data))}
-    kinds = [panel["panelType"] for panel in shown]
+                recorded |= {path.replace("/", ".") for path in flatten(json.loads(entry.data))}
+    kinds = [panel["panelType"] for panel in layout_panels]
     assert kinds.count("ThreeDee") == 1
     assert kinds.count("Log") == 1
     assert kinds.count("Plot") == 5
-    for panel in shown:
+    for panel in layout_panels:
         config = panel["config"]
         topics = [
             *config.get("topics", {}),
@@ -69,7 +69,7 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
         for series in config.get("paths", []):
             topic, _, field = series["value"].partition(".")
             assert field in fields[topic], series
-    (scene,) = [panel["config"] for panel in shown if panel["panelType"] == "ThreeDee"]
+    (scene,) = [panel["config"] for panel in layout_panels if panel["panelType"] == "ThreeDee"]
     assert {f"/episode/{actor}/scene" for actor in ("actor-0", "b")} <= set(scene["topics"])
 
 

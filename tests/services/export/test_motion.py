@@ -57,8 +57,8 @@ def posed(
     place = rng.normal(scale=0.3, size=(count, 3))
     local = [link(angles) for angles in q]
     position = np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(count)])
-    own = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
-    turns = [(wrist[t] * own[t]).as_quat(scalar_first=True) for t in range(count)]
+    rotations = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
+    turns = [(wrist[t] * rotations[t]).as_quat(scalar_first=True) for t in range(count)]
     return dataclasses.replace(
         motion,
         time=motion.control_dt * np.arange(count),
@@ -102,9 +102,9 @@ def odd_hand(human: Episode) -> Episode:
             turn = turns[parents[i]]
             place = places[parents[i]]
             for j in np.flatnonzero(np.array(joint_link) == i):
-                own = Rotation.from_rotvec(q[j] * axes[j])
-                place = place + turn.apply(anchors[j] - own.apply(anchors[j]))
-                turn = turn * own
+                joint_turn = Rotation.from_rotvec(q[j] * axes[j])
+                place = place + turn.apply(anchors[j] - joint_turn.apply(anchors[j]))
+                turn = turn * joint_turn
             turns.append(turn)
             places.append(place)
         origins = [np.zeros(3), anchors[0], np.zeros(3), anchors[2]]
@@ -327,8 +327,8 @@ def test_the_skin_of_a_glb_follows_its_joints(which, request, tmp_path):
     for t in (0, T - 1):
         matrices = np.stack([track.poses[name][t] for name in names]) @ inverse
         mixed = np.einsum("vk,vkij->vij", weights, matrices[joints])
-        found = np.einsum("vij,vj->vi", mixed, points)[:, :3]
-        np.testing.assert_allclose(found, expected_surface(motion, t)[source], atol=2e-6)
+        skinned = np.einsum("vij,vj->vi", mixed, points)[:, :3]
+        np.testing.assert_allclose(skinned, expected_surface(motion, t)[source], atol=2e-6)
 
 
 @pytest.mark.parametrize("which", ["human", "robot"])
@@ -388,9 +388,9 @@ def test_glb_and_usd_have_the_colours_of_the_object(
         for prim in stage.Traverse()
         if prim.GetName() == "mesh" and "skin" not in str(prim.GetPath())
     )
-    shown = shape.GetDisplayColorPrimvar()
-    assert shown.GetInterpolation() == UsdGeom.Tokens.vertex
-    assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(shown.Get()))
+    primvar = shape.GetDisplayColorPrimvar()
+    assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+    assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(primvar.Get()))
 
 
 def test_colours_of_a_hand_are_linear_in_glb_and_usd(
@@ -404,8 +404,8 @@ def test_colours_of_a_hand_are_linear_in_glb_and_usd(
     )
     stage = Usd.Stage.Open(str(export([human], "usd", tmp_path)))
     meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
-    shown = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
-    assert (np.abs(shown - flesh).max(1) < 1e-5).any()
+    colours = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
+    assert (np.abs(colours - flesh).max(1) < 1e-5).any()
 
 
 def test_a_bvh_has_the_skeleton_of_the_skin(human: Episode, tmp_path: pathlib.Path) -> None:
@@ -534,10 +534,10 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
         near, link_position=near.link_position + np.array([0, 0, 50.0]), table=np.zeros(count, bool)
     )
     nothing = dataclasses.replace(alone, object_position=near.object_position + 50.0)
-    shown, blank = (
+    drawn, blank = (
         next(pictures(motion, camera_for([near]))).astype(int) for motion in (alone, nothing)
     )
-    changed = np.argwhere(np.abs(shown - blank).sum(-1) > 20)
+    changed = np.argwhere(np.abs(drawn - blank).sum(-1) > 20)
     np.testing.assert_allclose(
         [changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5
     )
@@ -610,8 +610,8 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
-        (said,) = errors(capsys.readouterr().err)
-        assert words in said
+        (error,) = errors(capsys.readouterr().err)
+        assert words in error
 
 
 def test_a_motions_file_has_no_other_number(human: Episode, tmp_path: pathlib.Path) -> None:

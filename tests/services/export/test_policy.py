@@ -101,9 +101,9 @@ def test_the_file_s_limits_and_gains_are_those_of_the_hand(
     )
     limits = JointLimits(**json.loads(stored["robot_limits"]))
     joints = get_hand("human").joints
-    for name, wanted in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
+    for name, field in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
         np.testing.assert_allclose(
-            getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints]
+            getattr(limits, name)[:-6], [getattr(joint, field) for joint in joints]
         )
     q_open = np.append(get_hand("human").q_open, np.zeros(6))
     limited = Limiter(limits, q_open).limit(np.full(26, np.nan), q_open, np.zeros(26), 0.0)
@@ -146,8 +146,8 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     force, touching = grasp.forces()
     contacts = np.zeros((1, len(hand.links), CONTACTS_PER_LINK, 3))
     contacts[0, :, 0] = force  # one contact a link that carries its whole force
-    found = np.zeros(contacts.shape[:-1], bool)
-    found[0, :, 0] = touching > 0
+    contact_found = np.zeros(contacts.shape[:-1], bool)
+    contact_found[0, :, 0] = touching > 0
 
     def turn(m: np.ndarray) -> np.ndarray:
         return Rotation.from_matrix(m).as_quat(scalar_first=True)
@@ -166,7 +166,7 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
         object_angular_velocity=now @ data.qvel[grasp.free + 3 : grasp.free + 6],
         contact_force=contacts[0],
         contact_position=contacts[0],
-        contact_found=found[0],
+        contact_found=contact_found[0],
         base_position=grasp.base_position,
         base_quaternion=turn(grasp.base),
         q_initial=hand.q_open,

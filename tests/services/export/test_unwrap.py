@@ -23,9 +23,11 @@ def test_a_box_has_six_charts_with_the_proportions_of_its_sides():
     flat = unwrapped(vertices, faces)
     assert len(flat.source) == 24
     assert np.array_equal(flat.source[flat.faces], faces)
-    found = areas(flat.uv[flat.faces])
-    np.testing.assert_allclose(found / found.sum(), box.area_faces / box.area, rtol=1e-6)
-    assert (found > 0).all()  # seen from outside, none mirrored
+    chart_areas = areas(flat.uv[flat.faces])
+    np.testing.assert_allclose(
+        chart_areas / chart_areas.sum(), box.area_faces / box.area, rtol=1e-6
+    )
+    assert (chart_areas > 0).all()  # seen from outside, none mirrored
     boxes = sorted(
         {(tuple(c.min(0)), tuple(c.max(0))) for c in flat.uv[flat.faces].reshape(-1, 3, 2)}
     )

@@ -56,7 +56,7 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "remedy"),
+    ("grasp_request", "remedy"),
     [
         (GraspRequest(), "Scale it."),
         (GraspRequest(rest=2), "Leave out --rest, or scale it."),
@@ -67,5 +67,7 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
         ),
     ],
 )
-def test_a_remedy_names_the_options_that_were_given(asked: GraspRequest, remedy: str) -> None:
-    assert approaches.remedy_for(asked, "scale it") == remedy
+def test_a_remedy_names_the_options_that_were_given(
+    grasp_request: GraspRequest, remedy: str
+) -> None:
+    assert approaches.remedy_for(grasp_request, "scale it") == remedy

@@ -79,7 +79,7 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     minus = block.points[:, 2] < 0
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
     request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
-    found = grasper.grasp(
+    grasp = grasper.grasp(
         block, request, lambda what, done, total: reports.append((what, done, total))
     )
     steps = grasper.task.approach_steps + 25
@@ -88,11 +88,11 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     simulated = counts[0][1]
     assert simulated > steps
     assert counts == [(step + 1, simulated) for step in range(simulated)]
-    assert 1 <= found.held <= found.attempts <= 12
-    assert found.success
-    motion = found.motion
+    assert 1 <= grasp.held <= grasp.attempts <= 12
+    assert grasp.success
+    motion = grasp.motion
     assert motion.constraints == ("heading", "affordance")
-    assert motion.about["attempts"] == found.attempts
+    assert motion.about["attempts"] == grasp.attempts
     assert len(motion.time) == steps
     assert motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
@@ -103,7 +103,7 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     assert way @ axis > 0.8 * np.linalg.norm(way) > 0.05
     # The held block keeps its height although there is no table.
     assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
-    facts = found.facts()
+    facts = grasp.facts()
     assert facts["heading_rad"] < 0.5
     assert {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
 
@@ -122,14 +122,14 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
     monkeypatch.setattr(attempts, "conditions_of", recorded)
     monkeypatch.setattr(grasper, "left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
-    found = grasper.grasp(
+    grasp = grasper.grasp(
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
     )
-    arrays = found.episode.to_message().arrays
-    assert found.motion.hand == "human_left"
-    assert found.success
-    np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
-    np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
+    arrays = grasp.episode.to_message().arrays
+    assert grasp.motion.hand == "human_left"
+    assert grasp.success
+    np.testing.assert_allclose(grasp.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
+    np.testing.assert_allclose(grasp.motion.object_vertices, block.visual_vertices, atol=1e-6)
     start = mirror.fields(
         {name: np.asarray(x) for name, x in begun[-1][0].reset_state._asdict().items()}
     )
@@ -160,8 +160,8 @@ def test_costs_of_attempts():
         **dict.fromkeys(SURVIVAL, np.array([0.0, 0, 1, 1, 1])),
     }
     trace = Trace(*(np.zeros((3, 5, 3)) for _ in Trace._fields))
-    found = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
-    np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
+    computed = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
+    np.testing.assert_allclose(computed, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
 
 
 def test_the_cause_of_failures_is_weight_or_width(block):
@@ -194,17 +194,17 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
         bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2
     )
     upright = int(np.argmax(block.rest_poses[:, 2]))
-    found = lifting.grasp(block, GraspRequest(rest=upright))
+    grasp = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()
-    motion = found.motion
-    phases = found.facts()["phases"]
+    motion = grasp.motion
+    phases = grasp.facts()["phases"]
     assert list(phases) == ["approach", "grasp", "lift", "hold"]
-    assert found.rest == upright
+    assert grasp.rest == upright
     seconds = lifting.task.approach_steps * lifting.task.control_dt
     assert phases["grasp"] >= 0.3
     assert phases["lift"] == pytest.approx(phases["grasp"] + seconds)
     assert motion.table.all()
-    assert found.success
+    assert grasp.success
     grasped, lifted, held = (
         round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold")
     )
@@ -221,18 +221,18 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
 
 
 def test_impossible_requests(block, grasper):
-    lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
+    one_pose = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
     with pytest.raises(
         CongraspError, match=f'approach through the table.* straight down is --heading "{words}"'
     ):
-        grasper.grasp(lying, GraspRequest({"heading": {"direction": -down}}))
+        grasper.grasp(one_pose, GraspRequest({"heading": {"direction": -down}}))
     below = {"q": grasper.hand.q_open, "position": down, "quaternion": np.array([1.0, 0, 0, 0])}
     with pytest.raises(
         CongraspError, match="would be in the table in every resting pose of 'block'"
     ):
-        grasper.grasp(lying, GraspRequest({"heading": {}, "pose": below}))
+        grasper.grasp(one_pose, GraspRequest({"heading": {}, "pose": below}))
 
 
 @pytest.fixture
@@ -242,7 +242,7 @@ def fake_grasps(monkeypatch, quick_import):
 
     def motion(self, attempted, progress):
         obj = attempted
-        found = episode(success=obj.name != "loose")
+        fake_episode = episode(success=obj.name != "loose")
         errors = (
             "heading_rad",
             "heading_m",
@@ -252,19 +252,19 @@ def fake_grasps(monkeypatch, quick_import):
             "trajectory_m",
         )
         metrics = {
-            **found.metrics,
+            **fake_episode.metrics,
             **dict.fromkeys(errors, 0.01),
             "affordance_ratio": 0.0,
             "moved_at_removal": 0.0,
             "force_link_max": 3.0,
-            "held": float(found.success),
+            "held": float(fake_episode.success),
             "push_survival": float(obj.name == "a"),
         }
         made = dataclasses.replace(
-            found,
+            fake_episode,
             object=obj.name,
             metrics=metrics,
-            about={**found.about, "phases": {"grasp": 0.0, "hold": 0.04}},
+            about={**fake_episode.about, "phases": {"grasp": 0.0, "hold": 0.04}},
         )
         return Grasp(made, 4, 3, 0, ("The heading guides the wrist.",))
 
@@ -330,11 +330,13 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
 
 
 def test_another_file_of_a_constraint_is_another_request(tmp_path):
-    found = set()
+    identities = set()
     for content in ("one", "other"):
         (tmp_path / "a.bvh").write_text(content)
-        found |= {identity_of_text(f"{tmp_path}/a.bvh{part}") for part in ("", ":0", ":1", ":Hand")}
-    assert len(found) == 6
+        identities |= {
+            identity_of_text(f"{tmp_path}/a.bvh{part}") for part in ("", ":0", ":1", ":Hand")
+        }
+    assert len(identities) == 6
 
 
 def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):
@@ -373,12 +375,12 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
 
 
 def test_a_grasp_is_a_constraint_of_the_next(tmp_path, block, grasper, monkeypatch, fake_grasps):
-    found = Grasper.grasp(grasper, block)
-    save_grasp(tmp_path, found, film=None, pictures=False, about={"key": "k"})
+    grasp = Grasper.grasp(grasper, block)
+    save_grasp(tmp_path, grasp, film=None, pictures=False, about={"key": "k"})
     text = str(tmp_path / MOTION)
     request = read_request(block, grasper.hand, 15, pose=text, trajectory=text)
     assert set(request.constraints) == {"heading", "pose", "trajectory"}
-    np.testing.assert_array_equal(request.given("pose", "q"), found.motion.joint_position[7])
+    np.testing.assert_array_equal(request.given("pose", "q"), grasp.motion.joint_position[7])
 
 
 def test_an_upright_resting_pose_is_preferred():

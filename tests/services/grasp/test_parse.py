@@ -46,14 +46,14 @@ def test_an_object_has_the_origin_and_scale_of_its_file(block):
 
 
 def test_headings_are_numbers_or_a_word(block):
-    given = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
-    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    request = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
+    np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(request.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
     for written in ((0, 0, -2), [0.0, 0.0, -1.0], np.array([0, 0, -1], np.float32)):
-        given = asked(block, heading=written, at=None, force=np.float32(2))
-        np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-        assert given.above is False
-        assert given.given("force", "limit") == 2
+        request = asked(block, heading=written, at=None, force=np.float32(2))
+        np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+        assert request.above is False
+        assert request.given("force", "limit") == 2
     above = asked(block, heading="above")
     assert above.above
     assert above.given("heading", "direction") is None
@@ -114,9 +114,9 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
     """The quarter turn takes (x, y, z) to (x, -z, y)."""
     turned = dataclasses.replace(block, file_up="y")
     x, y, z = CENTER
-    given = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
-    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    request = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
+    np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(request.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
     upper = (
         trimesh.creation.box((0.04, 0.05, 0.05))
         .apply_translation(np.add(CENTER, [0, 0, 0.035]))
@@ -139,14 +139,14 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
 def test_references_come_from_motions_json_and_csv(block, tmp_path):
     motion = episode().normalised()
     save_motion(tmp_path / "grasp.npz", motion)
-    given = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
-    pose = given.constraints["pose"]
+    request = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
+    pose = request.constraints["pose"]
     last = 7  # the last moment with the table
     np.testing.assert_array_equal(pose["q"], motion.joint_position[last])
     np.testing.assert_allclose(
         pose["position"], motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6
     )
-    path, turns = given.constraints["trajectory"].values()
+    path, turns = request.constraints["trajectory"].values()
     assert path.shape == (15, 3)
     assert turns.shape == (15, 4)
     np.testing.assert_allclose(

@@ -86,20 +86,20 @@ def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
         np.linalg.norm((place - rest[:3])[:2]) for place in (reach.position[0], first.position[0])
     )
     assert away == pytest.approx(max(0.45, end + 0.22), abs=1e-6)
-    whole = Reach(
+    full_reach = Reach(
         np.concatenate([reach.position, first.position]),
         Rotation.concatenate([reach.rotation, first.rotation]),
         np.concatenate([reach.q, first.q]),
     )
-    near, low = clearance(hand, whole, rest[:3])
+    near, low = clearance(hand, full_reach, rest[:3])
     assert near.min() > min(CLEARANCE, near[-1]) - 2e-3
     assert low.min() > min(CLEARANCE, low[-1]) - 2e-3
-    velocity = np.diff(whole.position, axis=0) / DT
+    velocity = np.diff(full_reach.position, axis=0) / DT
     assert np.linalg.norm(velocity, axis=1).max() < 1.02 * SPEED
     np.testing.assert_allclose(velocity[-1], speed * way, atol=0.02)
     acceleration = np.diff(velocity, axis=0, prepend=0 * velocity[:1], append=[speed * way]) / DT
     assert np.linalg.norm(acceleration, axis=1).max() < 1.05 * ACCELERATION
-    turned = (whole.rotation[:-1].inv() * whole.rotation[1:]).magnitude() / DT
+    turned = (full_reach.rotation[:-1].inv() * full_reach.rotation[1:]).magnitude() / DT
     assert turned.max() < 1.02 * TURNING
     slow = plan_reach(hand, ball, rest, way, first, 3.0, DT, speed)
     assert len(slow.q) == 300
@@ -113,8 +113,8 @@ def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
     further = dataclasses.replace(
         task, control=dataclasses.replace(task.control, approach_position_limit=0.04)
     )
-    found = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
-    assert found == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
+    speeds = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
+    assert speeds == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
 
 
 def test_an_unreachable_grasp_is_an_error(ball) -> None:
@@ -161,8 +161,8 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
     u = longer.require_recorded().wrist_joints
     for t in range(3):
-        own = first * Rotation.from_euler("XYZ", u[t, 3:])
-        assert (own.inv() * turns[t]).magnitude() < 1e-5
+        rotation = first * Rotation.from_euler("XYZ", u[t, 3:])
+        assert (rotation.inv() * turns[t]).magnitude() < 1e-5
         np.testing.assert_allclose(
             first.apply(u[t, :3]) + made.wrist_position[0], place[t], atol=1e-6
         )
@@ -200,9 +200,9 @@ def test_resting_poses_by_name_and_number() -> None:
     for text in ("0", "99", "sideways"):
         with pytest.raises(CongraspError, match=f"--rest is '{text}'"):
             rest_pose(mug, text)
-    lying = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
+    one_pose = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
     with pytest.raises(CongraspError, match="points up in none of its 1 resting poses"):
-        rest_pose(lying, "upright")
+        rest_pose(one_pose, "upright")
 
 
 def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> None:
@@ -210,9 +210,9 @@ def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> No
 
     mug = procedural.generate(7, "mug")
     Catalogue(tmp_path / "mine").add(mug)
-    (found,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
+    (obj,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
     assert not errors
-    assert found.load().name == "mug_7"
+    assert obj.load().name == "mug_7"
     trimesh.creation.box((0.05, 0.05, 0.1)).export(tmp_path / "mug_7.stl")
     (other,), _ = find_objects([str(tmp_path / "mug_7.stl")], str(tmp_path / "mine"))
     assert other.source is not None  # a file is a file

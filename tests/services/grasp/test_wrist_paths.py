@@ -65,16 +65,16 @@ Frame Time: 0.02
     return path
 
 
-def check(found):
-    np.testing.assert_allclose(found.position, POSITION, atol=1e-6)
-    assert (found.rotation * ROTATION.inv()).magnitude().max() < 1e-6
+def check(path):
+    np.testing.assert_allclose(path.position, POSITION, atol=1e-6)
+    assert (path.rotation * ROTATION.inv()).magnitude().max() < 1e-6
 
 
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
 def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
-    found = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
-    check(found)
-    assert found.seconds == 0.02
+    path = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
+    check(path)
+    assert path.seconds == 0.02
     file.write_text(
         file.read_text().replace("position", "POSITION").replace("rotation", "Rotation")
     )
@@ -324,8 +324,8 @@ def test_a_clock_that_runs_back_is_refused_however_long_the_file_is(tmp_path, cl
 
 def test_another_wrist_frame_is_converted(tmp_path):
     # Fingers towards +x and the back of the hand +y: the thumb of a right hand then points to -z.
-    own = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
-    quaternion = (ROTATION * own.inv()).as_quat(scalar_first=True)
+    frame = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
+    quaternion = (ROTATION * frame.inv()).as_quat(scalar_first=True)
     np.savez(tmp_path / "a.npz", position=POSITION, quaternion=quaternion)
     check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
 

@@ -174,9 +174,9 @@ def test_each_environment_has_its_own_seed(manual):
     np.testing.assert_array_equal(manual.reset(seed=np.int64(7))[0][:2], together[:2])
     different = manual.reset(seed=[0, 2**32, 2**40, 2**64])[0]
     assert len(np.unique(different, axis=0)) == COUNT
-    kept = manual.reset(seed=[None, 7, None, None])[0]
-    np.testing.assert_array_equal(kept[1], together[0])
-    assert len(np.unique([*kept, *different], axis=0)) == 2 * COUNT
+    observations = manual.reset(seed=[None, 7, None, None])[0]
+    np.testing.assert_array_equal(observations[1], together[0])
+    assert len(np.unique([*observations, *different], axis=0)) == 2 * COUNT
 
 
 def test_an_environment_alone_draws_what_it_draws_among_others(manual):

@@ -299,8 +299,8 @@ def test_lines_that_were_cut_out_show_and_an_emptied_journal_is_no_clean_one(
             first,
             end,
         )
-        assert "Lines are missing at 1 place(s)" in (said := capsys.readouterr().out)
-        assert "cannot be judged" in said
+        assert "Lines are missing at 1 place(s)" in (printed := capsys.readouterr().out)
+        assert "cannot be judged" in printed
     path.write_bytes(b"")
     assert audit(tmp_path).missing == 1
     assert command(tmp_path) == 7

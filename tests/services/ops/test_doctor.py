@@ -54,10 +54,10 @@ def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypa
     monkeypatch.setattr(
         importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name)
     )
-    found = findings()
-    assert not found["mujoco"].fine
-    assert "4.0.0: ==3.17.0 is needed" in found["mujoco"].text
-    assert "4.0.0 and 3.17.0 do not match" in found["mujoco, mujoco-mjx"].text
+    by_check = findings()
+    assert not by_check["mujoco"].fine
+    assert "4.0.0: ==3.17.0 is needed" in by_check["mujoco"].text
+    assert "4.0.0 and 3.17.0 do not match" in by_check["mujoco, mujoco-mjx"].text
     assert command() == 1
     assert any(line.startswith("BAD  mujoco") for line in capsys.readouterr().out.splitlines())
 
@@ -76,9 +76,9 @@ def test_a_port_in_use_is_named(monkeypatch):
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", doctor.PORT))
         busy.listen()
-        found = findings()["ports"]
-    assert f"{doctor.PORT} is in use" in found.text
-    assert "--listen" in found.text
+        ports = findings()["ports"]
+    assert f"{doctor.PORT} is in use" in ports.text
+    assert "--listen" in ports.text
 
 
 def _slow(patch):
@@ -137,10 +137,10 @@ def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
         monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
     with monkeypatch.context() as change:
         patch(change)
-        (found,) = doctor.run_check(CHECKS[what])
-    assert found.what == what, found.text
-    assert not found.fine, found.text
-    assert re.search(words, found.text), found.text
+        (finding,) = doctor.run_check(CHECKS[what])
+    assert finding.what == what, finding.text
+    assert not finding.fine, finding.text
+    assert re.search(words, finding.text), finding.text
 
 
 def _broken():
@@ -153,11 +153,11 @@ def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
     monkeypatch.setattr(
         subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer)
     )
-    found = {finding.what: finding for finding in doctor.check_gpu()}
-    assert not found["gpu 0"].fine
-    assert "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
-    assert found["gpu 1"].fine
-    assert found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
+    by_check = {finding.what: finding for finding in doctor.check_gpu()}
+    assert not by_check["gpu 0"].fine
+    assert "driver 535.1: 580 or newer is needed" in by_check["gpu 0"].text
+    assert by_check["gpu 1"].fine
+    assert by_check["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
 
 
 def test_certificates_are_looked_at(tmp_path):
@@ -167,9 +167,11 @@ def test_certificates_are_looked_at(tmp_path):
     create_authority(tmp_path)
     issue(tmp_path, "actor", days=100.0)
     issue(tmp_path, "observer", days=3.0)
-    found = {finding.text.split(":")[0]: finding for finding in doctor.check_certificates(tmp_path)}
-    actor = found["quickstart.actor.0"]
-    observer = found["quickstart.observer.0"]
+    by_certificate = {
+        finding.text.split(":")[0]: finding for finding in doctor.check_certificates(tmp_path)
+    }
+    actor = by_certificate["quickstart.actor.0"]
+    observer = by_certificate["quickstart.observer.0"]
     assert actor.fine
     assert not observer.fine
     assert "issue --force" in observer.text

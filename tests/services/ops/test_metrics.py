@@ -69,19 +69,19 @@ def test_a_learner_shows_its_status_and_its_last_update():
     port = free_port()
     metrics.update({"episode/success": 0.5, "update_seconds": 0.25})
     with exposed(port, "127.0.0.1", metrics):
-        found = scrape(port)
-    assert found["congrasp_learner_version",] == 7
-    assert found["congrasp_learner_ready",] == 1
-    assert found["congrasp_learner_rollouts_total", "consumed"] == 7
-    assert found["congrasp_learner_tickets_total", "granted"] == 9
+        scraped = scrape(port)
+    assert scraped["congrasp_learner_version",] == 7
+    assert scraped["congrasp_learner_ready",] == 1
+    assert scraped["congrasp_learner_rollouts_total", "consumed"] == 7
+    assert scraped["congrasp_learner_tickets_total", "granted"] == 9
     assert (
-        found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",]
+        scraped["congrasp_learner_tickets_running",] + scraped["congrasp_learner_tickets_capacity",]
         == 4
     )
-    assert found["congrasp_learner_actor_lag", "a", "1"] == 1
-    assert found["congrasp_learner_roles", "actor"] == 1
-    assert found["congrasp_learner_update", "episode/success"] == 0.5
-    assert found["process_resident_memory_bytes",] > 0
+    assert scraped["congrasp_learner_actor_lag", "a", "1"] == 1
+    assert scraped["congrasp_learner_roles", "actor"] == 1
+    assert scraped["congrasp_learner_update", "episode/success"] == 0.5
+    assert scraped["process_resident_memory_bytes",] > 0
 
 
 def test_a_learner_that_starts_is_not_ready():
@@ -98,10 +98,10 @@ def test_an_actor_shows_its_last_rollout():
     port = free_port()
     metrics.rollout({"version": 3.0, "rollouts": 12.0, "steps_per_second": 99.0})
     with exposed(port, "127.0.0.1", metrics):
-        found = scrape(port)
-    assert found["congrasp_actor_rollouts_total",] == 12
-    assert found["congrasp_actor_version",] == 3
-    assert found["congrasp_actor_steps_per_second",] == 99
+        scraped = scrape(port)
+    assert scraped["congrasp_actor_rollouts_total",] == 12
+    assert scraped["congrasp_actor_version",] == 3
+    assert scraped["congrasp_actor_steps_per_second",] == 99
 
 
 def test_a_server_counts_answers_and_batches_from_many_threads():
@@ -117,20 +117,20 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
 
     with exposed(port, "127.0.0.1", metrics):
         together(answer, range(4))
-        found = scrape(port)
+        scraped = scrape(port)
     assert (
-        found["congrasp_policy_queries_total", "answered"]
+        scraped["congrasp_policy_queries_total", "answered"]
         == 400
-        == found["congrasp_policy_batch_bucket", "4.0"]
+        == scraped["congrasp_policy_batch_bucket", "4.0"]
     )
-    assert found["congrasp_policy_queries_total", "overloaded"] == 400
-    assert found["congrasp_policy_seconds_bucket", "0.003"] == 0
+    assert scraped["congrasp_policy_queries_total", "overloaded"] == 400
+    assert scraped["congrasp_policy_seconds_bucket", "0.003"] == 0
     assert (
-        found["congrasp_policy_seconds_bucket", "0.005"]
-        == found["congrasp_policy_seconds_count",]
+        scraped["congrasp_policy_seconds_bucket", "0.005"]
+        == scraped["congrasp_policy_seconds_count",]
         == 400
     )
-    assert found["congrasp_policy_version",] == 5
+    assert scraped["congrasp_policy_version",] == 5
 
 
 @contextlib.contextmanager
@@ -156,7 +156,7 @@ def role(*arguments):
 def scraped_until(port, condition):
     def look():
         with contextlib.suppress(OSError):
-            return found if condition(found := scrape(port)) else None
+            return metrics if condition(metrics := scrape(port)) else None
 
     return eventually(look, 0.1)
 
@@ -189,23 +189,25 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
     )
     with (
         role(*learner, "--metrics-port", str(ports[0])),
-        role(*actor, "--metrics-port", str(ports[1])) as said,
+        role(*actor, "--metrics-port", str(ports[1])) as actor_output,
     ):
-        wanted = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
-        found = scraped_until(ports[0], lambda found: wanted.items() <= found.items())
-        assert found["congrasp_learner_counters_balanced",] == 1
+        expected = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
+        metrics = scraped_until(ports[0], lambda metrics: expected.items() <= metrics.items())
+        assert metrics["congrasp_learner_counters_balanced",] == 1
         # One rollout an update, for the next version and the one after it.
         assert (
-            found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",]
+            metrics["congrasp_learner_tickets_capacity",]
+            + metrics["congrasp_learner_tickets_running",]
             == 2
         )
         assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
     assert all(
-        line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said
+        line.keys() == {"time", "level", "role", "id", "run", "text", "fields"}
+        for line in actor_output
     )
-    assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
+    assert datetime.datetime.fromisoformat(actor_output[0]["time"]).tzinfo is datetime.UTC
     # On a busy machine notices come first that it still waits.
-    first = next(line for line in said if not line["text"].startswith("Waiting for"))
+    first = next(line for line in actor_output if not line["text"].startswith("Waiting for"))
     assert first["text"] == f"Connected to the learner at {endpoint}."
     assert first["role"] == "actor"
     assert first["id"] == "worker"
@@ -214,11 +216,11 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
 def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
         main(["actor", "--connect", "nonsense", "--log-format", "json"])
-    said = capfd.readouterr()
-    line = json.loads(said.out)
+    printed = capfd.readouterr()
+    line = json.loads(printed.out)
     assert end.value.code == 2
     assert line["level"] == "error"
-    assert said.err == ""
+    assert printed.err == ""
     assert line["text"].startswith("'nonsense' is not an endpoint.")
     with pytest.raises(SystemExit):
         main(["grasp", "nowhere.obj"])

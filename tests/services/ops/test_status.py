@@ -43,19 +43,19 @@ def endpoint():
 
 def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert Status(connect=endpoint, run="r", json=True)() == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["run"] == "r"
-    assert found["version"] == 0
-    assert found["counters"]["accepted"] == 1
-    assert [(role["role"], role["id"]) for role in found["roles"]] == [
+    state = json.loads(capsys.readouterr().out)
+    assert state["run"] == "r"
+    assert state["version"] == 0
+    assert state["counters"]["accepted"] == 1
+    assert [(role["role"], role["id"]) for role in state["roles"]] == [
         ("actor", "worker-7"),
         ("learner", "0"),
     ]
-    actor = found["roles"][0]
+    actor = state["roles"][0]
     assert actor["rollouts"] == 1
     assert actor["version"] == 0
     assert actor["lag"] == 0
-    assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
+    assert 0 < actor["steps_per_second"] == state["rates"]["steps_per_second"] <= 8
     assert Status(connect=endpoint, run="r")() == 0
     text = capsys.readouterr().out
     assert "worker-7" in text
@@ -96,9 +96,9 @@ def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
 
 def test_counters_that_do_not_add_up_are_named(endpoint):
     with ZenohTransport(connect=[endpoint]) as transport:
-        found = ask(transport, "r")
-    assert found["warnings"] == []
-    lost = copy.deepcopy(found)
+        state = ask(transport, "r")
+    assert state["warnings"] == []
+    lost = copy.deepcopy(state)
     lost["counters"]["accepted"] += 1
     (words,) = warnings(lost)
     assert (
@@ -129,12 +129,12 @@ def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
 
 def test_a_terminal_of_80_columns_shows_whole_names(endpoint):
     """A long name continues in the next line of its cell."""
-    found = ask_with_tokens(endpoint, 70)
-    role = {**found["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
+    state = ask_with_tokens(endpoint, 70)
+    role = {**state["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
     rates = {"version": 1234567, "rollouts": 12345678, "steps_per_second": 72900.5}
     named = {**role, **rates, "rollouts_per_second": 24.355}
     console = Console(file=io.StringIO(), width=80)
-    console.print(tables({**found, "roles": [named]}))
+    console.print(tables({**state, "roles": [named]}))
     text = console.file.getvalue()
     assert "…" not in text
     assert "f45e4ae5" in text
@@ -146,19 +146,19 @@ def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_marku
     """600 liveliness tokens of one certificate, some with names that a terminal or a table would
     take for more.
     """
-    found = ask_with_tokens(endpoint, 600)
-    assert len(found["roles"]) == 66
-    assert found["unlisted"] == 600 - 64
-    assert any(role["id"] == "worker-7" for role in found["roles"])
-    named = {**found["roles"][0], "id": "[red]\x1b[2J[/nonsense]" * 10, "refused": 3}
+    state = ask_with_tokens(endpoint, 600)
+    assert len(state["roles"]) == 66
+    assert state["unlisted"] == 600 - 64
+    assert any(role["id"] == "worker-7" for role in state["roles"])
+    named = {**state["roles"][0], "id": "[red]\x1b[2J[/nonsense]" * 10, "refused": 3}
     console = Console(file=io.StringIO(), width=200)
-    console.print(tables({**found, "roles": [named] * 150}))
+    console.print(tables({**state, "roles": [named] * 150}))
     text = console.file.getvalue()
     assert "[red]" in text
     assert "\x1b" not in text
     assert "refused" in text
     assert len(text) < 50_000
-    assert f"{50 + found['unlisted']} more live process(es)" in text
+    assert f"{50 + state['unlisted']} more live process(es)" in text
 
 
 def ask_with_tokens(endpoint, count):

@@ -110,11 +110,11 @@ def test_bytes_are_limited_by_identity():
 
 def _odd(tmp_path):
     pipe = tmp_path / "pipe.json"
-    known = tmp_path / "known.json"
+    file = tmp_path / "known.json"
     os.mkfifo(pipe)
-    known.write_text(hand_text(get_hand("human")))
+    file.write_text(hand_text(get_hand("human")))
     long = ["x" * 300_000, "{" * 100_000]
-    texts = ["", *long, "\x1b[31m\n", "\ud800", str(pipe), str(known), "../../x", '{"format": 1}']
+    texts = ["", *long, "\x1b[31m\n", "\ud800", str(pipe), str(file), "../../x", '{"format": 1}']
     return [None, True, -1, 2**70, 1e300, [], ["human"], {}, {"a": {"b": [None]}}, *texts]
 
 
@@ -123,12 +123,12 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     ever), nothing hangs.
     """
     convert = Converter()
-    whole = episode_message()
+    intact = episode_message()
     messages = {
         "metrics": metrics(loss=1.0),
         "event": Message({}, {"time": 1.0, "level": "info", "text": "x"}),
         "version": Message({}, {"version": 1, "run_id": "e", "schema": "s"}),
-        "episode": whole,
+        "episode": intact,
         "rollout": Message({"reward": np.zeros((2, 2), np.float32)}, {"actor": "a"}),
     }
     refused = 0
@@ -156,24 +156,24 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     ],
 )
 def test_episodes_that_are_none_are_refused(change, why):
-    whole = episode_message()
+    message = episode_message()
     with pytest.raises(CongraspError, match=why):
         Converter()(
             KEYS.log("episode", "actor", "a"),
-            Message({**whole.arrays, **change}, whole.meta),
+            Message({**message.arrays, **change}, message.meta),
             10**18,
         )
 
 
 def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
     convert = Converter()
-    whole = episode_message()
-    long = Message(whole.arrays, {**whole.meta, "control_dt": 1.0})  # 12 s
+    message = episode_message()
+    long = Message(message.arrays, {**message.meta, "control_dt": 1.0})  # 12 s
     for _ in range(6):
         assert convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
     with pytest.raises(CongraspError, match="still playing for 72 s"):
         convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
-    assert convert(KEYS.log("episode", "actor", "0.a"), whole, 10**18)
+    assert convert(KEYS.log("episode", "actor", "0.a"), message, 10**18)
 
 
 def test_a_live_view_bounds_what_waits(monkeypatch):

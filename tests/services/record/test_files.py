@@ -150,9 +150,9 @@ def test_a_file_cut_anywhere_gives_a_beginning(
     tmp_path_factory: pytest.TempPathFactory, share: float
 ) -> None:
     path, _ = flushed_file(tmp_path_factory.mktemp("cut"))
-    whole = path.read_bytes()
+    data = path.read_bytes()
     cut = path.with_name("cut.mcap.part")
-    cut.write_bytes(whole[: round(share * len(whole))])
+    cut.write_bytes(data[: round(share * len(data))])
     read = updates(cut)
     assert read == [*range(len(read))]
 
@@ -226,15 +226,15 @@ def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_pat
     start, length = chunks[damaged]
     data[start + at % length] ^= 4
     path.write_bytes(data)
-    said: list[str] = []
-    records = list(read_records(path, warn=said.append))
+    notes: list[str] = []
+    records = list(read_records(path, warn=notes.append))
     read = [json.loads(record.data)["update"] for record in records]
     assert read == [i for i in range(15) if i // 3 != damaged]
     assert {(record.topic, record.schema) for record in records} == {
         ("/metrics/learner/0", records[0].schema)
     }
     places = f"damaged in 1 place(s), at byte {start}; at least 3 message(s) were dropped."
-    assert said == [f"{path} is {places}"]
+    assert notes == [f"{path} is {places}"]
 
 
 def test_what_was_dropped_is_warned_of_by_default(
@@ -261,14 +261,14 @@ def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
     at = 8 + int(place * (len(data) - 8))
     data[at] ^= 1 << bit
     path.write_bytes(data)
-    said: list[str] = []
-    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
+    notes: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=notes.append)]
     missing = sorted(set(range(15)) - set(read))
     assert read == sorted(set(read))
     assert len(missing) in (0, 3)
     assert not missing or (missing[0] % 3 == 0 and missing[-1] - missing[0] == 2)
-    assert bool(missing) <= bool(said)
-    assert len(said) <= 1
+    assert bool(missing) <= bool(notes)
+    assert len(notes) <= 1
 
 
 @settings(max_examples=60, deadline=None)
@@ -286,11 +286,11 @@ def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(tmp_path_factory, 
         at = 8 + int(place * (len(data) - 8))
         data = data[:at] + content + data[at + replaced :]
     path.write_bytes(data)
-    said: list[str] = []
-    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
+    notes: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=notes.append)]
     assert read == sorted(set(read))
     assert set(read) <= set(range(15))
-    assert len(said) <= 1
+    assert len(notes) <= 1
 
 
 def compressed_file(

@@ -58,8 +58,8 @@ class Viewer:
                 self._subscribe(list(self.advertised.values()))
 
     def _subscribe(self, channels: list[dict[str, str]]) -> None:
-        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        subscriptions = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
     def latest(self, topic: str) -> int:
         """Value of the field `number` of the last message."""

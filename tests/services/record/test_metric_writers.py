@@ -44,16 +44,16 @@ def events(folder: pathlib.Path) -> list[list[Event]]:
     """What is in each event file, by the framing that TensorFlow documents: length, its CRC, data,
     its CRC.
     """
-    found = []
+    all_events = []
     for path in sorted(folder.iterdir()):
         data = path.read_bytes()
         at = 0
-        found.append([])
+        all_events.append([])
         while at < len(data):
             (length,) = struct.unpack_from("<Q", data, at)
-            found[-1].append(Event.FromString(data[at + 12 : at + 12 + length]))
+            all_events[-1].append(Event.FromString(data[at + 12 : at + 12 + length]))
             at += 16 + length
-    return found
+    return all_events
 
 
 def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
@@ -72,7 +72,7 @@ def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
     assert first[1].session_log.status == SessionLog.START
     publish(tmp_path, ["tensorboard"], range(3, 6))
     second = [
-        found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3
+        event for event in events(tmp_path / "tensorboard" / "learner-0") if event[1].step == 3
     ]
     assert len(second) == 1
     assert second[0][1].session_log.status == SessionLog.START

@@ -95,9 +95,9 @@ def test_everything_a_run_publishes_is_in_the_file(
     assert len(topics["/metrics/learner/0"]) == 3
     assert json.loads(topics["/version/learner/0"][0]) == {"version": 7, "hash": "ab"}
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0, 1, 2])
-    (kept,) = read_episodes(tmp_path)
-    np.testing.assert_array_equal(kept.link_position, episode_message().arrays["link_position"])
-    assert kept.metrics == {"return": 1.0}
+    (recorded,) = read_episodes(tmp_path)
+    np.testing.assert_array_equal(recorded.link_position, episode_message().arrays["link_position"])
+    assert recorded.metrics == {"return": 1.0}
     (read,) = read_rollouts(tmp_path)
     assert dict(read.meta) == dict(rollout.meta)
     assert set(read.arrays) == set(rollout.arrays)
@@ -108,11 +108,11 @@ def test_everything_a_run_publishes_is_in_the_file(
 def test_damaged_messages_are_left_out_and_counted(
     transport: MemoryTransport, tmp_path: pathlib.Path
 ) -> None:
-    said: list[str] = []
+    notes: list[str] = []
     broken = Message(
         {**episode_message().arrays, "link_position": np.zeros(3)}, episode_message().meta
     )
-    with Recorder(transport, "r", tmp_path, warn=said.append) as recorder:
+    with Recorder(transport, "r", tmp_path, warn=notes.append) as recorder:
         transport.publish(METRICS, Message({}, {}))
         transport.publish(METRICS, Message({}, {"values": {"kl": "high"}}))
         transport.publish(KEYS.log("episode", "actor", "a0"), broken)
@@ -121,8 +121,8 @@ def test_damaged_messages_are_left_out_and_counted(
         transport.publish(METRICS, metrics(0))
     assert recorder.messages == 1
     assert recorder.damaged == 5
-    assert len(said) == 1
-    assert METRICS in said[0]
+    assert len(notes) == 1
+    assert METRICS in notes[0]
     assert [record.topic for record in read_records(recorder.files[0])] == ["/metrics/learner/0"]
 
 
@@ -137,7 +137,7 @@ def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(transport, 
 
 
 def test_a_full_disk_stops_the_recording_alone(transport, tmp_path, monkeypatch):
-    said: list[str] = []
+    notes: list[str] = []
     seen: list[Entry] = []
 
     class Sink:
@@ -153,14 +153,14 @@ def test_a_full_disk_stops_the_recording_alone(transport, tmp_path, monkeypatch)
         flush(self)
 
     monkeypatch.setattr(LogWriter, "flush", flush_or_fail)
-    with Recorder(transport, "r", tmp_path, warn=said.append, sinks=[Sink()]) as recorder:
+    with Recorder(transport, "r", tmp_path, warn=notes.append, sinks=[Sink()]) as recorder:
         transport.publish(METRICS, metrics(0))
         eventually(lambda: bool(recorder.files) and len(list(read_records(recorder.files[0]))) == 1)
         full = True
         eventually(lambda: bool(recorder.error))
         transport.publish(METRICS, metrics(1))
         eventually(lambda: len(seen) == 2)
-    assert said == [recorder.error]
+    assert notes == [recorder.error]
     assert "No space left on device" in recorder.error
     assert "\n" not in recorder.error
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0])
@@ -309,7 +309,7 @@ def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
         )
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=10)
-    found = re.search(r"lost (\d+)", errors)
-    assert found is not None
-    assert sum(size >= big_size for size in sizes()) + int(found[1]) >= 20
-    assert int(found[1]) > 0
+    lost = re.search(r"lost (\d+)", errors)
+    assert lost is not None
+    assert sum(size >= big_size for size in sizes()) + int(lost[1]) >= 20
+    assert int(lost[1]) > 0

@@ -195,14 +195,14 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     writer.write(*Converter()(KEY, episode_message(), START))
     writer.close()
     with writer.files[0].open("rb") as file:
-        found = [
+        drawn = [
             (channel.topic, message)
             for _, channel, _, message in make_reader(
                 file, decoder_factories=[DecoderFactory()]
             ).iter_decoded_messages(["/episode/a0/tf", "/episode/a0/scene"])
         ]
-    (scene,) = [message for topic, message in found if topic.endswith("scene")]
-    frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
+    (scene,) = [message for topic, message in drawn if topic.endswith("scene")]
+    frame = [message for topic, message in drawn if topic.endswith("tf")][step].transforms[k + 1]
     (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
     assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
     assert frame.parent_frame_id == "a0"
@@ -220,9 +220,9 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     skin = skin_of(HAND)
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
     posed = skin.posed(arrays["link_position"][step], turns)[0]
-    own = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
-    assert len(own) > 3
-    assert cKDTree(world).query(own)[0].max() < 1e-4
+    of_link = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
+    assert len(of_link) > 3
+    assert cKDTree(world).query(of_link)[0].max() < 1e-4
     corners = world[np.array(mesh.indices).reshape(-1, 3)]
     middle = world.mean(0)
     outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -274,10 +274,10 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
 
 def test_the_raw_episode_is_kept_whole(entries: list[Entry]) -> None:
     (entry,) = of(entries, "raw")
-    kept = decode(entry.data)
+    recorded = decode(entry.data)
     sent = episode_message()
-    assert kept.meta == sent.meta
-    assert all(np.array_equal(kept.arrays[name], sent.arrays[name]) for name in sent.arrays)
+    assert recorded.meta == sent.meta
+    assert all(np.array_equal(recorded.arrays[name], sent.arrays[name]) for name in sent.arrays)
 
 
 def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side() -> None:
@@ -307,27 +307,27 @@ def test_a_clock_that_is_set_back_drops_no_episode() -> None:
 
 
 def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
-    whole = episode_message()
+    message = episode_message()
     colours = {
         "colour_points": np.zeros((2, 3), np.float32),
         "colour_values": np.zeros((2, 3), np.uint8),
     }
-    Episode.from_message(Message(whole.arrays | colours, whole.meta))
+    Episode.from_message(Message(message.arrays | colours, message.meta))
     for name in colours:
         with pytest.raises(
             CongraspError, match="colour_points without colour_values, or the reverse"
         ):
-            Episode.from_message(Message(whole.arrays | {name: colours[name]}, whole.meta))
+            Episode.from_message(Message(message.arrays | {name: colours[name]}, message.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
-        Episode.from_message(Message(whole.arrays | far, whole.meta))
-    evil = Episode.from_message(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
+        Episode.from_message(Message(message.arrays | far, message.meta))
+    evil = Episode.from_message(Message(message.arrays, {**message.meta, "object": "../evil"}))
     with pytest.raises(CongraspError, match="object of a motion"):
         save_motion(tmp_path / "motion.npz", evil)
     with pytest.raises(CongraspError, match="object of a motion"):
         default_name(evil, "glb")
     motion = dataclasses.replace(
-        Episode.from_message(whole).normalised(),
+        Episode.from_message(message).normalised(),
         colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)),
     )
     save_motion(tmp_path / "motion.npz", motion)

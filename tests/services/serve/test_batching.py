@@ -133,9 +133,9 @@ class Letters(Gate):
 )
 def test_peers_share_a_batch_however_long_their_items_are(several, items, batches):
     gate = Letters()
-    asked = [item.split(":") for item in items.split()]
-    futures, batcher = gate.run(*asked)
-    assert [future.result(10) for future in futures] == [item.upper() for _, item in asked]
+    queries = [item.split(":") for item in items.split()]
+    futures, batcher = gate.run(*queries)
+    assert [future.result(10) for future in futures] == [item.upper() for _, item in queries]
     assert gate.batches == batches
     batcher.close()
 

@@ -198,14 +198,14 @@ def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
     clock = Clock(100.0)
     policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
-        kept = guard.step(STATE)
+        command = guard.step(STATE)
         guard.freeze()
         policy.outcome = answer(np.array([0.9, 0.9]))
         clock.now += 0.5
         frozen = guard.step(STATE)
-        assert kept.mode == "follow"
+        assert command.mode == "follow"
         assert frozen.mode == "freeze"
-        np.testing.assert_allclose(frozen.q_target, kept.q_target)
+        np.testing.assert_allclose(frozen.q_target, command.q_target)
         guard.open()
         clock.now += 0.5
         assert guard.step(STATE).mode == "open"

@@ -109,8 +109,8 @@ def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits(
 
     def limit(*given):
         *three, now = given
-        found = limiter.limit(*(np.append(x, np.zeros(6)) for x in three), now)
-        return Limited(found.target[0], found.torque[0], found.by)
+        limited = limiter.limit(*(np.append(x, np.zeros(6)) for x in three), now)
+        return Limited(limited.target[0], limited.torque[0], limited.by)
 
     assert limit(0.01, 0.0, 0.0, 0.0).target == pytest.approx(0.01)  # the first period
     fast = limit(0.5, 0.4, 0.0, 0.01)

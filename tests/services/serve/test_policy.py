@@ -317,12 +317,12 @@ def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
     camera = dataclasses.replace(STUDENT.task, observation="camera")
     policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=camera)))
-    own = episode.request
+    tracked = episode.request
     cloud = np.asarray(episode.request.surface) + episode.request.object_pose[0]
-    heading = own.constraints["heading"]
-    heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}
+    heading = tracked.constraints["heading"]
+    heading = {**heading, "position": np.asarray(heading["position"]) + tracked.object_pose[0]}
     request = dataclasses.replace(
-        own,
+        tracked,
         constraints={"heading": heading},
         surface=None,
         object_pose=None,
@@ -385,10 +385,10 @@ def test_a_student_averages_the_resting_object(episode, settle, expected):
         with pytest.raises(RefusedError, match="unknown field 'colour'"):
             policy.act({**episode.state, "colour": np.zeros(3)})
         policy.act({**episode.state, "object_position": start + np.array([x, 0.0, 0.0])})
-    found = [
+    positions = [
         1e3 * (sent["object_position_initial"] - start) for sent in policy.sent if "past_q" in sent
     ]
-    np.testing.assert_allclose([x for x, _, _ in found], expected, atol=1e-4)
+    np.testing.assert_allclose([x for x, _, _ in positions], expected, atol=1e-4)
 
 
 def test_normals_of_an_episode_are_those_of_its_points(episode):

@@ -103,10 +103,10 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
     """It is the hand's own at the start, in the object's frame; along the heading it says
     nothing.
     """
-    own = grasp_frame(get_hand("human")).cross
+    cross = grasp_frame(get_hand("human")).cross
     wrist = Rotation.from_euler("x", 0.4)
     thing = Rotation.from_quat(turn, scalar_first=True)
-    held = thing.inv().apply(wrist.apply(own))
+    held = thing.inv().apply(wrist.apply(cross))
     across = np.cross(held, [0.36, 0.48, 0.8])
     direction = held if along else across / np.linalg.norm(across)
     _, received = parse(
@@ -122,11 +122,11 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
 def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
     points = np.arange(count)[:, None] * np.ones(3)
     _, received = parse(surface_points=points, surface_avoid=np.arange(count) >= count // 2)
-    kept = received["surface_points"][:, 0]
-    assert kept[0] == 0
-    assert np.all(np.diff(kept) >= 0)
-    assert len(set(kept)) == min(count, 8)
-    np.testing.assert_array_equal(received["surface_avoid"], kept >= count // 2)
+    coordinates = received["surface_points"][:, 0]
+    assert coordinates[0] == 0
+    assert np.all(np.diff(coordinates) >= 0)
+    assert len(set(coordinates)) == min(count, 8)
+    np.testing.assert_array_equal(received["surface_avoid"], coordinates >= count // 2)
 
 
 @pytest.mark.parametrize(
@@ -289,18 +289,18 @@ def test_normals_are_estimated_once_for_a_surface(monkeypatch):
         lambda points: calls.append(points) or estimated_normals(points),
     )
     layout = Layout(HAND, CLOSER)
-    own = np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
+    sent_normals = np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
     vectors = np.zeros((5, layout.size), np.float32)
     for row, surface in enumerate((0, 1, 0, 0, 1)):
-        vectors[row, layout.offsets["surface_points"] :][:24] = own[surface].reshape(-1)
+        vectors[row, layout.offsets["surface_points"] :][:24] = sent_normals[surface].reshape(-1)
     vectors[3, layout.offsets["surface_normals"] :][:24] = UP.reshape(-1)
     layout.estimate_normals(vectors.copy())
     layout.estimate_normals(vectors)
     assert len(calls) == 2
-    found = layout.unpack(vectors)["surface_normals"]
-    expected = np.asarray(estimated_normals(own))
+    normals = layout.unpack(vectors)["surface_normals"]
+    expected = np.asarray(estimated_normals(sent_normals))
     np.testing.assert_allclose(
-        found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
+        normals, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
     )
 
 
@@ -320,5 +320,5 @@ def test_estimated_normals_of_a_cloud_point_toward_its_camera():
     task = dataclasses.replace(CLOSER, observation="camera")
     sheet = np.random.default_rng(2).uniform(-0.05, 0.05, (8, 3)) * [1, 1, 0]
     for side in (1.0, -1.0):
-        found = normals_of(task, cloud=sheet, camera_position=np.array([0.1, 0.0, side]))
-        np.testing.assert_allclose(found, side * UP, atol=1e-3)
+        normals = normals_of(task, cloud=sheet, camera_position=np.array([0.1, 0.0, side]))
+        np.testing.assert_allclose(normals, side * UP, atol=1e-3)

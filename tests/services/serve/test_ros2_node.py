@@ -98,13 +98,13 @@ def robot_says(obj):
     names = [*(NAMES[i] for i in order), "elbow"]
     angles = [*HAND.q_open[order].tolist(), 0.7]
     joints = Fields(header=header(""), name=names, position=angles, velocity=[], effort=[])
-    lying = Rotation.from_euler("z", 0.5)
+    rotation = Rotation.from_euler("z", 0.5)
     elsewhere = Fields(header=header(""), name=["wheel"], position=[3.0], velocity=[], effort=[])
     return [
         ("joint_states", joints),
         ("joint_states", elsewhere),
         ("wrist_pose", posed(BASE, BASE_TURN)),
-        ("object_pose", posed(np.array([0.0, 0.1, 0.05]) + lying.apply(obj.origin), lying)),
+        ("object_pose", posed(np.array([0.0, 0.1, 0.05]) + rotation.apply(obj.origin), rotation)),
     ]
 
 
@@ -135,8 +135,8 @@ def check(policy, obj, commanded):
     sin = np.sin([0.02, 0.01])
     about_x = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
     about_z = np.array([[cos[1], -sin[1], 0], [sin[1], cos[1], 0], [0, 0, 1]])
-    found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    np.testing.assert_allclose(found, BASE_TURN.as_matrix() @ about_x @ about_z, atol=1e-6)
+    rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    np.testing.assert_allclose(rotation, BASE_TURN.as_matrix() @ about_x @ about_z, atol=1e-6)
     assert wrist.header.frame_id == "world"
     assert abs(wrist.header.stamp.sec - time.time()) < 60
 
@@ -169,11 +169,11 @@ def running(example, bus, arguments, age, lift, target):
 
 
 @contextlib.contextmanager
-def node_of(example, bus, lift=0.0, age=5.0, **given):
+def node_of(example, bus, lift=0.0, age=5.0, **options):
     """A node with a tracker, and the object that it grasps."""
     obj = procedural.generate(7)
     # On a machine with other work
-    arguments = example.Arguments("capsule:7", robot_age=5.0, **given)
+    arguments = example.Arguments("capsule:7", robot_age=5.0, **options)
     request = congrasp.GraspRequest(surface=obj.points)
     make = lambda sensors: example.Tracked(sensors, request, obj.origin)  # noqa: E731
     with running(example, bus, arguments, age, lift, make) as (node, policy):
@@ -204,9 +204,9 @@ class Wire:
 
 def arrived(commands, policy):
     """True if the targets, which the limits slow down, rest where the policy wants them."""
-    wanted = np.concatenate(policy.wanted)
+    target = np.concatenate(policy.wanted)
     newest = [np.append(command.q_target, command.u_target) for command in commands[-2:]]
-    return len(newest) == 2 and np.allclose(newest, wanted)
+    return len(newest) == 2 and np.allclose(newest, target)
 
 
 def schema(kind):
@@ -267,7 +267,7 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
     """Against a stand-in for rclpy that takes what rclpy takes: messages by class, arrays as
     lists.
     """
-    said = []
+    messages = []
     sent = {}
     callbacks = {}
 
@@ -298,8 +298,8 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
         return type(kind.rpartition("/")[2], (), {"__init__": make})
 
     def spin_once(node, timeout_sec):
-        if said:
-            topic, message = said.pop(0)
+        if messages:
+            topic, message = messages.pop(0)
             callbacks[topic](message)
 
     policies = {
@@ -331,7 +331,7 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
     with node_of(example, example.RosBus()) as (node, policy, obj):
 
         def turn():
-            said.extend(robot_says(obj))
+            messages.extend(robot_says(obj))
             commands.append(node.step())
             return commands[-1].mode == "follow" and arrived(commands, policy)
 
@@ -562,10 +562,10 @@ PALM = np.array([0.5, 0.1, 0.32])
 PALM_TURN = Rotation.from_euler("x", 180, degrees=True)
 
 
-def camera_node(example, bus, lift=0.0, age=5.0, **given):
+def camera_node(example, bus, lift=0.0, age=5.0, **options):
     """A node of a policy with a camera, in a box around (0.5, 0.1)."""
     arguments = example.Arguments(
-        cloud_topic=TOPIC, robot_age=5.0, box="0.5 0.1 0.2 0.3 0.3 0.4", **given
+        cloud_topic=TOPIC, robot_age=5.0, box="0.5 0.1 0.2 0.3 0.3 0.4", **options
     )
     make = functools.partial(example.target_of, arguments, hand=HAND, described=DESCRIBED)
     return running(example, bus, arguments, age, lift, make)

@@ -123,14 +123,14 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
         return versions
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool, PolicyClient(endpoint) as watcher:
-        asked = pool.map(ask, range(4))
+        versions_of_clients = pool.map(ask, range(4))
         try:
             for version in range(1, 101):
                 bundles.save(dataclasses.replace(policy, version=version), path)
                 eventually(lambda version=version: watcher.health()["version"] == version, 0.0)
         finally:
             swapped.set()
-        for versions in asked:
+        for versions in versions_of_clients:
             assert versions == sorted(versions)
             assert versions[-1] == 100
             assert len(set(versions)) > 10
@@ -236,16 +236,16 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         ]
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
         stack.callback(go.set)
-        asked = [pool.submit(ask, clients[0])]
+        futures = [pool.submit(ask, clients[0])]
         assert entered.acquire(timeout=60)
-        asked += [pool.submit(ask, client) for client in clients[1:-1]]
+        futures += [pool.submit(ask, client) for client in clients[1:-1]]
         eventually(lambda: clients[-1].health()["queue"] >= DEPTH)
         with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
-        assert not any(future.done() for future in asked)
+        assert not any(future.done() for future in futures)
         go.set()
-        assert len({future.result(60) for future in asked}) == 1
+        assert len({future.result(60) for future in futures}) == 1
 
 
 def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):

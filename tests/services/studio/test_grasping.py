@@ -105,11 +105,11 @@ def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> N
     ],
 )
 def test_the_drawn_grasp_is_shown_unless_a_variation_is_clearly_better(held, error, index, says):
-    found = outcome(held, error)
-    removal = int(found.trace.table[:, 0].sum()) - 1
-    assert grasping.best_attempt(found, (), removal, 0.0) == index
-    assert says in grasping.variation_note(found, index, np.full(ATTEMPTS, 0.004))
-    assert bool(says) == bool(grasping.variation_note(found, index, np.full(ATTEMPTS, 0.004)))
+    attempts = outcome(held, error)
+    removal = int(attempts.trace.table[:, 0].sum()) - 1
+    assert grasping.best_attempt(attempts, (), removal, 0.0) == index
+    assert says in grasping.variation_note(attempts, index, np.full(ATTEMPTS, 0.004))
+    assert bool(says) == bool(grasping.variation_note(attempts, index, np.full(ATTEMPTS, 0.004)))
 
 
 def test_a_job_shows_its_elapsed_seconds() -> None:

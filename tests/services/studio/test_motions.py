@@ -51,17 +51,17 @@ def test_every_active_constraint_has_a_lane_and_no_other() -> None:
 
 
 def test_the_fake_grasp_meets_its_constraints() -> None:
-    found = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
-    heading = found["heading"]
+    shown_lanes = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
+    heading = shown_lanes["heading"]
     np.testing.assert_allclose(heading.errors["rad"], 0.0, atol=1e-3)
     assert heading.met[-1]
     assert heading.counts.tolist() == [False] * REMOVAL + [True] * (STEPS - REMOVAL)
-    pose = found["pose"]
+    pose = shown_lanes["pose"]
     assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6)
     assert pose.errors["m"][-1] == pytest.approx(0, abs=1e-6)
     assert not pose.met[0]
     assert pose.met[-1]
-    trajectory = found["trajectory"]
+    trajectory = shown_lanes["trajectory"]
     assert trajectory.counts.tolist() == [True] * REMOVAL + [False] * (STEPS - REMOVAL)
     np.testing.assert_allclose(trajectory.errors["m"], 0.0, atol=1e-6)
     assert trajectory.met.all()
@@ -131,9 +131,9 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
 def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> None:
     made = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
     recorded = Episode.from_message(older(made.to_message()))
-    found = lanes(recorded)
-    assert set(found) == {"contact"}
-    np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
+    shown_lanes = lanes(recorded)
+    assert set(shown_lanes) == {"contact"}
+    np.testing.assert_array_equal(shown_lanes["contact"].met, lanes(made)["contact"].met)
     page = for_page(recorded)
     now = for_page(made)
     kinds = ("arrow/", "polyline/", "ghost/", "paint/")
@@ -147,9 +147,9 @@ VIEW = {"position": [0.5, -0.6, 0.4], "target": [0.0, 0.0, 0.06], "field_of_view
 
 
 def image(view: dict[str, object], frame: int = 5) -> np.ndarray:
-    found = drawing(episode(6, removal=4), "3", "png", view, frame, lambda share: None)
-    assert found.name == f"cylinder-0-3-{frame}.png"
-    return np.asarray(Image.open(io.BytesIO(found.data))).astype(int)
+    picture = drawing(episode(6, removal=4), "3", "png", view, frame, lambda share: None)
+    assert picture.name == f"cylinder-0-3-{frame}.png"
+    return np.asarray(Image.open(io.BytesIO(picture.data))).astype(int)
 
 
 def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

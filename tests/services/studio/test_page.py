@@ -59,9 +59,9 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     small = np.asarray(
         Image.fromarray(seen.astype(np.uint8)).resize((96, 72), Image.Resampling.BOX)
     ).astype(int)
-    wanted = np.asarray(Image.open(REFERENCE).convert("RGB")).astype(int)
+    reference = np.asarray(Image.open(REFERENCE).convert("RGB")).astype(int)
     # Buttons lie over the picture's upper and lower edge; fonts differ between machines.
-    difference = np.abs(small - wanted).max(-1)[12:-6]
+    difference = np.abs(small - reference).max(-1)[12:-6]
     assert (difference > 40).mean() < 0.02, (
         "the picture is another than tests/services/studio/first_picture.png"
     )

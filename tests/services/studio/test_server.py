@@ -50,9 +50,9 @@ class Page:
             {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}},
         )
         answer = connection.getresponse()
-        found = answer.status, answer.read()
+        reply = answer.status, answer.read()
         connection.close()
-        return found
+        return reply
 
     def get(self, path: str) -> dict[str, Any]:
         return json.loads(self.ask("GET", path)[1])
@@ -62,9 +62,9 @@ class Page:
         return self.get("/api/state")
 
     def do(self, action: str, **values: Any) -> dict[str, Any]:
-        code, found = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
+        code, reply = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
         assert code == 200
-        return json.loads(found)
+        return json.loads(reply)
 
     def upload(self, name: str, content: bytes = b"solid") -> dict[str, Any]:
         kind = "application/octet-stream"
@@ -114,10 +114,10 @@ def test_a_result_that_is_not_json_is_answered() -> None:
     server = PageServer(
         lambda browser: Routes({"/api/nan": lambda query: {"x": float("nan")}}, {}), "127.0.0.1", 0
     )
-    code, found = Page(server.port).ask("GET", "/api/nan")
+    code, reply = Page(server.port).ask("GET", "/api/nan")
     server.close()
     assert code == 500
-    assert "ValueError" in json.loads(found)["error"]
+    assert "ValueError" in json.loads(reply)["error"]
 
 
 def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,12 +215,12 @@ def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_other_sites_are_rejected(page: Page) -> None:
-    own = {
+    same_site = {
         "Host": f"localhost:{page.port}",
         "Origin": f"http://localhost:{page.port}",
         "Sec_Fetch_Site": "same-origin",
     }
-    assert page.ask("GET", "/api/state", **own)[0] == 200
+    assert page.ask("GET", "/api/state", **same_site)[0] == 200
     for other in (
         "Host=evil.example:80",
         "Origin=http://evil.example",
@@ -228,7 +228,7 @@ def test_other_sites_are_rejected(page: Page) -> None:
         "Sec_Fetch_Site=same-site",
     ):
         name, _, value = other.partition("=")
-        assert page.ask("GET", "/api/state", **{**own, name: value})[0] == 403, other
+        assert page.ask("GET", "/api/state", **{**same_site, name: value})[0] == 403, other
 
 
 def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
@@ -253,12 +253,14 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         )
         assert code(Host="hub.example.org", Origin="https://hub.example.org") == 200
         # nginx puts the address behind it as Host and leaves the browser's Origin.
-        own = f"127.0.0.1:{server.port}"
-        assert code(Host=own, Origin="https://hub.example.org") == 200
-        refused = page.ask("GET", "/", Host=own, Origin="https://other.example")
+        address = f"127.0.0.1:{server.port}"
+        assert code(Host=address, Origin="https://hub.example.org") == 200
+        refused = page.ask("GET", "/", Host=address, Origin="https://other.example")
         assert refused[0] == 403
         assert "--allow-host 'other.example'" in json.loads(refused[1])["error"]
-        assert code(Host=own, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
+        assert (
+            code(Host=address, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
+        )
         assert code(Host="localhost:9000", Origin="http://localhost:9001") == 403
         assert code(Host="hub.example.org", Origin="https://evil.example") == 403
         refused = page.ask("GET", "/", Host="other.example.org")
@@ -300,9 +302,9 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
     ],
 )
 def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, says: str) -> None:
-    code, found = page.ask("POST", "/api/do", body)
+    code, reply = page.ask("POST", "/api/do", body)
     assert code == 200
-    assert says in json.loads(found)["error"]
+    assert says in json.loads(reply)["error"]
 
 
 def test_a_body_without_length_or_beyond_the_limit_is_refused_unread(page: Page) -> None:
@@ -367,8 +369,8 @@ def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
     page = Page(server.port)
     try:
         for name in ("..", "a/..", "a%00.stl", "a%0A.stl", "a" * 300, "%F0%9F%8D%90" * 64):
-            code, found = page.ask("POST", f"/api/upload?name={name}", b"solid")
-            assert (code, "is not a file name" in json.loads(found)["error"]) == (400, True), name
+            code, reply = page.ask("POST", f"/api/upload?name={name}", b"solid")
+            assert (code, "is not a file name" in json.loads(reply)["error"]) == (400, True), name
         for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
             assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
         assert page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=nan")[0] == 400
@@ -389,17 +391,17 @@ def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> 
     def mass() -> float:
         return page.state["studio"]["object"]["mass_g"]
 
-    own = mass()
+    estimated = mass()
     page.do("weigh", mass_g=500)
     page.do("grasp")
     assert page.wait()
     assert grasping.asked[-1][0].mass == 0.5
     assert mass() == 500
     page.do("weigh", material="steel")
-    assert mass() not in (500, own)
+    assert mass() not in (500, estimated)
     assert "The mass is 9e+09 g" in page.do("weigh", mass_g=9e9)["error"]
     page.do("weigh")
-    assert mass() == own
+    assert mass() == estimated
 
 
 def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePolicy) -> None:
@@ -480,14 +482,14 @@ def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page)
     for unit in ("cm", "in"):
         page.do("unit", unit=unit)
         page.wait()
-        found = page.state
-        assert found["upload"]["unit"] == unit
-        names.append(found["chosen"])
-        sizes.append(max(found["studio"]["object"]["size_cm"]))
+        state = page.state
+        assert state["upload"]["unit"] == unit
+        names.append(state["chosen"])
+        sizes.append(max(state["studio"]["object"]["size_cm"]))
     assert sizes[1] / sizes[0] == pytest.approx(2.54, rel=0.05)
     # It took the place of the first
     assert names[0] == names[1]
-    assert found["objects"].count(names[0]) == 1
+    assert state["objects"].count(names[0]) == 1
     page.do("object", name="mug")
     assert page.wait()
     assert page.state["upload"] is None

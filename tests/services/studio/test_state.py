@@ -70,8 +70,8 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
     studio.paint([center], 0.02, avoid=True)
     far = np.linalg.norm(MUG.points - center, axis=-1)
     np.testing.assert_array_equal(studio.canvas.avoid, far <= 0.02)
-    shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
-    np.testing.assert_array_equal(studio.canvas.paint.shown, shown <= 0.02)
+    distance = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
+    np.testing.assert_array_equal(studio.canvas.paint.shown, distance <= 0.02)
     assert studio.asked == masks(studio) == {"affordance"}
     np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.avoid)
     np.testing.assert_array_equal(studio.request.avoid, studio.canvas.avoid)

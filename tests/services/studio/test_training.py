@@ -118,7 +118,7 @@ def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> No
 def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
     hub = MemoryHub()
     learner = MemoryTransport(hub)
-    mine = MemoryTransport(hub)
+    client = MemoryTransport(hub)
     learner.serve(
         KEYS.status,
         lambda key, request: Message(
@@ -144,7 +144,7 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
         ),
     )
     window = TrainingWindow("fake")
-    follower = Follower(mine, window, every=0.05)
+    follower = Follower(client, window, every=0.05)
     stop = threading.Event()
     try:
         while not (
@@ -281,7 +281,7 @@ def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
 
 
 def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> None:
-    found = labels_of(
+    labels = labels_of(
         [
             "term/force_excess",
             "episode/heading_rad",
@@ -290,7 +290,7 @@ def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> No
             "episode/success",
         ]
     )
-    units = {name: label["unit"] for name, label in found.items()}
+    units = {name: label["unit"] for name, label in labels.items()}
     assert units == {
         "episode/success": "share of episodes",
         "staleness_mean": "versions",
@@ -298,5 +298,5 @@ def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> No
         "episode/heading_rad": "rad",
         "update_seconds": "s",
     }
-    assert list(found)[:2] == ["episode/success", "staleness_mean"]
-    assert not any({"_", "/"} & set(label["title"]) for label in found.values())
+    assert list(labels)[:2] == ["episode/success", "staleness_mean"]
+    assert not any({"_", "/"} & set(label["title"]) for label in labels.values())

@@ -34,7 +34,7 @@ CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=
 
 
 @pytest.fixture
-def said(monkeypatch):
+def printed_lines(monkeypatch):
     """What was printed so far, as lines."""
     output = io.StringIO()
     monkeypatch.setattr(command, "console", Console(file=output, width=200, soft_wrap=True))
@@ -60,7 +60,7 @@ def status(update, **values):
     return {"values": figures, "update": update, "version": update, "actors": 2}
 
 
-def test_progress_counts_the_time_left_from_the_first_update(said, clock):
+def test_progress_counts_the_time_left_from_the_first_update(printed_lines, clock):
     with stage("a stage"):
         pass
     with TrainingProgress(CONFIG) as progress:
@@ -79,7 +79,7 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
                 },
             )
         )
-    first, *start, early, late = (line.strip() for line in said())
+    first, *start, early, late = (line.strip() for line in printed_lines())
     assert "First update" in start[0]
     assert any(line.endswith(": a stage") for line in start[1:])
     assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
@@ -98,13 +98,13 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
         assert words in late
 
 
-def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
+def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(printed_lines, clock):
     with TrainingProgress(CONFIG) as progress:
         for _ in range(22):
             clock.seconds += 1.0
             progress.show({"actors": 1})
     # The last one at the end
-    assert [line.split()[-4] for line in said()] == [
+    assert [line.split()[-4] for line in printed_lines()] == [
         "1",
         "11",
         "21",
@@ -127,13 +127,15 @@ def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
         eventually(lambda: "left ?" in output.getvalue())
 
 
-def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
+def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(printed_lines, tmp_path):
     from congrasp.services.cli.main import COMMANDS
 
     (tmp_path / EPISODE).touch()
     print_next_steps(tmp_path)
-    assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
-    commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
+    assert any(line.strip() == str(tmp_path / EPISODE) for line in printed_lines())
+    commands = [
+        line.split("congrasp ", 1)[1].split()[0] for line in printed_lines() if "congrasp " in line
+    ]
     assert commands
     assert set(commands) <= set(COMMANDS)
 
@@ -141,7 +143,7 @@ def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, t
 @pytest.mark.parametrize(
     ("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")]
 )
-def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, free, words):
+def test_a_run_that_dies_of_a_full_disk_names_it(printed_lines, monkeypatch, tmp_path, free, words):
     def die(*args, **options):
         checkpoint = tmp_path / "checkpoints" / "checkpoint_000000001.safetensors"
         checkpoint.parent.mkdir()
@@ -163,7 +165,9 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
         ({"environments": 0}, "empty"),
     ],
 )
-def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
+def test_a_configuration_that_cannot_run_leaves_no_run_behind(
+    printed_lines, tmp_path, change, words
+):
     with pytest.raises(CongraspError, match=words):
         config = dataclasses.replace(CONFIG, **change)
         command.run_training(config, tmp_path / "run", LAUNCH, resume=False, evaluation=0)
@@ -171,7 +175,7 @@ def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, ch
 
 
 @pytest.mark.parametrize("existed", [False, True])
-def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existed):
+def test_a_failed_start_removes_what_it_made(printed_lines, monkeypatch, tmp_path, existed):
     run_dir = tmp_path / "new" / "run"
     if existed:
         run_dir.mkdir(parents=True)
@@ -189,7 +193,9 @@ def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existe
     assert run_dir.with_name("run.failed.log").read_text() == "out of memory"
 
 
-def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch, tmp_path):
+def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(
+    printed_lines, monkeypatch, tmp_path
+):
     def stopped(folder, *args, stop, **options):
         stop.set()
         if folder.name == "with checkpoint":
@@ -199,8 +205,8 @@ def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch
     monkeypatch.setattr(command, "train", stopped)
     for name in ("with checkpoint", "without"):
         command.run_training(CONFIG, tmp_path / name, LAUNCH, resume=False, evaluation=0)
-    kept, removed = (line for line in said() if "was stopped" in line)
-    assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in kept
+    resumable, removed = (line for line in printed_lines() if "was stopped" in line)
+    assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in resumable
     assert "--resume" not in removed
     assert not (tmp_path / "without").exists()
 
@@ -221,7 +227,7 @@ SUPERVISOR = """
 """
 
 
-def test_a_resume_while_a_learner_restarts_is_refused(said, monkeypatch, tmp_path):
+def test_a_resume_while_a_learner_restarts_is_refused(printed_lines, monkeypatch, tmp_path):
     """Between the learner's death and its restart nothing but its supervisor holds a lock."""
     create_run(tmp_path, CONFIG)
     write_launch(tmp_path, LaunchRecord.of_plan(LAUNCH.planned(CONFIG), CONFIG.name))
@@ -239,7 +245,7 @@ def test_a_resume_while_a_learner_restarts_is_refused(said, monkeypatch, tmp_pat
         command.run_training(changed, tmp_path, LAUNCH, resume=True, evaluation=0)
 
 
-def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):
+def test_a_run_says_at_its_start_what_was_made_easier(printed_lines, monkeypatch, tmp_path):
     def stop(*args, **options):
         raise KeyboardInterrupt
 
@@ -252,7 +258,7 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
     full = get_preset("human").objects.count
     assert (
         f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of "
-        f"32 units" in said()[1]
+        f"32 units" in printed_lines()[1]
     )
 
 

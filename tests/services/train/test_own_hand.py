@@ -85,8 +85,8 @@ def stages(monkeypatch, tmp_path, claw):
 
 
 def request(hand, out, **changes):
-    asked = Request(hand, "claw", out, False, False, "auto", 8, 2, ("--updates", "3"), 60.0)
-    return dataclasses.replace(asked, **changes)
+    made_request = Request(hand, "claw", out, False, False, "auto", 8, 2, ("--updates", "3"), 60.0)
+    return dataclasses.replace(made_request, **changes)
 
 
 def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
@@ -174,9 +174,9 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
         "--training=--updates 3",
     ]
     assert main.run(command) == 0
-    said = capsys.readouterr().out
-    assert "thumb        opposing_lower - opposing_upper" in said
-    assert "congrasp grasp examples/mug.obj --hand claw" in said
+    printed = capsys.readouterr().out
+    assert "thumb        opposing_lower - opposing_upper" in printed
+    assert "congrasp grasp examples/mug.obj --hand claw" in printed
     file = tmp_path / "hands" / "claw.json"
     made = file.read_text()
     assert main.run(command) == 0

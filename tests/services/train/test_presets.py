@@ -45,12 +45,12 @@ def test_a_preset_travels_and_its_batch_can_be_cut(name):
 def test_the_full_task_is_that_of_the_hand_that_a_command_line_names(claw):
     assert get_preset("full") == get_preset("human") == get_preset("allegro", "human")
     assert get_preset("full", "allegro") == get_preset("allegro") == get_preset("human", "allegro")
-    own = defaults(["--preset", "full", "--hand=claw"])["config"]
-    assert own == get_preset("full", "claw")
-    assert own.name == "claw"
-    assert own.task.hand == claw.text
-    assert with_hand(own, "claw") == own
-    assert easier(own) == []
+    config = defaults(["--preset", "full", "--hand=claw"])["config"]
+    assert config == get_preset("full", "claw")
+    assert config.name == "claw"
+    assert config.task.hand == claw.text
+    assert with_hand(config, "claw") == config
+    assert easier(config) == []
     for name in ("full", "human", "quickstart"):
         with pytest.raises(CongraspError, match="no hand 'paw'"):
             get_preset(name, "paw")
@@ -89,17 +89,19 @@ def test_the_hands_of_the_package_have_what_the_rules_give(name):
 
 @pytest.mark.parametrize("name", RULES)
 def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
-    own = recipe(get_hand(name))
+    config = recipe(get_hand(name))
     human = recipe(get_hand("human"))
     ruled = dataclasses.asdict(rules(get_hand(name)))
     share = ruled.pop("p_affordance")
     weights = dataclasses.replace(human.curriculum.reward, **ruled)
-    assert own.curriculum == dataclasses.replace(human.curriculum, reward=weights)
-    assert own.task.reward == dataclasses.replace(human.task.reward, force_max=ruled["force_max"])
-    task = dataclasses.replace(
-        human.task, hand=name, reward=own.task.reward, **{"p_affordance": share}
+    assert config.curriculum == dataclasses.replace(human.curriculum, reward=weights)
+    assert config.task.reward == dataclasses.replace(
+        human.task.reward, force_max=ruled["force_max"]
     )
-    assert own == dataclasses.replace(human, name=name, task=task, curriculum=own.curriculum)
+    task = dataclasses.replace(
+        human.task, hand=name, reward=config.task.reward, **{"p_affordance": share}
+    )
+    assert config == dataclasses.replace(human, name=name, task=task, curriculum=config.curriculum)
 
 
 def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever():
@@ -139,10 +141,10 @@ def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
         )
         return rules(dataclasses.replace(allegro, links=links))
 
-    found = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
-    assert [one.p_affordance for one in found] == sorted(
-        (one.p_affordance for one in found), reverse=True
+    configs = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
+    assert [one.p_affordance for one in configs] == sorted(
+        (one.p_affordance for one in configs), reverse=True
     )
-    assert found[0].p_affordance == 0.8
-    assert found[-1].p_affordance == 0.6
-    assert len({one.force_max for one in found}) == 1
+    assert configs[0].p_affordance == 0.8
+    assert configs[-1].p_affordance == 0.6
+    assert len({one.force_max for one in configs}) == 1

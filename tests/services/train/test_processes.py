@@ -24,7 +24,7 @@ WAITS = "import time; time.sleep(60)"
 
 
 def test_options_become_arguments():
-    given = {
+    options = {
         "run_dir": "a",
         "resume": True,
         "certs": None,
@@ -32,7 +32,7 @@ def test_options_become_arguments():
         "port": 0,
         "metric_writers": (),
     }
-    assert command("learner", **given) == [
+    assert command("learner", **options) == [
         "learner",
         "--run-dir",
         "a",
@@ -222,13 +222,13 @@ def silent(label, total):
 def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
-    wanted = request(tmp_path, 3.0)
-    failures = train_all(wanted, [OURS, GRAPSXL, PHASES], silent)
+    trainings = request(tmp_path, 3.0)
+    failures = train_all(trainings, [OURS, GRAPSXL, PHASES], silent)
     assert set(failures) == {OURS, GRAPSXL}
     assert "human-ours failed: The disk is full." in failures[OURS]
     assert "human-ours.log" in failures[OURS]
     assert "human-graspxl was stopped" in failures[GRAPSXL]
-    runs = wanted.runs
+    runs = trainings.runs
     assert background.finished_policy(runs / OURS.name) is None
     assert background.training_seconds(runs / OURS.name) is None
     assert (
@@ -241,21 +241,21 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
 def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}
-    wanted = request(tmp_path, 20.0, "--updates", "9")
-    (wanted.runs / OURS.name / "checkpoints").mkdir(parents=True)
-    (wanted.runs / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
-    (wanted.runs / GRAPSXL.name).mkdir()
-    (wanted.runs / GRAPSXL.name / "config.json").touch()
-    assert train_all(wanted, [OURS, GRAPSXL], silent) == {}
+    trainings = request(tmp_path, 20.0, "--updates", "9")
+    (trainings.runs / OURS.name / "checkpoints").mkdir(parents=True)
+    (trainings.runs / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
+    (trainings.runs / GRAPSXL.name).mkdir()
+    (trainings.runs / GRAPSXL.name / "config.json").touch()
+    assert train_all(trainings, [OURS, GRAPSXL], silent) == {}
     ours, graspxl = (child.arguments for child in started)
     assert "--resume" in ours
     assert ours[-2:] == ["--updates", "9"]
     assert "--preset" not in ours
-    run = str(wanted.runs / GRAPSXL.name)
+    run = str(trainings.runs / GRAPSXL.name)
     assert graspxl[graspxl.index("--run-dir") + 1] == run
     assert graspxl[graspxl.index("--evaluation") + 1] == "0"
     assert "--resume" not in graspxl
-    assert not (wanted.runs / GRAPSXL.name / "config.json").exists()
+    assert not (trainings.runs / GRAPSXL.name / "config.json").exists()
 
 
 @pytest.mark.parametrize(

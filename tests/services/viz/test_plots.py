@@ -66,10 +66,10 @@ def test_settings_of_matplotlib_change_no_figure(tmp_path: pathlib.Path) -> None
 def test_every_metric_is_in_exactly_one_panel() -> None:
     series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
     groups = figures({"run": series})
-    shown = [
+    plotted = [
         metric for _, panels in groups.values() for panel in panels for metric in panel.metrics
     ]
-    assert sorted(shown) == sorted(METRICS)
+    assert sorted(plotted) == sorted(METRICS)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [
         ("term/contact",),
         ("term/force_excess",),

@@ -63,9 +63,9 @@ class Known:
     def waypoints(self, count: int = 15) -> tuple[np.ndarray, Rotation]:
         """The expected trajectory, at equal distances along the path."""
         length = np.concatenate([[0], np.linalg.norm(np.diff(self.path, axis=0), axis=-1).cumsum()])
-        wanted = np.linspace(0, length[-1], count)
-        position = np.stack([np.interp(wanted, length, axis) for axis in self.path.T], -1)
-        return position, Slerp(length, self.turns)(wanted)
+        lengths = np.linspace(0, length[-1], count)
+        position = np.stack([np.interp(lengths, length, axis) for axis in self.path.T], -1)
+        return position, Slerp(length, self.turns)(lengths)
 
 
 def make(
@@ -138,19 +138,19 @@ def make(
     )
 
 
-def write_mesh(known: Known, path: pathlib.Path) -> None:
+def write_mesh(scene: Known, path: pathlib.Path) -> None:
     """The box's mesh in metres."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    known.mesh().export(path)
+    scene.mesh().export(path)
 
 
-def check(arrays: dict[str, np.ndarray], m: int, known: Known) -> None:
+def check(arrays: dict[str, np.ndarray], m: int, scene: Known) -> None:
     """Pose and trajectory m of a set are the known ones within 1 mm and 0.01 rad."""
-    position, turns = known.waypoints(arrays["trajectory/position"].shape[2])
-    found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
+    position, turns = scene.waypoints(arrays["trajectory/position"].shape[2])
+    rotation = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
     np.testing.assert_allclose(arrays["trajectory/position"][0, m], position, atol=1e-3)
-    assert (found * turns.inv()).magnitude().max() < 0.01
-    np.testing.assert_allclose(arrays["pose/q"][0, m], known.q, atol=0.01)
+    assert (rotation * turns.inv()).magnitude().max() < 0.01
+    np.testing.assert_allclose(arrays["pose/q"][0, m], scene.q, atol=0.01)
     np.testing.assert_allclose(arrays["pose/position"][0, m], position[-1], atol=1e-3)
     last = Rotation.from_quat(arrays["pose/quaternion"][0, m], scalar_first=True)
     assert (last * turns[-1].inv()).magnitude() < 0.01

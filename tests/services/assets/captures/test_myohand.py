@@ -97,9 +97,9 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
     assert len(report.kept) == 5
     assert len(held) == 1
     catalogue = Catalogue(tmp_path / "objects")
-    found = [catalogue.get(name) for name in catalogue.list()]
+    imported = [catalogue.get(name) for name in catalogue.list()]
     for split, names in (("training", set("abcde") - set(held)), ("held-out", set(held))):
-        objects, chosen = load_for(tmp_path / "out", found, split)
+        objects, chosen = load_for(tmp_path / "out", imported, split)
         if headings == "demonstrated":  # a heading belongs where its demonstration does
             assert {obj.name for obj in objects} == names
         valid = bank_of(chosen, split).pose_valid[:, 0].any((1, 2))

@@ -282,17 +282,17 @@ def test_where_one_may_not_go_the_other_does():
         links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2]),
     )
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    assert found[0, 0] == np.float32(-0.38)
-    assert found[0, 1] < 0.3
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+    angles = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    assert angles[0, 0] == np.float32(-0.38)
+    assert angles[0, 1] < 0.3
+    np.testing.assert_allclose(deepest(hand, angles), OVERLAP, atol=2e-5)
 
 
 def test_followers_still_follow():
     hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+    angles = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    np.testing.assert_allclose(angles, coupled(hand, angles), atol=1e-6)
+    np.testing.assert_allclose(deepest(hand, angles), OVERLAP, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
@@ -308,17 +308,17 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
     )
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
     before = np.asarray(deepest(hand, q))
-    found = separated(hand, q)
+    angles = separated(hand, q)
     deep = before > OVERLAP
     assert deep.any()
     assert not deep.all()
-    np.testing.assert_array_equal(found[~deep], q[~deep])
-    assert np.all(found >= hand.lower)
-    assert np.all(found <= hand.upper)
+    np.testing.assert_array_equal(angles[~deep], q[~deep])
+    assert np.all(angles >= hand.lower)
+    assert np.all(angles <= hand.upper)
     np.testing.assert_array_less(
-        hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5
+        hand_hand(hand, link_transforms(hand, jnp.asarray(angles))), OVERLAP + 5e-5
     )
-    np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)
+    np.testing.assert_allclose(separated(hand, angles), angles, atol=1e-3)
 
 
 # --- resting poses ---
@@ -385,25 +385,25 @@ def test_the_report_names_them(capsys):
         later = {"frames_after_touch": 4 if below else 0}
         return {"sequence": name, "object": "box", "residual_rad": 0.0} | place | apart | later
 
-    kept = [
+    sequences = [
         row("lift", clear=True, below=False),
         row("scoop", clear=False, below=True, overlap=0.004, moved=0.1),
         row("push", clear=False, below=False, overlap=0.003, moved=0.2),
         row("dig", clear=False, below=True),
     ]
-    print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
-    said = capsys.readouterr().out
-    assert "room for 1 of 4" in said
-    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in said
-    assert "the reference is taken then, 4 frames later on average" in said
-    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in said
-    assert "by 0.15 rad on average, at most 0.20 rad (push)" in said
+    print_report(Report(sequences), "human", pathlib.Path("sets"), pathlib.Path("objects"))
+    printed = capsys.readouterr().out
+    assert "room for 1 of 4" in printed
+    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in printed
+    assert "the reference is taken then, 4 frames later on average" in printed
+    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in printed
+    assert "by 0.15 rad on average, at most 0.20 rad (push)" in printed
     assert (
         "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, "
-        "dig." in said
+        "dig." in printed
     )
-    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
-    assert "3 sequences are for training, 1 held out." in said
+    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in printed
+    assert "3 sequences are for training, 1 held out." in printed
 
 
 # --- robot hands ---
@@ -446,16 +446,18 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
         human = np.clip(far[-1, 9:] if m else case.q, HUMAN.lower, HUMAN.upper)
         human_tips = joint_positions(human)[:, 3]
         position, turns = case.waypoints()
-        wanted = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
-        found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
+        centre = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
+        rotation = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
         path = arrays["trajectory/position"][0, m]
         # The hand centre of the closed hand, wrist frame
-        held = found[-1].inv().apply(wanted[-1] - path[-1])
-        np.testing.assert_allclose(path + found.apply(held), wanted, atol=1e-3)
+        held = rotation[-1].inv().apply(centre[-1] - path[-1])
+        np.testing.assert_allclose(path + rotation.apply(held), centre, atol=1e-3)
         assert np.linalg.norm(held - center) < 0.03  # fingers that close again move it a little
-        for own, theirs in zip(axes(hand), axes(HUMAN), strict=True):
-            assert (np.linalg.norm(found.apply(own) - turns.apply(theirs), axis=-1) < 0.01).all()
-        np.testing.assert_allclose(arrays["heading/position"][0, m], wanted[-1], atol=1e-3)
+        for ours, theirs in zip(axes(hand), axes(HUMAN), strict=True):
+            assert (
+                np.linalg.norm(rotation.apply(ours) - turns.apply(theirs), axis=-1) < 0.01
+            ).all()
+        np.testing.assert_allclose(arrays["heading/position"][0, m], centre[-1], atol=1e-3)
         np.testing.assert_array_equal(
             arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1]
         )

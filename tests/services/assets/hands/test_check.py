@@ -44,23 +44,23 @@ def with_joints(hand, change, only=""):
 def verdicts(hand):
     """The first finding of each check by its name, and all that was found."""
     assert not faults(hand)
-    found = check_hand(hand, recipe(hand).task, 2)
+    report = check_hand(hand, recipe(hand).task, 2)
     lines = {}
-    for finding in found.findings:
+    for finding in report.findings:
         assert bool(finding.remedy) == (finding.verdict != "passed")
         lines.setdefault(finding.check, finding)
-    return lines, found
+    return lines, report
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS]
 )
 def test_good_hands_pass_every_check(name):
-    lines, found = verdicts(HANDS[name])
-    assert not found.failed
+    lines, report = verdicts(HANDS[name])
+    assert not report.failed
     assert {finding.verdict for finding in lines.values()} == {"passed"}
-    assert [grip.obj.name for grip in found.grips] == ["ball", "cylinder", "box"]
-    for grip in found.grips:
+    assert [grip.obj.name for grip in report.grips] == ["ball", "cylinder", "box"]
+    for grip in report.grips:
         assert grip.held
         assert grip.survived["push_survival_weight"]
         assert grip.touching.sum() >= 2
@@ -70,8 +70,8 @@ def test_a_reversed_axis_is_found_and_named():
     turned = with_joints(
         CLAW, lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)), only="opposing_root"
     )
-    lines, found = verdicts(turned)
-    assert found.failed
+    lines, report = verdicts(turned)
+    assert report.failed
     assert lines["joint"].verdict == "failed"
     assert "'opposing_root'" in lines["joint"].measured
     assert "axis" in lines["joint"].remedy
@@ -92,12 +92,12 @@ def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, ve
 
 def test_both_pads_of_a_gripper_of_one_motor_stay_parallel():
     hand = propose(pathlib.Path(__file__).parents[3] / "hands" / "pincher.urdf").hand
-    found = {
+    angles = {
         one.measured.split("'")[1]: one.verdict
         for one in geometry_checks.joint_findings(hand)
         if one.check == "joint"
     }
-    assert found == {"left_parallel": "doubt", "right_parallel": "doubt"}
+    assert angles == {"left_parallel": "doubt", "right_parallel": "doubt"}
 
 
 def moved(vector, by):
@@ -146,14 +146,14 @@ def test_gains_that_shake_are_found_and_named():
         lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0),
         only="left_middle",
     )
-    found = physics_checks.servo_findings(loose, trials.responses(loose, recipe(loose).task, 2))
-    assert [finding.verdict for finding in found] == ["failed"]
-    assert "'left_middle'" in found[0].measured
-    assert "raise kv" in found[0].remedy
+    findings = physics_checks.servo_findings(loose, trials.responses(loose, recipe(loose).task, 2))
+    assert [finding.verdict for finding in findings] == ["failed"]
+    assert "'left_middle'" in findings[0].measured
+    assert "raise kv" in findings[0].remedy
     soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
-    found = physics_checks.servo_findings(soft, trials.responses(soft, recipe(soft).task, 2))
-    assert len(found) == 6
-    assert all("raise kp" in finding.remedy for finding in found)
+    findings = physics_checks.servo_findings(soft, trials.responses(soft, recipe(soft).task, 2))
+    assert len(findings) == 6
+    assert all("raise kp" in finding.remedy for finding in findings)
 
 
 def test_torques_that_are_too_weak_are_found_and_hold_nothing():

@@ -134,18 +134,20 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     path = tmp_path / "driven.json"
     path.write_text(hand_text(driven.hand))
     save_meshes(path, driven.meshes)
-    found = load_meshes(path, driven.hand)
-    assert found.keys() == {link.name for link in driven.hand.links}
-    vertices, faces = found["palm"]  # the box of the file, in the palm's frame
+    loaded = load_meshes(path, driven.hand)
+    assert loaded.keys() == {link.name for link in driven.hand.links}
+    vertices, faces = loaded["palm"]  # the box of the file, in the palm's frame
     np.testing.assert_allclose(
         [vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]]
     )
     assert len(faces) == 12
-    skin = skin_of_meshes(driven.hand, {"palm": found["palm"]})  # of the other links their capsules
+    skin = skin_of_meshes(
+        driven.hand, {"palm": loaded["palm"]}
+    )  # of the other links their capsules
     assert np.abs(skin.points[:8] - vertices).max() == 0
     assert len(skin.weights.T) == len(driven.hand.links)
-    drawn, own = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
-    assert np.abs(drawn.astype(int) - own).max() > 30
+    drawn, capsules = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
+    assert np.abs(drawn.astype(int) - capsules).max() > 30
     assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
 
     def refused(word, meshes):
@@ -195,10 +197,10 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     for body in range(theirs.nbody):
         part |= {body} if theirs.body_parentid[body] in part else set()
     expected = shapes(theirs, "base", lambda g: theirs.geom_bodyid[g] in part)
-    found = shapes(ours, "palm", lambda g: True)
-    assert found[1] == expected[1]
-    assert {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
-    np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
+    actual = shapes(ours, "palm", lambda g: True)
+    assert actual[1] == expected[1]
+    assert {2, 3, 6} <= {*actual[1]}  # balls, capsules and boxes
+    np.testing.assert_allclose(actual[0], expected[0], atol=2e-6)
     assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
     with pytest.raises(CongraspError, match="jax supports capsules only"):
         make_physics("jax", hand, TaskConfig(), [], threads=1)

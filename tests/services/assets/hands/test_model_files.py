@@ -109,9 +109,9 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
     spec.compile()
     (tmp_path / "hand.xml").write_text(spec.to_xml())
     original = get_hand(name)
-    found = propose(tmp_path / "hand.xml").hand
-    assert found.thumb == original.thumb
-    for a, b in zip(original.joints, found.joints, strict=True):
+    hand = propose(tmp_path / "hand.xml").hand
+    assert hand.thumb == original.thumb
+    for a, b in zip(original.joints, hand.joints, strict=True):
         np.testing.assert_allclose(
             [*a.anchor, *a.axis, a.lower, a.upper, a.kp, a.torque_limit],
             [*b.anchor, *b.axis, b.lower, b.upper, b.kp, b.torque_limit],
@@ -120,22 +120,24 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
     # What is proposed is near to what was chosen by hand: the frame, and the thumb turned against
     # the fingers.
     ours = grasp_frame(original)
-    theirs = grasp_frame(found)
+    theirs = grasp_frame(hand)
     assert np.degrees(np.arccos(ours.heading @ theirs.heading)) < 20
     assert np.degrees(np.arccos(ours.cross @ theirs.cross)) < 20
-    assert found.object_scale == pytest.approx(original.object_scale, abs=0.15)
+    assert hand.object_scale == pytest.approx(original.object_scale, abs=0.15)
 
 
 def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
-    said = capsys.readouterr().out
-    assert "6 joints, 6 motors, 7 links" in said
-    assert "congrasp train --hand gripper" in said
+    printed = capsys.readouterr().out
+    assert "6 joints, 6 motors, 7 links" in printed
+    assert "congrasp train --hand gripper" in printed
     assert (tmp_path / "own" / "gripper.json").exists()
     assert (tmp_path / "own" / "gripper.png").stat().st_size > 10_000
     assert main.run(["hands", "list"]) == 0
-    said = capsys.readouterr().out
-    assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
+    printed = capsys.readouterr().out
+    assert all(
+        name in printed for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO")
+    )
 
 
 def test_long_numbers_are_searched_in_linear_time():

@@ -85,9 +85,9 @@ def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
         patch = trimesh.PointCloud(trimesh.sample.sample_surface(patch, 3000, seed=0)[0])
     patch.export(tmp_path / "part.ply")
     depth = box.points[:, 0].max() - box.points[:, 0]
-    found = on_part_mesh(box, tmp_path / "part.ply")
-    assert found[depth < 1e-3].all()
-    assert not found[depth > 0.005].any()
+    labelled = on_part_mesh(box, tmp_path / "part.ply")
+    assert labelled[depth < 1e-3].all()
+    assert not labelled[depth > 0.005].any()
 
 
 def test_a_part_whose_triangles_lack_vertices_is_refused(box, tmp_path):

@@ -102,11 +102,11 @@ def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, mo
     monkeypatch.setattr(meshes, "memory", lambda: 1 << 40)
     for name, factor in (("a", 1.0), ("b", 1000.0), ("c", 0.5)):
         block(factor * SIDES).export(tmp_path / f"{name}.stl")
-    found = dict(meshes.import_sources(find_sources(tmp_path), options))
-    assert [isinstance(found[i], CongraspError) for i in range(3)] == [False, True, False]
-    assert found[0].name == "a"
-    assert found[2].name == "c"
-    assert "b.stl is 80 m long" in str(found[1])
+    imports = dict(meshes.import_sources(find_sources(tmp_path), options))
+    assert [isinstance(imports[i], CongraspError) for i in range(3)] == [False, True, False]
+    assert imports[0].name == "a"
+    assert imports[2].name == "c"
+    assert "b.stl is 80 m long" in str(imports[1])
 
 
 def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
@@ -157,12 +157,12 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
     )
     # The middle of the hull's longest side is 3 cm from either leg; the hull fills 36 cm^3 beside
     # the 56 of the mesh, less what thinning takes: 2 * 3 mm of 20.
-    said = re.search(
+    note = re.search(
         r"cut from its mesh, for its own 1 are coarser: .*most ([0-9.]+) mm off .* ([0-9.]+)% too large",
         obj.notes[-1],
     )
-    assert abs(float(said[1]) - 30) < 0.3
-    assert abs(float(said[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
+    assert abs(float(note[1]) - 30) < 0.3
+    assert abs(float(note[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
 
 
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
@@ -470,9 +470,9 @@ def _fallback(tree):
 )
 def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
     (tmp_path / name).write_bytes(data)
-    said = limited(read_mesh, tmp_path / name)
-    assert said.startswith(f"CongraspError: {tmp_path / name}"), said
-    assert why in said, said
+    message = limited(read_mesh, tmp_path / name)
+    assert message.startswith(f"CongraspError: {tmp_path / name}"), message
+    assert why in message, message
 
 
 def _inline(tree):

@@ -17,9 +17,9 @@ def touching(*boxes: tuple[tuple[float, float, float], tuple[float, float, float
         center = np.add(low, np.divide(sides, 2))
         transform = trimesh.transformations.translation_matrix(center)
         meshes.append(trimesh.creation.box(sides, transform))
-    whole = trimesh.util.concatenate(meshes)
-    whole.merge_vertices()
-    return whole
+    mesh = trimesh.util.concatenate(meshes)
+    mesh.merge_vertices()
+    return mesh
 
 
 def test_an_edge_of_two_boxes_belongs_to_both():

@@ -39,8 +39,8 @@ def joined(blocks, max_pieces, triangles=None):
 
 def test_pieces_that_form_a_convex_one_are_joined_without_need():
     blocks = [block((0.01, 0.01, 0.01), (x, 0, 0)) for x in (0, 0.01, 0.1, 0.11)]
-    whole = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
-    merged = joined(blocks, 8, np.concatenate(whole))
+    halves = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
+    merged = joined(blocks, 8, np.concatenate(halves))
     np.testing.assert_allclose(
         [shapes.hull_of(piece).volume for piece in merged], [2e-6, 2e-6], rtol=1e-6
     )

@@ -25,13 +25,13 @@ def ball(**options):
 
 def test_an_opening_is_left_and_bodies_that_touch_stay_together():
     half = ball()
-    said = list[str]()
+    notes = list[str]()
     half.update_faces(half.triangles_center[:, 2] < 0)
-    assert len(closed(half, said).faces) == len(half.faces)
-    assert not said  # a bowl stays a bowl
+    assert len(closed(half, notes).faces) == len(half.faces)
+    assert not notes  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
-    assert len(largest_body(pair, said).faces) == 2 * len(ball().faces)
-    assert not said
+    assert len(largest_body(pair, notes).faces) == 2 * len(ball().faces)
+    assert not notes
 
 
 @pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
@@ -61,10 +61,10 @@ def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
 )
 def test_a_flat_object_is_no_table(radius, depth, knob, at):
     flat = trimesh.creation.cylinder(radius, depth)
-    whole = trimesh.util.concatenate(
+    mesh = trimesh.util.concatenate(
         [flat, trimesh.creation.cylinder(*knob).apply_translation([0.0, 0.0, at])]
     )
-    assert without_table(whole, 1.0, []) is whole
+    assert without_table(mesh, 1.0, []) is mesh
 
 
 def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
@@ -72,9 +72,9 @@ def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
     speck = np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]])
     volume = scan.volume
     trimesh.util.concatenate([scan, trimesh.Trimesh(speck, [[0, 1, 2]])]).export(tmp_path / "a.stl")
-    found = largest_body(read_mesh(tmp_path / "a.stl"), [])
-    assert found.is_watertight
-    assert found.volume == pytest.approx(volume, rel=0.01)
+    body = largest_body(read_mesh(tmp_path / "a.stl"), [])
+    assert body.is_watertight
+    assert body.volume == pytest.approx(volume, rel=0.01)
     small = trimesh.Trimesh(*reduced(np.vstack([scan.vertices, [100.0, 0, 0]]), scan.faces, []))
     assert small.volume == pytest.approx(volume, rel=0.01)
 
@@ -102,9 +102,9 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     mug.merge_vertices()
     assert mug.faces.shape == (len(cup.faces) + len(faces), 3)
     assert mug.body_count == 1
-    said = list[str]()
-    assert len(closed(mug, said).faces) == len(mug.faces)
-    assert not said
+    notes = list[str]()
+    assert len(closed(mug, notes).faces) == len(mug.faces)
+    assert not notes
 
 
 @pytest.mark.parametrize(
@@ -192,11 +192,11 @@ _QUADS = _ply(_ARROW, "binary_little_endian")
 )
 def test_polygons_of_a_ply_keep_their_volume_and_their_colours(tmp_path, data, volume):
     (tmp_path / "a.ply").write_bytes(data)
-    said = list[str]()
-    mesh = read_mesh(tmp_path / "a.ply", said)
+    notes = list[str]()
+    mesh = read_mesh(tmp_path / "a.ply", notes)
     assert mesh.is_watertight
     assert abs(mesh.volume) == pytest.approx(volume)
-    assert not said
+    assert not notes
     colours = load_geometry(tmp_path / "a.ply", "").visual.face_colors[:, :3]
     faces = 6 if volume == 3 else 10
     np.testing.assert_array_equal(np.unique(colours, axis=0), [(9, i, 7) for i in range(faces)])
@@ -284,9 +284,9 @@ def test_many_corners_are_left_with_a_note(tmp_path):
     (tmp_path / "a.obj").write_text(
         _flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1))
     )
-    said = list[str]()
-    assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 64
-    assert said == [
+    notes = list[str]()
+    assert len(load_geometry(tmp_path / "a.obj", "", notes=notes).faces) == 64
+    assert notes == [
         "1 of its dented polygons could not be cut and may be filled (export it as triangles)"
     ]
     (tmp_path / "a.obj").write_text("v 0 0\n" + _flat(np.eye(4, 2)))
@@ -303,19 +303,19 @@ def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
         trimesh.creation.revolve(np.array(line), sections=32)
         for line in (outer + inner, [*outer, (0, 0.18)])
     )
-    said = list[str]()
-    shown = without_hollows(bottle, said)
-    np.testing.assert_allclose(shown.volume, (full if filled else bottle).volume, rtol=0.01)
-    assert repair.encloses(shown)
-    assert bool(said) == filled
+    notes = list[str]()
+    repaired = without_hollows(bottle, notes)
+    np.testing.assert_allclose(repaired.volume, (full if filled else bottle).volume, rtol=0.01)
+    assert repair.encloses(repaired)
+    assert bool(notes) == filled
 
 
 def test_a_hollow_without_an_opening_is_filled():
     void = ball()
     void.apply_scale(0.9)
     void.invert()
-    shown = without_hollows(trimesh.util.concatenate([ball(), void]), [])
-    np.testing.assert_allclose(shown.volume, ball().volume, rtol=1e-6)
+    filled = without_hollows(trimesh.util.concatenate([ball(), void]), [])
+    np.testing.assert_allclose(filled.volume, ball().volume, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -338,9 +338,9 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
 
 def test_a_surface_without_an_outside_is_unchanged():
     strip = trimesh.Trimesh(*_moebius())
-    said: list[str] = []
-    assert closed(strip, said).faces.shape == strip.faces.shape
-    assert not said
+    notes: list[str] = []
+    assert closed(strip, notes).faces.shape == strip.faces.shape
+    assert not notes
 
 
 def _moebius():
@@ -374,8 +374,8 @@ def test_a_slit_along_a_bend_is_closed_along_the_bend():
     filled = fill(sphere, [loop])
     assert filled.is_watertight
     assert len(filled.vertices) == len(sphere.vertices)
-    whole = trimesh.creation.uv_sphere(0.04, count=[32, 32])
-    np.testing.assert_allclose(filled.volume, whole.volume, rtol=5e-4)
+    ball_mesh = trimesh.creation.uv_sphere(0.04, count=[32, 32])
+    np.testing.assert_allclose(filled.volume, ball_mesh.volume, rtol=5e-4)
 
 
 def test_a_hole_whose_bases_are_edges_of_the_mesh_is_closed_by_a_fan():

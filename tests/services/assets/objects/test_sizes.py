@@ -89,20 +89,20 @@ def weight(mesh, name):
 
 def test_a_solid_weighs_its_volume():
     block = trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0.3, 0, 0))
-    found = weight(block, "steel")
-    assert found.mass == pytest.approx(7850 * 4e-5)
-    np.testing.assert_allclose(found.center, (0.3, 0, 0), atol=1e-12)
+    mass = weight(block, "steel")
+    assert mass.mass == pytest.approx(7850 * 4e-5)
+    np.testing.assert_allclose(mass.center, (0.3, 0, 0), atol=1e-12)
     np.testing.assert_allclose(
-        np.diag(found.inertia), found.mass / 12 * np.array([0.0104, 0.0104, 0.0008])
+        np.diag(mass.inertia), mass.mass / 12 * np.array([0.0104, 0.0104, 0.0008])
     )
 
 
 def test_what_is_too_thick_for_its_material_weighs_its_wall():
     ball = trimesh.creation.icosphere(4, radius=0.05)
-    found = weight(ball, "ceramic")
-    assert found.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
+    mass = weight(ball, "ceramic")
+    assert mass.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
     np.testing.assert_allclose(
-        found.inertia, 2 / 3 * found.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9
+        mass.inertia, 2 / 3 * mass.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9
     )
     assert weight(ball, "wood").mass == pytest.approx(640 * 4 / 3 * np.pi * 0.05**3, rel=0.01)
 
@@ -118,9 +118,9 @@ def test_an_open_sheet_weighs_its_wall():
     box = trimesh.creation.box((0.06, 0.06, 0.1))
     box.update_faces(box.triangles_center[:, 2] < 0.049)
     assert not box.is_volume
-    found = weight(box, "glass")
-    assert found.mass == pytest.approx(2500 * 0.003 * (0.06**2 + 4 * 0.06 * 0.1))
-    assert found.center[2] == pytest.approx(-0.05 * 0.06**2 / (0.06**2 + 4 * 0.06 * 0.1))
+    mass = weight(box, "glass")
+    assert mass.mass == pytest.approx(2500 * 0.003 * (0.06**2 + 4 * 0.06 * 0.1))
+    assert mass.center[2] == pytest.approx(-0.05 * 0.06**2 / (0.06**2 + 4 * 0.06 * 0.1))
     flat = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 1, 2)], process=False)
     assert weight(flat, "paper").mass == pytest.approx(900 * 0.001 * 0.005)
 
@@ -153,10 +153,10 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     assert -obj.origin[2] == pytest.approx(0.1375 * head / (head + handle), rel=1e-3)
     for text in ("wood,head=steel", "handle=wood,steel"):
         assert imported(hammer, material=text).mass == obj.mass
-    given = imported(hammer, material="head=steel,handle=wood", mass=0.5)
-    assert given.mass == 0.5
-    assert given.origin == obj.origin
-    np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
+    weighed = imported(hammer, material="head=steel,handle=wood", mass=0.5)
+    assert weighed.mass == 0.5
+    assert weighed.origin == obj.origin
+    np.testing.assert_allclose(weighed.inertia / 0.5, obj.inertia / obj.mass)
 
 
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():

@@ -95,8 +95,8 @@ def test_captured_rows_of_several_data_sets_each_have_a_cell():
         result("captured", row("pose", rate, 0.0, 1.0), table="captured", data=name)
         for rate, name in ((0.8, "grab"), (0.9, "oakink"))
     )
-    found = find(compare([grab, oak], {}, HANDS), "ablation", "pose")
-    assert [(cell.data, cell.ours) for cell in found] == [("grab", 0.8), ("oakink", 0.9)]
+    table_cell = find(compare([grab, oak], {}, HANDS), "ablation", "pose")
+    assert [(cell.data, cell.ours) for cell in table_cell] == [("grab", 0.8), ("oakink", 0.9)]
 
 
 def test_reasons_say_what_is_missing():
@@ -129,7 +129,7 @@ def test_groups_by_size_are_compared_and_others_are_our_own():
     (small,) = find(compare(results, {}, HANDS), "objects", "heading", group="small")
     assert small.paper == 0.929
     assert small.ours == 0.9
-    assert [own.group for _, own in unmatched(results)] == ["family mug"]
+    assert [ours.group for _, ours in unmatched(results)] == ["family mug"]
 
 
 def test_the_summary_counts_rates_and_intervals():
@@ -184,17 +184,17 @@ def test_latex_is_balanced_and_holds_every_figure():
         row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01})
         for name in ("heading", "pose")
     ]
-    shown = paper_tables(compare([result("hands", *rows)], {}, HANDS))
-    text = "\n".join(table.latex("50 % of 3_objects & more.") for table in shown)
+    tables = paper_tables(compare([result("hands", *rows)], {}, HANDS))
+    text = "\n".join(table.latex("50 % of 3_objects & more.") for table in tables)
     opened, closed = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
     assert sorted(opened) == sorted(closed) == ["table"] * 6 + ["tabular"] * 6
     plain = re.sub(r"\\[\\%&#_{}$]|\\\w+(\{\})?", "", text)
     assert plain.count("{") == plain.count("}")
     body = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert len(body) == 6 + 47
-    wanted = [len(table.columns) - 1 for table in shown for _ in range(1 + len(table.rows))]
-    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == wanted
-    assert set(wanted) == {7, 9}
+    separators = [len(table.columns) - 1 for table in tables for _ in range(1 + len(table.rows))]
+    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == separators
+    assert set(separators) == {7, 9}
     for line in body:
         assert not re.search(r"(?<!\\)[%#_]", line)
     assert r"98.4 (94.5-99.6) & 96.0 & +2.4" in text
@@ -203,7 +203,7 @@ def test_latex_is_balanced_and_holds_every_figure():
 
 @given(st.text("&%$#_{}~^\\<>±ab \n"))
 def test_escaped_text_has_no_special_character_left(text):
-    found = escape(text)
+    escaped = escape(text)
     for command in (
         r"\textbackslash{}",
         r"\textasciitilde{}",
@@ -212,5 +212,5 @@ def test_escaped_text_has_no_special_character_left(text):
         "$<$",
         "$>$",
     ):
-        found = found.replace(command, "")
-    assert not re.search(r"[&%$#_{}~^]", re.sub(r"\\[&%$#_{}]", "", found))
+        escaped = escaped.replace(command, "")
+    assert not re.search(r"[&%$#_{}~^]", re.sub(r"\\[&%$#_{}]", "", escaped))

@@ -107,14 +107,14 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     policy, tmp_path, monkeypatch
 ):
     """A method whose training fails is named with the reason, and the others are evaluated."""
-    asked = []
+    trained = []
 
-    def train_all(request, wanted, track):
-        asked.extend(wanted)
-        return {one: "it failed" for one in wanted}
+    def train_all(request, keys, track):
+        trained.extend(keys)
+        return {one: "it failed" for one in keys}
 
     def evaluate_part(part, entrant, settings, out, track):
-        asked.append(part.name)
+        trained.append(part.name)
         constraint = "heading" if part.table == "single" else "pose+trajectory"
         made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
         about = {"pictures": [], "seconds": 1.0, "heading_rules": "Half of the headings are kept."}
@@ -145,8 +145,8 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     )
     account = reproduction.reproduce(request, policies, silent)
     what = {one.name: text for one, text in account.policies}
-    assert asked[:2] == [PolicyKey("allegro", "ours"), PolicyKey("human", "graspxl")]
-    assert asked[2:6] == [
+    assert trained[:2] == [PolicyKey("allegro", "ours"), PolicyKey("human", "graspxl")]
+    assert trained[2:6] == [
         "human-ours-single",
         "human-pd-single",
         "human-ours-composed",
