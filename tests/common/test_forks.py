@@ -65,6 +65,11 @@ if __name__ == "__main__":
 {body}
 """
 PORT = 17631
+OPEN = "transport = connect()\n"
+CLOSED = "connect().close()\n"
+CALLER = "import jax\njax.numpy.ones(3).block_until_ready()\n"
+LOAD = "lambda: congrasp.load_policy({policy!r})"
+LOADED = "policy = congrasp.load_policy({policy!r})\n"
 
 
 @pytest.fixture(scope="module")
@@ -84,13 +89,6 @@ def lines_of(tmp_path, body: str) -> list[str]:
     done = python(program)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
-
-
-OPEN = "transport = connect()\n"
-CLOSED = "connect().close()\n"
-CALLER = "import jax\njax.numpy.ones(3).block_until_ready()\n"
-LOAD = "lambda: congrasp.load_policy({policy!r})"
-LOADED = "policy = congrasp.load_policy({policy!r})\n"
 
 
 @pytest.mark.parametrize(

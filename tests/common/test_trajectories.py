@@ -24,6 +24,7 @@ from tests.scenes import quaternions
 HAND = get_hand("human")
 COUNT = 64
 WAYPOINTS = 15
+MANY = 4000
 
 
 def _make(position, quaternion, style):
@@ -96,7 +97,6 @@ def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
 # --- disturbances ---
 
 
-MANY = 4000
 fingers_off = jax.jit(disturbed_fingers, static_argnums=0)
 wrist_off = jax.jit(disturbed_wrist)
 

@@ -28,6 +28,37 @@ from tests.socket_transport import SocketListener, SocketTransport
 from tests.waits import eventually, together
 
 KEYS = Keys("test")
+BUSY_PROCESS = """
+    import contextlib, socket, sys, threading, time
+    from congrasp.common.transport.keys import Keys
+    from congrasp.common.transport.zenoh_transport import ZenohTransport
+    from congrasp.common.wire.codec import Message
+    keys = Keys("test")
+    address = "127.0.0.1", int(sys.argv[1].rpartition(":")[2])
+    server = ZenohTransport(listen=[sys.argv[1]])
+    client = ZenohTransport(connect=[sys.argv[1]])
+    server.serve(keys.act, lambda key, message: message, workers=2)
+    server.watch_alive(keys.everyone, lambda key, alive: None)
+    client.declare_alive(keys.alive("actor", "a", "01"))
+    subscription = server.subscribe(keys.logs, depth=1)
+    client.publish(keys.log("event", "actor", "a"), Message())
+    client.query(keys.act, Message(), timeout=60)
+    def ask():
+        while True:
+            with contextlib.suppress(Exception):
+                client.query(keys.act, Message(), timeout=60)
+    for _ in range(3):
+        threading.Thread(target=ask, daemon=True).start()
+    print("ready", flush=True)
+    {end}
+"""
+SILENT_CONNECTION = (
+    "silent = socket.create_connection(address); "
+    "later = ZenohTransport(connect=[sys.argv[1]]); "
+    "sys.slow = type('Slow', (), {'__del__': lambda slow, sleep=time.sleep: sleep(4)})(); "
+    "sys.exit(3)"
+)
+"""Delays the closing of the listener; it returns while the interpreter shuts down slowly."""
 
 
 @pytest.fixture(params=["memory", "zenoh", "from outside"])
@@ -405,41 +436,6 @@ def test_peer_that_comes_back_is_found_again():
             server.watch_alive(KEYS.everyone, lambda key, alive: seen.append(alive))
             eventually(lambda: _answers(client, KEYS.act))
             eventually(lambda: seen == [True])
-
-
-BUSY_PROCESS = """
-    import contextlib, socket, sys, threading, time
-    from congrasp.common.transport.keys import Keys
-    from congrasp.common.transport.zenoh_transport import ZenohTransport
-    from congrasp.common.wire.codec import Message
-    keys = Keys("test")
-    address = "127.0.0.1", int(sys.argv[1].rpartition(":")[2])
-    server = ZenohTransport(listen=[sys.argv[1]])
-    client = ZenohTransport(connect=[sys.argv[1]])
-    server.serve(keys.act, lambda key, message: message, workers=2)
-    server.watch_alive(keys.everyone, lambda key, alive: None)
-    client.declare_alive(keys.alive("actor", "a", "01"))
-    subscription = server.subscribe(keys.logs, depth=1)
-    client.publish(keys.log("event", "actor", "a"), Message())
-    client.query(keys.act, Message(), timeout=60)
-    def ask():
-        while True:
-            with contextlib.suppress(Exception):
-                client.query(keys.act, Message(), timeout=60)
-    for _ in range(3):
-        threading.Thread(target=ask, daemon=True).start()
-    print("ready", flush=True)
-    {end}
-"""
-
-
-SILENT_CONNECTION = (
-    "silent = socket.create_connection(address); "
-    "later = ZenohTransport(connect=[sys.argv[1]]); "
-    "sys.slow = type('Slow', (), {'__del__': lambda slow, sleep=time.sleep: sleep(4)})(); "
-    "sys.exit(3)"
-)
-"""Delays the closing of the listener; it returns while the interpreter shuts down slowly."""
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,14 @@ from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 
 KEYS = Keys("test")
+TAKER = """
+import json, sys
+from congrasp.common.transport import ports
+ports._FIRST_FREE_PORT = {lowest}
+ports._FREE_PORTS = 61  # sixty to choose from, so that one would soon be chosen twice
+for line in sys.stdin:
+    print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
+"""
 
 
 @pytest.fixture
@@ -173,16 +181,6 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         assert not actor.is_alive()
         assert getattr(actor, "exitcode", 0) == 0
         rollouts.close()
-
-
-TAKER = """
-import json, sys
-from congrasp.common.transport import ports
-ports._FIRST_FREE_PORT = {lowest}
-ports._FREE_PORTS = 61  # sixty to choose from, so that one would soon be chosen twice
-for line in sys.stdin:
-    print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
-"""
 
 
 def test_no_port_is_given_twice_while_its_process_lives(tmp_path):

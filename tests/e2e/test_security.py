@@ -32,6 +32,23 @@ from tests.waits import eventually
 KEYS = Keys("safe")
 ME = "0.a"
 OTHER = "1.b"
+ACTOR = """
+import sys
+from congrasp.actors.link import ActorLink
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+
+try:
+    transport = urls.connect(sys.argv[1], "actor", certs=sys.argv[2])
+    with transport, ActorLink(transport, "safe", "0.z") as link:
+        link.config(20)
+        print("ready", flush=True)
+        while True:
+            link.acquire_ticket(1.0)
+except CongraspError as error:
+    sys.exit(f"congrasp: error: {error}")
+"""
+"""An actor that does nothing but ask for tickets, and ends as the command does."""
 
 
 @pytest.fixture(scope="module")
@@ -559,25 +576,6 @@ def test_who_is_revoked_is_out_and_the_others_stay(fresh):
             for path in fresh.certs.rglob("revoked"):
                 path.unlink()
     eventually(lambda: answers(thief, KEYS.config))  # and let in again once the list is empty
-
-
-ACTOR = """
-import sys
-from congrasp.actors.link import ActorLink
-from congrasp.common.errors import CongraspError
-from congrasp.common.transport import urls
-
-try:
-    transport = urls.connect(sys.argv[1], "actor", certs=sys.argv[2])
-    with transport, ActorLink(transport, "safe", "0.z") as link:
-        link.config(20)
-        print("ready", flush=True)
-        while True:
-            link.acquire_ticket(1.0)
-except CongraspError as error:
-    sys.exit(f"congrasp: error: {error}")
-"""
-"""An actor that does nothing but ask for tickets, and ends as the command does."""
 
 
 def _started(*command):

@@ -35,6 +35,13 @@ SAVE = """
     tree, _ = Checkpoints(folder / "checkpoints").load({"x": np.zeros(3, int)})
     print(tree["x"][0], len(notices))
 """
+HOLD = """
+    import os, time
+    from congrasp.learner.run_directory import exclusive
+    with exclusive(folder):
+        print(os.getpid(), flush=True)
+        time.sleep(END)
+"""
 
 
 def on(stand_in: str, program: str, folder: pathlib.Path) -> subprocess.CompletedProcess[str]:
@@ -83,15 +90,6 @@ def test_the_link_of_an_old_run_becomes_a_file(tmp_path):
     done = on("no_links(stand_ins.NUMBERS['EPERM'])", SAVE, tmp_path)
     assert done.returncode == 0, done.stderr
     assert not (folder / "latest").is_symlink()
-
-
-HOLD = """
-    import os, time
-    from congrasp.learner.run_directory import exclusive
-    with exclusive(folder):
-        print(os.getpid(), flush=True)
-        time.sleep(END)
-"""
 
 
 def test_two_learners_without_locks_are_refused(tmp_path):

@@ -51,6 +51,25 @@ LOADERS = {
 }
 
 
+BVH = """HIERARCHY
+ROOT Hips
+{
+ OFFSET 0 0 0
+ CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+ JOINT RightHand
+ {
+  OFFSET 1 0 0
+  CHANNELS 3 Zrotation Xrotation Yrotation
+ }
+}
+MOTION
+Frames: 2
+Frame Time: 0.01
+0 0 0 0 0 0 0 0 0
+1 0 0 0 0 0 0 0 0
+"""
+
+
 def _saved(save, *arguments):
     """Bytes of a file that a function writes, to a path or an open file."""
     with tempfile.TemporaryDirectory() as folder:
@@ -397,25 +416,6 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
             set_file.load(path)
     path.write_bytes(encode(made))
     assert set_file.load(path).meta == made.meta
-
-
-BVH = """HIERARCHY
-ROOT Hips
-{
- OFFSET 0 0 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT RightHand
- {
-  OFFSET 1 0 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
- }
-}
-MOTION
-Frames: 2
-Frame Time: 0.01
-0 0 0 0 0 0 0 0 0
-1 0 0 0 0 0 0 0 0
-"""
 
 
 def refused(function, path, why):

@@ -14,6 +14,7 @@ FRAMES = 12
 T = np.linspace(0, 1, FRAMES)
 POSITION = np.stack([0.3 * T, 0.1 * np.sin(3 * T), 0.2 + 0.1 * T], -1)
 ROTATION = Rotation.from_rotvec(np.outer(T, [0.4, -0.3, 0.8]))
+ROS = "x,y,z,qx,qy,qz,qw"
 
 
 def bvh(path, order="ZXY", unit=0.01):
@@ -92,9 +93,6 @@ def test_csv_and_npz_give_the_same_path(tmp_path):
     np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=header, comments="")
     for name in ("a.npz", "b.npz", "c.csv", "d.csv"):
         check(read_wrist_path(tmp_path / name))
-
-
-ROS = "x,y,z,qx,qy,qz,qw"
 
 
 @pytest.mark.parametrize(

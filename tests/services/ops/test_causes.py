@@ -25,6 +25,9 @@ CASES = {
 }
 
 
+LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); "
+
+
 @pytest.mark.parametrize("code", [1, -6])
 @pytest.mark.parametrize("after", ["", PIPE, "info: The actor actor-0 left.\n"])
 @pytest.mark.parametrize(("log", "cause"), CASES.values(), ids=CASES)
@@ -52,7 +55,6 @@ class Program(Child):
         return [sys.executable, "-c", self.arguments[0]]
 
 
-LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); "
 DEATHS = {
     "bytes": (f"{LIMITED}bytes(4 << 30)", "out of memory"),
     "import": ("import no_such_module", "no_such_module"),

@@ -24,26 +24,6 @@ from tests.waits import Clock
 
 KEYS = Keys("r")
 ROOT = pathlib.Path(__file__).resolve().parents[3]
-
-
-def metrics(**values):
-    return Message({}, {"time": 1.0, "values": values})
-
-
-def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():
-    convert = Converter()
-    evil = KEYS.log("metrics", "actor", "1.b")
-    honest = KEYS.log("metrics", "actor", "0.a")
-    schemas = set()
-    for i in range(150):
-        (entry,) = convert(evil, metrics(**{f"made/up/{i}/{j}": 1.0 for j in range(100)}), i)
-        schemas.add(entry.channel.schema)
-        (entry,) = convert(honest, metrics(loss=float(i)), i)
-        assert f'"loss":{float(i)}' in entry.data.decode()
-    assert len(schemas) <= 32
-    assert sum(map(len, schemas)) < 500_000
-
-
 RECORDER = """
 import pathlib, resource, sys
 from congrasp.common.transport.keys import Keys
@@ -64,6 +44,24 @@ with Recorder(transport, "r", out, warn=lambda text: None) as recorder:
         pass
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10)
 """
+
+
+def metrics(**values):
+    return Message({}, {"time": 1.0, "values": values})
+
+
+def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():
+    convert = Converter()
+    evil = KEYS.log("metrics", "actor", "1.b")
+    honest = KEYS.log("metrics", "actor", "0.a")
+    schemas = set()
+    for i in range(150):
+        (entry,) = convert(evil, metrics(**{f"made/up/{i}/{j}": 1.0 for j in range(100)}), i)
+        schemas.add(entry.channel.schema)
+        (entry,) = convert(honest, metrics(loss=float(i)), i)
+        assert f'"loss":{float(i)}' in entry.data.decode()
+    assert len(schemas) <= 32
+    assert sum(map(len, schemas)) < 500_000
 
 
 @pytest.mark.slow

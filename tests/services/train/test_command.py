@@ -31,6 +31,13 @@ from tests.waits import eventually
 LAUNCH = Launch(actors=1)
 # 40 steps an update
 CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)
+SUPERVISOR = """
+    import pathlib, sys
+    from congrasp.learner.run_directory import supervised
+    with supervised(pathlib.Path(sys.argv[1])):
+        print("locked", flush=True)
+        sys.stdin.read()
+"""
 
 
 @pytest.fixture
@@ -216,15 +223,6 @@ def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):
     create_run(tmp_path / "runs" / "mine", CONFIG)
     with pytest.raises(CongraspError, match=r"--resume needs .*runs/mine"):
         command.run_training(CONFIG, None, LAUNCH, resume=True, evaluation=0)
-
-
-SUPERVISOR = """
-    import pathlib, sys
-    from congrasp.learner.run_directory import supervised
-    with supervised(pathlib.Path(sys.argv[1])):
-        print("locked", flush=True)
-        sys.stdin.read()
-"""
 
 
 def test_a_resume_while_a_learner_restarts_is_refused(printed_lines, monkeypatch, tmp_path):

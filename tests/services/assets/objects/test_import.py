@@ -32,6 +32,11 @@ from tests.solids import block, ell
 
 SLOW = pytest.mark.slow
 SIDES = np.array([0.04, 0.06, 0.08])
+_PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float "
+    b"y\nproperty float z\n"
+)
+_FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
 
 
 @pytest.fixture
@@ -363,11 +368,6 @@ def test_coacd_cuts_an_ell_in_two():
 # --- files that announce more than they hold ---
 
 
-_PLY = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float "
-    b"y\nproperty float z\n"
-)
-_FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
 _POINTS = (
     _PLY.replace(b"binary_little_endian", b"ascii") % 4
     + _FACES.replace(b"%d", b"0\nproperty int part")
