@@ -142,7 +142,7 @@ RUNS_DATA = re.compile(
 )
 
 
-def test_one_module_imports_what_can_run_code_out_of_data():
+def test_one_module_alone_unpickles():
     """The child process with an allow-list."""
     modules = [
         str(path.relative_to(ROOT))
@@ -178,7 +178,7 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
                     yield statement.lineno, str(statement.value.value).strip()
 
 
-def test_the_rules_find_what_they_ban():
+def test_the_rules_report_banned_words():
     tree = ast.parse(
         '"""Whether it is mended."""\nx = 1\n"""What x is."""\nraise ValueError("nobody came")\n'
     )

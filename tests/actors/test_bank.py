@@ -81,7 +81,7 @@ def test_references_with_fingers_in_the_table_are_not_valid():
 
 
 @pytest.mark.parametrize("constraints", [TASK.constraints, ("heading",)])
-def test_the_form_of_a_bank_is_known_before_it(constraints):
+def test_bank_form_matches_the_built_bank(constraints):
     """Of a task with references and of one without."""
     task = dataclasses.replace(TASK, constraints=constraints)
     bank = suite.bank() if task == TASK else build_bank(HAND, task, suite.OBJECTS, 0)
@@ -98,7 +98,7 @@ def test_an_object_that_cannot_be_approached_is_named():
         build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_task_that_draws_no_references_gets_none_and_the_same_headings():
+def test_a_bank_without_references_keeps_the_headings():
     without_references = build_bank(
         HAND, dataclasses.replace(TASK, constraints=("heading", "affordance")), suite.OBJECTS, 0
     )
@@ -158,7 +158,7 @@ def test_a_grasp_replaces_one_reference_of_its_object_and_region(flat_bank):
     jax.tree.map(np.testing.assert_array_equal, nothing, flat_bank)
 
 
-def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(flat_bank):
+def test_policy_grasps_of_all_ages_replace_half_of_the_references(flat_bank):
     """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the
     places.
     """

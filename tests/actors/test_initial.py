@@ -131,7 +131,7 @@ def _drawn(
     )
 
 
-def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside_an_affordance():
+def test_trajectories_ending_near_the_avoid_region_exclude_affordances():
     active, _, trajectory = _drawn(TASK)
     both = active["trajectory"] & active["region"]
     alone = active["trajectory"] & ~active["region"]
@@ -178,7 +178,7 @@ def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
 
 
 @pytest.mark.parametrize("together", [0.0, 1.0])
-def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn(together):
+def test_no_trajectory_is_drawn_if_all_contradict_the_affordance(together):
     active, pose, trajectory = _drawn(TASK, (0, 1, 2), together=together)
     assert not (active["trajectory"] & active["region"]).any()
     assert active["affordance"].any()
@@ -197,7 +197,7 @@ def test_pose_and_trajectory_are_drawn_independently():
 
 
 @pytest.mark.parametrize("few", [False, True])
-def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
+def test_aligned_pairs_are_drawn_on_request(few):
     active, pose, trajectory = _drawn(
         dataclasses.replace(TASK, aligned_references=True),
         (0, 1, 2, 3, 5) if few else tuple(range(M)),
@@ -212,7 +212,7 @@ def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
 
 @pytest.mark.parametrize("on", [{"pose"}, {"pose", "trajectory"}, {"trajectory"}, set()])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_heading_guidance_and_reward_know_one_center(dynamic, on):
+def test_heading_guidance_and_reward_share_the_hand_centre(dynamic, on):
     """Where the hand is at its target, the heading that the rules made is met to 0 m.
 
     With the fingers of its start, but under a trajectory alone with those of the partly closed

@@ -142,7 +142,7 @@ def test_identity_is_added_and_counts(ends):
         assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
 
 
-def test_tickets_are_waited_for_and_asked_for_under_one_id(joined):
+def test_a_repeated_ticket_request_keeps_its_id(joined):
     learner, link = joined()
     learner.granted = False
     assert link.acquire_ticket(0.2) is None
@@ -215,7 +215,7 @@ def test_another_training_is_noticed_by_every_way(joined, by):
         link.acquire_ticket(1) if by == "ticket" else link.weights(-1)
 
 
-def test_finished_run_is_told_to_the_caller(joined):
+def test_finished_run_raises_run_finished(joined):
     learner, link = joined()
     learner.state["finished"] = True
     with pytest.raises(RunFinished):
@@ -258,7 +258,7 @@ def test_refusals_in_a_row_stop_the_actor_with_a_reason(joined):
     assert len(learner.received) == 6
 
 
-def test_message_that_always_arrives_damaged_is_not_sent_for_ever(joined):
+def test_a_message_always_damaged_is_given_up(joined):
     learner, link = joined(max_refusals=2)
     learner.outcomes = [CongraspError("The message's data do not match their checksum.")]
     assert link.upload(rollout(), TICKET).result(60) == "refused"
@@ -268,7 +268,7 @@ def test_message_that_always_arrives_damaged_is_not_sent_for_ever(joined):
         link.upload(rollout(), TICKET)
 
 
-def test_silent_learner_is_given_up(joined):
+def test_silent_learner_raises_after_the_patience(joined):
     learner, link = joined(patience=0.3)
     learner.transport.close()
     with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
@@ -291,7 +291,7 @@ def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch,
     assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
 
 
-def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joined, monkeypatch):
+def test_a_suspended_actor_does_not_count_as_silence(joined, monkeypatch):
     learner, link = joined(patience=5.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)
@@ -315,7 +315,7 @@ def test_learner_that_talks_nonsense_ends_the_link(joined):
         link.acquire_ticket(1)
 
 
-def test_closing_gives_up_what_is_on_its_way(joined):
+def test_closing_drops_pending_uploads(joined):
     learner, link = joined()
     learner.outcomes = ["retry"]
     outcome = link.upload(rollout(), TICKET)

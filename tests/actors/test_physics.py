@@ -177,9 +177,7 @@ def test_contact_force_is_that_of_the_object_on_the_link(on_cpu, env):
     np.testing.assert_allclose(np.mean(forces[-40:], 0)[2], -box.mass * 9.81, rtol=0.1)
 
 
-def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(
-    native, env, tmp_path, monkeypatch
-):
+def test_a_diverged_environment_alone_is_flagged_and_reset(native, env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = native(OBJECTS, threads=2)
     start = above(env, 0.3)
@@ -355,7 +353,7 @@ def test_jax_agrees_with_native(native, env, optimised):
     np.testing.assert_allclose(x.q, y.q, atol=2e-4)
 
 
-def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(native, env, monkeypatch):
+def test_too_many_environments_for_the_memory_are_refused(native, env, monkeypatch):
     monkeypatch.setattr("congrasp.actors.physics.native.memory", lambda: 1_500_000)
     physics = native(OBJECTS)
     with pytest.raises(

@@ -129,7 +129,7 @@ def test_scanned_objects_agree_with_native(native, shared_objects):
     _agrees_with_native(native(objects), objects, _starts(objects))
 
 
-def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(start):
+def test_repeated_steps_without_jax_equal_control_steps(start):
     """One control step by JAX and three repeats are four control steps with the same targets; and
     nobody notices.
     """
@@ -151,7 +151,7 @@ def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(s
     physics.close()
 
 
-def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeypatch):
+def test_a_control_step_loads_no_further_kernel(start, monkeypatch):
     """Of those that MuJoCo Warp launches; JAX's call is a module without kernels."""
     import warp as wp  # takes seconds in every worker
 
@@ -173,7 +173,7 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
     physics.close()
 
 
-def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends_on_the_environments(
+def test_only_broadphase_kernels_depend_on_the_batch(
     monkeypatch,
 ):
     import warp as wp  # takes seconds in every worker
@@ -240,7 +240,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
         pass  # without a folder nothing is shared
 
 
-def test_rows_are_what_mujoco_compiles():
+def test_object_rows_equal_mujocos_compiled_fields():
     catalogue = ObjectRows(HAND, TASK, OBJECTS[0], 8)
     before = {
         name: getattr(catalogue.model, name).copy()
@@ -274,7 +274,7 @@ def test_rows_are_what_mujoco_compiles():
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
 
-def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, start):
+def test_a_reset_changes_only_masked_environments(native, start):
     warp = warp_engine(OBJECTS)
     step = jax.jit(warp.step)
     table = jnp.ones(4, bool)
@@ -306,9 +306,7 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
 
 
 @pytest.mark.slow
-def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
-    native, start, others
-):
+def test_replaced_objects_compile_nothing_and_keep_running_episodes(native, start, others):
     warp = warp_engine(OBJECTS)
     untouched = warp_engine(OBJECTS)
     step = jax.jit(warp.step)
@@ -379,7 +377,7 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
     np.testing.assert_array_equal(*occupancy)
 
 
-def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(start):
+def test_a_diverged_environment_alone_is_flagged_and_reset(start):
     warp = warp_engine(OBJECTS)
     first = warp.start(start)
     target = jnp.asarray(grasp(start, 0))
@@ -395,7 +393,7 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(st
     assert not after.diverged.any()
 
 
-def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
+def test_occupancy_equals_mujocos_contact_counts(native, start):
     from congrasp.actors.physics.warp_buffers import (
         CONSTRAINTS_PER_ENVIRONMENT,
         CONTACTS_PER_ENVIRONMENT,
@@ -413,7 +411,7 @@ def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
         np.testing.assert_allclose(after.occupancy[:2], np.divide(counts, room), rtol=1e-5)
 
 
-def test_what_had_no_room_is_counted(start, monkeypatch):
+def test_overflowing_contacts_are_counted(start, monkeypatch):
     monkeypatch.setattr("congrasp.actors.physics.warp_buffers.CONTACTS_PER_ENVIRONMENT", 2)
     warp = warp_engine(OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))

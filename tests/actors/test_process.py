@@ -210,7 +210,7 @@ def test_another_policy_schema_is_refused_before_objects_are_built(run_for, monk
         run_for("0", ("reward",))
 
 
-def test_steps_in_which_the_physics_left_contacts_out_are_counted():
+def test_occupancy_metrics_by_hand():
     occupancy = np.array(
         [[0.5, 0.1, 0.0], [1.0, 0.2, 0.5], [1.25, 0.2, 0.25], [0.3, 1.5, 0.25]], np.float32
     )
@@ -218,7 +218,7 @@ def test_steps_in_which_the_physics_left_contacts_out_are_counted():
     assert process.buffer_occupancy(occupancy) == metrics
 
 
-def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):
+def test_nonfinite_episode_metrics_are_left_out(heard):
     episodes = np.tile(np.arange(len(FIELDS), dtype=np.float32), (B, 1))
     episodes[0, FIELDS.index("episode/heading_rad")] = np.nan
     episodes[2, FIELDS.index("term/contact")] = np.inf
@@ -237,7 +237,7 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     validate(logs["episode"], EPISODE)
 
 
-def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
+def test_objects_change_at_the_configured_interval(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "pools", [])
     episodes = invented(np.zeros((B, len(FIELDS)), np.float32))
     heard(episodes)
@@ -249,7 +249,7 @@ def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
     assert InventedWorker.pools[0] == ["box_0", "mug_0"]
 
 
-def test_objects_that_fall_sometimes_are_drawn_more_often_where_the_run_says_so(heard, monkeypatch):
+def test_objects_that_fall_are_drawn_more_often_with_by_failure(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "weights", [])
     episodes = np.zeros((B, len(FIELDS)), np.float32)
     episodes[:, FIELDS.index("episode/object_index")] = np.arange(B) % 2
@@ -290,7 +290,7 @@ def rollout(*times, ended=()):
     return Trace(**{**fields, "q": q, "terminal": np.isin(np.arange(len(times)), ended)})
 
 
-def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
+def test_episode_across_rollouts_is_followed_to_its_end():
     follower = Follower()
     # The first episode goes on from before, the next one begins with the third step.
     assert follower.add(rollout(8, 9, 0, ended=[1]), None, state("next", 3), due=True) is None
@@ -321,7 +321,7 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     )
 
 
-def test_what_ends_with_a_rollout_begins_nothing_in_it_and_what_is_forgotten_is_not_joined():
+def test_follower_ignores_finished_and_forgotten_episodes():
     follower = Follower()
     assert follower.add(rollout(7, 8, ended=[1]), None, state("none"), due=True) is None
     assert follower.add(rollout(0, 1), state("fresh"), state("none"), due=True) is None

@@ -261,7 +261,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
     np.testing.assert_allclose(finished["episode/force_sum"], 3.0, rtol=1e-5)
 
 
-def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
+def test_a_fallen_object_ends_no_episode_without_end_when_fallen():
     """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no
     truncation.
     """

@@ -223,7 +223,7 @@ def released(stress: Protocol, steps: int):
     return rollout
 
 
-def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
+def test_a_lift_moves_the_wrist_but_not_the_observation():
     """It begins when the wrist has come to its guidance. Objects fall, in the world; the frame
     leaves them below.
     """
@@ -264,7 +264,7 @@ def test_pushes_reach_the_object_through_the_environment():
     np.testing.assert_allclose(way[-1, :, 1], 0.0, atol=5e-3)
 
 
-def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypatch):
+def test_steps_after_the_hold_change_no_metric(monkeypatch):
     monkeypatch.setattr(protocols, "PUSH_SECONDS", 0.05)
     steps = TASK.approach_steps + TASK.hold_steps
     after = protocols.stress_steps(TASK)

@@ -159,7 +159,7 @@ def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
         ({"folder": 0, "constraints": 0}, "no constraint set"),
     ],
 )
-def test_what_cannot_be_trained_on_is_said(folders, objects, text):
+def test_unusable_training_objects_are_refused(folders, objects, text):
     options = {name: folders[0] if value == 0 else value for name, value in objects.items()}
     with pytest.raises(CongraspError, match=text):
         training_set(HAND, _run(**options), 0)
@@ -205,7 +205,7 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
     np.testing.assert_array_equal(both.pose_q[1], rows[1].pose_q)
 
 
-def test_objects_are_drawn_as_often_as_their_weights_say():
+def test_objects_are_drawn_in_proportion_to_their_weights():
     bank = suite.bank()._replace(weight=np.array([1.0, 3.0, 0.0, 4.0], np.float32))
     drawn = suite.episodes(2000, bank).reset_state.object_index
     assert np.bincount(drawn, minlength=4) / len(drawn) == pytest.approx(

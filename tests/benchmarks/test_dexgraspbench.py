@@ -259,7 +259,7 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
     np.testing.assert_allclose(here.geom_xpos[palm[0]], (-0.0093, 0, 0.095 - 0.0475), atol=1e-6)
 
 
-def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called(motion):
+def test_a_shadow_hand_is_recognised_by_its_kinematics(motion):
     """A file that has its palm elsewhere, fingers in another order under other names, and joints
     that turn back.
     """

@@ -144,7 +144,7 @@ def test_shared_message_is_encoded_once():
         (Message(meta={"a": "x" * MAX_HEADER}), "header has .* bytes"),
     ],
 )
-def test_what_cannot_be_written_is_named(message, match):
+def test_unencodable_values_are_named(message, match):
     with pytest.raises(CongraspError, match=match):
         encode(message)
 

@@ -67,7 +67,7 @@ def _without(full_scene, constraint):
 
 
 @each
-def test_blocks_are_as_wide_as_their_fields_say(constraint, full_scene):
+def test_block_sizes_equal_the_sum_of_their_fields(constraint, full_scene):
     described = fields(HAND, TASK)
     sizes = dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)

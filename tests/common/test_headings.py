@@ -233,7 +233,7 @@ def test_an_object_without_o_plus_still_gets_headings():
     assert sample_headings(barren, np.random.default_rng(0), use_affordance=True) is None
 
 
-def test_feasible_keeps_what_stays_above_the_table():
+def test_feasible_headings_stay_above_the_table():
     steep = [0.0, np.sin(0.1), np.cos(0.1)]
     headings = made(
         ([0, 0, 0.0], DOWN),  # 5 cm high

@@ -131,7 +131,7 @@ def test_invalid_methods_are_refused():
         with_method(RUN, "pd")
 
 
-def test_rows_that_a_method_can_be_asked_for():
+def test_rows_that_a_method_supports():
     assert takes("ours", "heading")
     assert takes("graspxl", "affordance")
     assert takes("pd", "trajectory+affordance")

@@ -194,7 +194,7 @@ def test_mjx_couples_joints_as_mujoco_c_does():
     np.testing.assert_allclose(step(fresh).qpos, native.qpos, atol=1e-3)
 
 
-def test_a_tendon_goes_on_where_one_of_its_joints_is_held_and_couplings_do_not_give(hand):
+def test_a_tendon_moves_its_free_joints_if_one_is_held(hand):
     model, data = _closing(hand)
     held, other, leader, follower = (
         model.joint(x) for x in ("middle_2", "middle_3", "index_2", "index_3")

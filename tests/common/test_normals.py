@@ -79,7 +79,7 @@ def test_estimated_normals_are_near_the_exact_ones(shape, median, most, inward):
     assert np.mean(errors > 90) <= inward
 
 
-def test_normals_turn_with_the_cloud_whatever_its_unit_and_place():
+def test_normals_rotate_with_the_cloud_at_any_scale_and_place():
     rng = np.random.default_rng(1)
     points, _ = cylinder(rng)
     turn = Rotation.random(random_state=2)

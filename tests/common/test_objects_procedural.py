@@ -156,7 +156,7 @@ def test_no_two_of_many_are_alike():
     assert {obj.family for obj in many} == set(BASIC_FAMILIES)
 
 
-def test_groups_stand_for_their_families():
+def test_a_group_means_its_families():
     assert family_turns(3, 0, ("mug", "household")) == ["mug", *HOUSEHOLD_FAMILIES[:2]]
     assert set(family_turns(66, 0, ("all",))) == {*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES}
     assert set(family_turns(74, 0, ("all", "scans"))) == set(FAMILIES)
@@ -180,7 +180,7 @@ def test_half_of_the_points_lie_on_a_thin_handle(family):
         ("compound", 0.280085458611, 1164.81867416),
     ],
 )
-def test_held_out_objects_of_basic_families_stay_what_they_are(family, mass, moment):
+def test_held_out_objects_of_basic_families_are_unchanged(family, mass, moment):
     """Figures of different versions are of the same objects."""
     obj = generate(1_000_000, family)
     np.testing.assert_allclose([obj.mass, 1e6 * np.trace(obj.inertia)], [mass, moment], rtol=1e-6)
@@ -236,7 +236,7 @@ def test_evaluation_has_the_same_objects_everywhere():
     assert first_seed(config, 0) == first_seed(config, 123) == HELD_OUT_SEED + 7
 
 
-def test_a_folder_gives_all_its_objects_whoever_asks(tmp_path):
+def test_a_folder_gives_every_actor_all_its_objects(tmp_path):
     catalogue = Catalogue(tmp_path)
     for seed in (2, 1):
         catalogue.add(procedural.generate(seed, "box"))
@@ -258,7 +258,7 @@ def test_pools_that_cannot_be_are_refused_in_words(config, words):
         load_pool(config)
 
 
-def test_an_empty_folder_says_how_to_fill_it(tmp_path):
+def test_an_empty_folder_names_the_remedy(tmp_path):
     with pytest.raises(CongraspError, match=r"contains no object\. .*objects import"):
         load_pool(ObjectsConfig(folder=str(tmp_path)))
 
@@ -296,7 +296,7 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
         np.testing.assert_array_equal(a.vertices, b.vertices)
 
 
-def test_a_catalogue_lists_what_was_added(tmp_path):
+def test_a_catalogue_lists_its_objects(tmp_path):
     catalogue = Catalogue(tmp_path / "new")
     with pytest.raises(CongraspError, match="no folder"):
         catalogue.list()

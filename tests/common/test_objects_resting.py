@@ -121,7 +121,7 @@ def test_the_free_joints_damping_stops_a_rolling_ball_after_the_distance_worked_
     np.testing.assert_allclose(data.qpos[0], speed * constant, rtol=0.1)
 
 
-def test_settling_reports_what_moved():
+def test_settling_reports_the_motion():
     obj = make(Piece("box", (0.02, 0.02, 0.02)))
     fallen = settle(obj, np.array([0, 0, 0.05, 1.0, 0, 0, 0]), 1.0)
     np.testing.assert_allclose(fallen.moved, 0.03, atol=1e-3)

@@ -130,7 +130,7 @@ def test_halves_cut_across_the_longest_axis():
     assert points[labels == 0, 1].max() < points[labels == 1, 1].min() + 0.02
 
 
-def test_mesh_samples_leave_out_what_the_pieces_cover():
+def test_mesh_samples_exclude_areas_covered_by_pieces():
     # A cube's surface with a second, smaller one inside it, whose faces look inwards.
     outer = shapes.triangulate(np.array(np.meshgrid(*[[-0.03, 0.03]] * 3)).reshape(3, -1).T)
     inner = np.asarray(outer.triangles)[:, ::-1] * 0.6
@@ -170,7 +170,7 @@ def test_a_lathed_solid_has_a_piece_for_each_convex_stretch():
     assert len(lathe([(0.0, 0.02), (0.05, 0.04), (0.1, 0.02)])) == 1
 
 
-def test_a_shell_is_what_lies_between_its_polygons():
+def test_a_shell_is_the_solid_between_its_polygons():
     ring = shell([(0.0, 0.05, 0.04), (0.1, 0.05, 0.04)], 8)
     assert len(ring) == 8
     assert _volume(ring) == pytest.approx(0.1 * (_polygon(16) * 0.05**2 - _polygon(8) * 0.04**2))

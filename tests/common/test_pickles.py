@@ -23,7 +23,7 @@ from tests.mano_file import Reduced, dumps, mano_pickle, selection
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_what_python_writes_comes_back(tmp_path, protocol):
+def test_pickles_of_python_are_read(tmp_path, protocol):
     array = np.arange(12, dtype=">f4").reshape(3, 4)
     value = {
         "numbers": [1, -2, 3.5, True],
@@ -52,7 +52,7 @@ def test_what_python_writes_comes_back(tmp_path, protocol):
     assert read["words/none"].shape == (0,)
 
 
-def test_several_files_are_read_in_one_process_and_the_wrong_one_is_named(monkeypatch):
+def test_several_files_share_a_process_and_a_bad_one_is_named(monkeypatch):
     data = [(f"{i}.pkl", pickle.dumps({"x": np.full(3, i)})) for i in range(1500)]
     read = read_pickles(data)
     assert len(read) == 1500
@@ -315,7 +315,7 @@ def test_arrays_come_back(tmp_path):
         pytest.param({"a.txt": b""}, "members that are not arrays", id="a text"),
     ],
 )
-def test_what_is_larger_than_it_looks_is_refused_before_it_is_in_memory(tmp_path, members, why):
+def test_an_archive_that_expands_too_far_is_refused_unread(tmp_path, members, why):
     _zip(tmp_path / "a.npz", members)
     read = functools.partial(read_npz, largest=4 << 20)
     message = limited(read, tmp_path / "a.npz", "Get it again.", memory=24 << 20)

@@ -152,7 +152,7 @@ def test_message_shares_the_arrays_of_this_process(bundle):
         {"network": NetworkConfig(hidden=(8, 4), encoder=4)},
     ],
 )
-def test_schema_changes_with_what_it_covers(change):
+def test_schema_changes_with_every_covered_setting(change):
     other = dataclasses.replace(SPEC, **change)
     assert other.schema != SPEC.schema
     with pytest.raises(CongraspError) as caught:
@@ -223,7 +223,7 @@ def test_a_spoilt_bundle_is_refused_in_one_line(bundle, spoil, words):
     assert "p.safetensors" in str(caught.value)
 
 
-def test_inference_normalises_and_knows_its_log_probability(bundle):
+def test_inference_normalises_and_returns_the_log_probability(bundle):
     raw = np.random.default_rng(1).normal(size=(5, 17)).astype(np.float16)
     raw[:, -4:] = 1.0
     affine = normalizer.observation_affine(bundle.observation, LAYOUT)
@@ -258,7 +258,7 @@ def test_spec_of_the_real_task():
     network.check_layout(spec.layout)
 
 
-def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
+def test_a_bundle_describes_its_critics_inputs(bundle, tmp_path):
     seen = (("mass", 1), ("observation", 4))
     statistics = Statistics(np.float64(3), np.arange(5.0), np.ones(5))
     wide = bundles.with_inputs_of(dataclasses.replace(SPEC, privileged=seen), bundle.task, bundle)

@@ -28,7 +28,7 @@ from congrasp.services.train.command import untrained
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
 
-def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monkeypatch):
+def test_a_given_policy_precedes_the_shipped_one(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "FOLDER", tmp_path)
     custom = tmp_path / "mine.safetensors"
     assert policy_file(custom) == custom
@@ -43,7 +43,7 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
     assert pretrained_file("allegro") is None
 
 
-def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
+def test_a_custom_hand_has_its_custom_policy(tmp_path, monkeypatch):
     monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path))
     get_hand.cache_clear()
     hand = dataclasses.replace(get_hand("human"), name="mine")
@@ -73,7 +73,7 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     get_hand.cache_clear()
 
 
-def test_what_is_shipped_is_installed_and_can_be_loaded():
+def test_shipped_policies_are_installed_and_load():
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
         "package-data"
     ]

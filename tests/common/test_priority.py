@@ -243,7 +243,7 @@ def test_trajectory_and_affordance_must_agree(end_x, aligned):
     assert np.all(resolved(surface, goal, _flags(trajectory=True)).aligned)
 
 
-def test_explanations_name_what_is_overridden():
+def test_explanations_name_overridden_constraints():
     words = " ".join(explain(["affordance", "pose", "trajectory"]))
     assert "only the fingers of the reference pose count" in words.lower()
     assert "overridden by the reference pose" in words

@@ -71,7 +71,7 @@ def test_euler_angles_are_intrinsic_xyz(seed):
     assert np.abs(other - far).max() <= np.pi + 1e-5
 
 
-def test_euler_angles_go_on_where_y_passes_ninety_degrees():
+def test_euler_angles_stay_continuous_beyond_ninety_degrees():
     """By hand: 95 degrees about y from a wrist at 89 stays (0, 95, 0), and is not (180, 85,
     180).
     """

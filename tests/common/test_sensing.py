@@ -109,13 +109,13 @@ def shown(own, poses, room):
 PATH = np.array([np.concatenate(truth(step)) for step in range(STEPS)], np.float32)
 
 
-def test_a_perfect_tracker_shows_the_true_pose():
+def test_a_perfect_tracker_measures_the_true_pose():
     np.testing.assert_array_equal(shown(sensors(), PATH, 1), PATH)
 
 
 @settings(max_examples=12, deadline=None)
 @given(delay=st.integers(0, 12))
-def test_a_delay_of_k_steps_shows_the_pose_of_k_steps_ago(delay):
+def test_a_delay_of_k_steps_measures_the_pose_of_k_steps_ago(delay):
     expected = [np.concatenate(truth(step - delay)) for step in range(STEPS)]
     np.testing.assert_array_equal(shown(sensors(delay=delay), PATH, 13), expected)
 
@@ -130,7 +130,7 @@ def test_samples_are_held_until_the_next_one_arrives():
 
 @settings(max_examples=12, deadline=None)
 @given(dropout=st.floats(0.0, 1.0), period=st.floats(1.0, 10.0))
-def test_what_is_lost_leaves_the_last_pose(dropout, period):
+def test_a_lost_sample_leaves_the_last_pose(dropout, period):
     """Every step shows what the step before it showed, or the present pose; all are lost at 1, none
     at 0.
     """

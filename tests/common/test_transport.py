@@ -300,7 +300,7 @@ def test_closed_subscription_lets_its_reader_go(pair):
     assert time.monotonic() - start < 15
 
 
-def test_tokens_show_who_is_there(pair):
+def test_tokens_list_the_live_peers(pair):
     server, client = pair
     early = KEYS.alive("actor", "a", "01")
     late = KEYS.alive("actor", "b", "02")
@@ -489,7 +489,7 @@ def test_admission_sends_requests_away_unread(pair):
         ("", "(acc: (worker_threads: 64), )"),
     ],
 )
-def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_s(given, merged):
+def test_listener_threads_are_merged_into_the_users_settings(given, merged):
     code = "import os, congrasp.common.transport.zenoh_session; print(os.environ['ZENOH_RUNTIME'])"
     env = {**os.environ, "ZENOH_RUNTIME": given}
     assert (
@@ -497,7 +497,7 @@ def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_
     )
 
 
-def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
+def test_listener_threads_start_with_the_users_settings():
     script = (
         "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as "
         "T; "
@@ -540,7 +540,7 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
         ("AbstractRuntimeParam(app: (worker_threads: 2, max_blocking_threads: 9)) // mine", True),
     ],
 )
-def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sound):
+def test_thread_settings_that_panic_zenoh_are_refused(monkeypatch, given, sound):
     monkeypatch.setenv("ZENOH_RUNTIME", given)
     session = fresh_copy(zenoh_session)
     with (
@@ -552,9 +552,7 @@ def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sou
 
 
 @pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
-def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free(
-    monkeypatch, caplog, hard, files, warnings
-):
+def test_a_listener_raises_its_file_limit_or_warns_once(monkeypatch, caplog, hard, files, warnings):
     """Zenoh panics in a process that has no file left."""
     limits = [(1024, hard)]
     monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: limits[-1])
@@ -573,7 +571,7 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
     assert [record.args for record in caplog.records] == [(files, files // 4, 16_384)] * warnings
 
 
-def test_another_user_s_file_in_the_temporary_folder_takes_no_port_away(tmp_path):
+def test_another_users_file_does_not_block_free_ports(tmp_path):
     (
         tmp_path / f"congrasp-ports-{os.getuid()}"
     ).mkdir()  # what cannot be opened, as another user's file

@@ -57,7 +57,7 @@ def test_every_role_opens_the_flows_of_all_that_it_may_do():
 
 
 @pytest.mark.parametrize("url", ["carrier-pigeon/loft", "127.0.0.1:7447", ""])
-def test_an_unknown_scheme_is_named_with_those_that_are_known(url):
+def test_an_unknown_scheme_lists_the_known_ones(url):
     with pytest.raises(
         CongraspError, match=rf"'{url}' is not an endpoint\. Write it like tcp/.*memory, tcp, tls"
     ):
@@ -90,7 +90,7 @@ def test_within_a_process_a_name_is_enough():
             assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
 
 
-def test_who_connects_waits_for_the_listener(tmp_path):
+def test_a_connection_waits_for_the_listener(tmp_path):
     for url in ("memory/late", f"socket/{tmp_path}/late"):
         opened = []
         late = threading.Timer(
@@ -120,7 +120,7 @@ def test_certificates_follow_from_the_role(certs):
         urls.connect(url, "observer", certs=certs / "actor.1")
 
 
-def test_a_client_without_cryptography_leaves_the_judgement_to_its_peer(certs, monkeypatch):
+def test_without_cryptography_a_client_does_not_check_certificates(certs, monkeypatch):
     monkeypatch.setattr(urls.importlib.util, "find_spec", lambda name: None)
     assert urls.find_credentials(str(certs / "actor.1"), "client") == Credentials(
         certs / "actor.1", "client"
@@ -183,7 +183,7 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         rollouts.close()
 
 
-def test_no_port_is_given_twice_while_its_process_lives(tmp_path):
+def test_a_free_port_is_reserved_while_its_process_lives(tmp_path):
     # Above those that other tests take
     script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))
     # And locks of its own

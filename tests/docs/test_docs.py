@@ -106,7 +106,7 @@ def test_every_help_page_ends_with_examples_that_parse(command):
         parse_errors.parse(name, main.load(name), rest)
 
 
-def test_help_pages_speak_to_people(capsys):
+def test_help_pages_show_no_parser_internals(capsys):
     """Of every command, its options as they are typed: nothing of the parser's own types and
     headings.
     """
@@ -130,7 +130,7 @@ def test_help_pages_speak_to_people(capsys):
                 assert noise not in page, (words, noise)
 
 
-def test_the_mug_is_what_its_code_makes(tmp_path):
+def test_the_example_mug_equals_the_output_of_its_code(tmp_path):
     runpy.run_path(str(ROOT / "examples" / "make_mug.py"))["main"](tmp_path)
     for name in ("mug.obj", "handle.obj"):
         made, shipped = (trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples"))

@@ -43,7 +43,7 @@ def publish_noise(transport):
     transport.publish(Keys(CONFIG.name).log("metrics", "test", "0"), Message(meta=meta))
 
 
-def test_training_goes_on_over_a_full_disk(disk, tmp_path):
+def test_training_continues_on_a_full_disk(disk, tmp_path):
     config = dataclasses.replace(CONFIG, updates=12, checkpoint_every=2)
     run_dir = disk / "run"
     create_run(run_dir, config)
@@ -100,7 +100,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     assert report.holes or report.counts["used"] == 24
 
 
-def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
+def test_a_journal_counts_lines_lost_on_a_full_disk(disk):
     complaints = []
     journal = Journal(disk / AUDIT / "x.jsonl", complaints.append)
     journal.write(line=0)
@@ -121,7 +121,7 @@ def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
     assert journal_lines.damaged == 0
 
 
-def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
+def test_a_failed_last_checkpoint_is_an_error(disk):
     config = dataclasses.replace(CONFIG, updates=3, checkpoint_every=2)
     create_run(disk / "run", config)
     hub = MemoryHub()

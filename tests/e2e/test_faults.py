@@ -88,7 +88,7 @@ def test_a_killed_learner_costs_no_rollout(cluster):
     )
 
 
-def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together(cluster):
+def test_acknowledged_rollouts_survive_the_death_of_all_processes(cluster):
     """No process is left that could send anything again; others continue in their place."""
     cluster.options["pause"] = 0.05
     learner = cluster.start_learner(every=2)
@@ -130,7 +130,7 @@ def test_an_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     assert len({incarnation for incarnation, _ in history}) == 2
 
 
-def test_a_stopped_actor_is_noticed_holds_no_other_up_and_comes_back(cluster):
+def test_a_suspended_actor_blocks_no_other_and_returns(cluster):
     """Its connection stays open and silent."""
     learner = cluster.start_learner()
     actor = cluster.start_actor("a")

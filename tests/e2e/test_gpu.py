@@ -52,7 +52,7 @@ def test_the_shipped_policy_grasps_on_warp_as_on_a_cpu(tmp_path):
         assert row["diverged"] < 0.005, name
 
 
-def test_training_on_the_device_stops_and_goes_on(tmp_path):
+def test_training_on_the_device_stops_and_resumes(tmp_path):
     """Learner and actor in one process, rollouts that stay on the device, and a second start from
     the checkpoint.
     """

@@ -60,7 +60,7 @@ def _updates(link, run, parameters, count):
         assert (pulled.arrays["actor/w"] == version).all()
 
 
-def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
+def test_peers_that_read_no_answers_block_no_other(tmp_path):
     """With answers that wait for their readers, both workers of the server would stand still for
     seconds.
     """
@@ -77,7 +77,7 @@ def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
             time.sleep(0.01)
 
 
-def test_peers_that_ask_for_weights_without_end_are_put_off():
+def test_endless_requests_for_weights_are_deferred():
     with (
         learner(900_000) as (endpoint, run),
         urls.connect(endpoint, "actor") as transport,
@@ -89,7 +89,7 @@ def test_peers_that_ask_for_weights_without_end_are_put_off():
         assert run.hub.pull_limit.rejected > 0
 
 
-def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
+def test_an_actor_on_a_slow_link_blocks_no_other():
     """300 kB/s: the weights take three seconds, in which the other's updates go on."""
     pulled = []
 
@@ -119,7 +119,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
 
 
 @pytest.mark.parametrize("flow", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_silent_connections_keep_nobody_out(flow):
+def test_silent_connections_exclude_no_other(flow):
     """Connections that show nothing for seconds are closed, and hundreds of them are not too
     many.
     """
@@ -142,7 +142,7 @@ def _grown(honest):
     return most
 
 
-def test_what_is_too_long_is_refused_before_it_is_in_memory():
+def test_too_long_messages_are_refused_before_they_are_in_memory():
     """Four times 60 MB at a time: a policy server is sent no more than two."""
     with policy_server() as endpoint, urls.connect(endpoint, "client") as client:
         ask = lambda: client.query(KEYS.act_for("c"), Message(), timeout=5)  # noqa: E731

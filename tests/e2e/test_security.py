@@ -201,7 +201,7 @@ def test_an_actor_whose_certificate_came_later_works_at_once(run):
         assert link.upload(rollout(), link.acquire_ticket(5)).result(10) == "accepted"
 
 
-def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
+def test_an_actor_reconnects_to_a_restarted_learner(certs):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     credentials = Credentials(certs / "actor.0", "actor")
     learner = Credentials(certs / "learner.0", "learner")
@@ -251,7 +251,7 @@ MAY_ASK_THE_POLICY = {
 }
 
 
-def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(run):
+def test_each_role_may_query_only_its_keys(run):
     learner = str(run.transport.session(KEYS.config).info.zid())
 
     def answered(transport, key):
@@ -270,7 +270,7 @@ def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(r
 
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
-def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
+def test_only_the_learner_publishes_and_serves_its_keys(run, who):
     """Forged weights, announcements, logs and answers reach neither the learner nor those connected
     to it.
     """
@@ -314,7 +314,7 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
     assert queries == []
 
 
-def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
+def test_actors_cannot_use_keys_of_one_another(fresh):
     actor = fresh.connect("actor.0")
     victim = fresh.connect("actor.1")
     observer = fresh.connect("observer.0")
@@ -352,7 +352,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
     assert fresh.hub.status()["counters"]["accepted"] == 0
 
 
-def test_a_client_hears_no_logs(run):
+def test_a_client_receives_no_logs(run):
     logs = run.connect("client.0").subscribe(KEYS.logs, depth=64)
     also = run.connect("client.0", run.policy, flows=("policy",)).subscribe(
         "congrasp/*/policy/**", depth=64
@@ -456,7 +456,7 @@ def test_wrong_credentials_do_not_get_in(run, evil, tmp_path):
 @pytest.mark.parametrize(
     ("folder", "who"), [("certs", "actor.0"), ("evil", "learner.0"), ("certs", "actor.9")]
 )
-def test_nobody_is_taken_for_the_learner(folder, who, request, certs):
+def test_no_other_certificate_passes_for_the_learner(folder, who, request, certs):
     """A listener that another authority certified, or whose certificate is not for listening, gets
     no connection.
     """
@@ -537,7 +537,7 @@ def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
             assert queries == []
 
 
-def test_who_is_revoked_is_out_and_the_others_stay(fresh):
+def test_a_revoked_peer_is_disconnected_alone(fresh):
     thief = fresh.connect("actor.1")
     actor = fresh.connect("actor.0")
     observer = fresh.connect("observer.0")
@@ -599,9 +599,7 @@ def forgiven(certs):
 
 
 @pytest.mark.slow
-def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(
-    forgiven, fresh, certs
-):
+def test_processes_connected_to_a_revoked_one_end_in_one_line(forgiven, fresh, certs):
     status = [
         "-m",
         "congrasp",
@@ -635,7 +633,7 @@ def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(
             process.wait()
 
 
-def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, fresh, certs):
+def test_a_client_of_a_revoked_server_gets_an_error(forgiven, fresh, certs):
     client = fresh.connect("client.0", fresh.policy, revocation_seconds=0.1)
     key = KEYS.act_for("0.c")
     assert answers(client, key)
@@ -670,7 +668,7 @@ def test_a_connection_ends_when_its_certificate_expires(run):
     _refused(run.endpoint, Credentials(made, "actor"), "expired")
 
 
-def test_what_is_too_long_or_too_often_is_dropped(fresh):
+def test_too_long_and_too_frequent_messages_are_dropped(fresh):
     observer = fresh.connect("observer.0")
     actor = fresh.connect("actor.0")
     long = Message({"x": np.zeros(100_000, np.uint8)})

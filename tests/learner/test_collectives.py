@@ -85,7 +85,7 @@ def two_devices(program, *arguments):
     return done.stdout.strip()
 
 
-def test_half_of_the_batch_on_each_of_two_devices_is_the_whole_batch():
+def test_ppo_on_two_devices_equals_one():
     assert two_devices(PPO) == "agreed"
 
 

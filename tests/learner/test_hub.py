@@ -19,7 +19,7 @@ from tests.learner.hub_bench import FORM, KEYS, A, B, D, T, bundle, rollout, seq
 from tests.waits import eventually
 
 
-def test_config(bench):
+def test_config_reply(bench):
     reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
     assert reply["config"] == '{"name": "x"}'
     assert reply["run_id"] == "e"
@@ -28,7 +28,7 @@ def test_config(bench):
     assert reply["arrays"] == list(FORM.arrays)
 
 
-def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
+def test_no_ticket_or_rollout_before_the_first_weights(bench):
     b = bench()
     assert not b.ticket()["granted"]
     assert b.send()["outcome"] == "retry"
@@ -38,7 +38,7 @@ def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
     assert b.send()["outcome"] == "accepted"
 
 
-def test_tickets_run_out_and_return(bench):
+def test_tickets_are_limited_and_returnable(bench):
     b = bench(version=0, max_staleness=0, batch=1)
     assert b.ticket("t")["granted"]
     assert b.ticket("t")["granted"]
@@ -52,7 +52,7 @@ def test_tickets_run_out_and_return(bench):
         b.ask(KEYS.ticket("a"), {"actor": "*", "incarnation": "1", "ticket": "t"})
 
 
-def test_death_returns_tickets_and_is_told(bench):
+def test_tickets_of_a_dead_actor_return(bench):
     logged = []
     b = bench(version=0, max_staleness=0, batch=1, on_event=lambda *event: logged.append(event))
     events = b.peer.subscribe(KEYS.logs, depth=8)
@@ -75,7 +75,7 @@ def _roles(b):
     return {(role["role"], role["id"]) for role in b.ask(KEYS.status)["roles"]}
 
 
-def test_batches_come_in_order_and_wait(bench):
+def test_batches_are_in_order_and_waited_for(bench):
     b = bench(version=0)
     assert b.rollouts.next_batch(2, 0.05) is None
     assert b.send(0)["outcome"] == b.send(1)["outcome"] == b.send(2)["outcome"] == "accepted"
@@ -105,7 +105,7 @@ def test_batches_come_in_order_and_wait(bench):
     }
 
 
-def test_full_learner_says_when_to_come_again(bench):
+def test_a_full_learner_defers_rollouts(bench):
     b = bench(version=0, batch=1)
     assert [b.send(i)["outcome"] for i in range(2)] == ["accepted"] * 2
     reply = b.send(2)
@@ -118,7 +118,7 @@ def test_full_learner_says_when_to_come_again(bench):
     assert [limited.send(i)["outcome"] for i in range(2)] == ["accepted", "retry"]
 
 
-def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
+def test_stale_rollouts_are_refused_or_dropped_from_the_queue(bench):
     b = bench()
     events = b.peer.subscribe(KEYS.logs, depth=8)
     b.hub.publish_weights(bundle(0), 0)
@@ -144,7 +144,7 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
     assert ledger["accepted"] == 3
 
 
-def test_nobody_speaks_for_another(bench):
+def test_requests_for_another_actor_are_refused(bench):
     b = bench(version=0)
     assert b.ticket("t")["granted"]
     request = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
@@ -160,7 +160,7 @@ def test_nobody_speaks_for_another(bench):
     assert ledger["accepted"] == 0
 
 
-def test_nobody_makes_the_learner_forget_what_another_sent(bench):
+def test_an_actor_cannot_displace_sequences_of_another(bench):
     b = bench(version=9)
     assert b.send(0, version=9, actor="0.a")["outcome"] == "accepted"
     for i in range(1100):  # more starts of an actor than are remembered
@@ -168,7 +168,7 @@ def test_nobody_makes_the_learner_forget_what_another_sent(bench):
     assert b.send(0, version=9, actor="0.a")["outcome"] == "duplicate"
 
 
-def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
+def test_floods_are_rejected_at_no_cost_to_others(bench, monkeypatch):
     # No token returns
     monkeypatch.setattr(hub, "RateLimit", functools.partial(RateLimit, clock=lambda: 0.0))
     b = bench(version=0)
@@ -193,7 +193,7 @@ def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
     assert any("useless requests of 1.b" in text for text in texts)
 
 
-def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
+def test_repeated_refusals_are_deferred_and_counted(bench):
     b = bench(version=0)
     b.peer.declare_alive(KEYS.alive("actor", "1.b", "01"))
     answers = [b.send(0, actor="1.b", steps=1) for _ in range(4)]
@@ -213,7 +213,7 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
     assert b.ledger()["damaged"] == 3
 
 
-def test_values_beyond_the_task_are_refused_with_the_range(bench):
+def test_values_outside_the_tasks_ranges_are_refused(bench):
     ranges = Ranges(
         np.array([1.0, 1.0, 1.0, 400.0, 2.0]), 65.0, 1e3, {"episode/success": (0.0, 1.0)}
     )
@@ -254,7 +254,7 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
     ).meta["outcome"] == ("accepted")
 
 
-def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
+def test_thousands_of_tokens_are_not_listed(bench):
     b = bench()
     events = b.peer.subscribe(KEYS.logs, depth=1000)
     b.peer.declare_alive(KEYS.alive("actor", "0.a", "01"))
@@ -279,7 +279,7 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     assert told == 64  # one for each that was listed
 
 
-def test_refusal_ends_the_ticket(bench):
+def test_a_refused_rollout_redeems_its_ticket(bench):
     b = bench(version=0)
     assert b.ticket("t")["granted"]
     assert b.send(0, ticket="t", steps=1)["outcome"] == "refused"
@@ -328,7 +328,7 @@ def test_only_weights_of_this_run_are_published(bench):
     assert b.ask(KEYS.config)["version"] == -1
 
 
-def test_status_names_everything(bench):
+def test_status_lists_queue_roles_and_rates(bench):
     b = bench(version=0)
     b.peer.declare_alive(KEYS.alive("actor", "a", "01"))
     b.send(0)
@@ -351,7 +351,7 @@ def test_status_names_everything(bench):
     assert status["rates"] == rates
 
 
-def test_finished_run_says_so(bench):
+def test_a_finished_run_grants_and_accepts_nothing(bench):
     b = bench(version=0)
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.finish()

@@ -46,7 +46,7 @@ def test_useless_requests_empty_a_certificates_bucket_and_time_fills_it():
         (None, 4),
     ],
 )
-def test_only_what_is_granted_or_accepted_is_free(meta, cost):
+def test_only_granted_or_accepted_requests_are_free(meta, cost):
     limit = RateLimit(per_second=0.0, most=100.0, unit=10, clock=Clock())
 
     def handler(key, request):

@@ -39,7 +39,7 @@ def leaves(state: TrainState) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("lag", [0, 2])
-def test_it_learns_to_reach(lag):
+def test_ppo_learns_to_reach(lag):
     """From hardly moving to better than halving the distance at every step, also from stale
     rollouts.
     """
@@ -107,7 +107,7 @@ def test_moving_the_value_statistics_does_not_move_the_values():
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
 
 
-def test_rounding_between_actor_and_learner_is_told_apart_from_lag():
+def test_rounding_is_separated_from_lag():
     """Rollouts of the same version with log probabilities .01 off show as a gap of .01, older ones
     not at all.
     """
@@ -368,7 +368,7 @@ def with_future(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def test_a_privileged_critic_explains_what_the_observation_does_not():
+def test_a_privileged_critic_explains_hidden_value():
     explained = {}
     for spec in (toy.SPEC, WIDE):
         algorithm = PPO(spec, toy.SETTINGS)

@@ -141,7 +141,7 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, ac
     assert not (tmp_path / "audit").exists()
 
 
-def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub, act):
+def test_a_resume_without_link_and_version_file_overwrites_nothing(tmp_path, hub, act):
     """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the
     one before.
     """
@@ -181,9 +181,7 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
-def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(
-    tmp_path, hub, act, monkeypatch
-):
+def test_too_many_unusable_batches_in_a_row_end_the_run(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=20)
     create_run(tmp_path, config)
     # What is within the ranges breaks nothing
@@ -203,9 +201,7 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
     assert not stored & {0, 1}
 
 
-def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
-    tmp_path, hub, act, monkeypatch
-):
+def test_an_unusable_batch_is_dropped(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
@@ -252,7 +248,7 @@ def _started(thread: threading.Thread):
     yield
 
 
-def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
+def test_a_collapse_ends_the_run_with_an_error(tmp_path, hub, act):
     config = dataclasses.replace(CONFIG, updates=20, collapse_patience=3)
     create_run(tmp_path, config)
     act(links=0.0)
@@ -265,7 +261,7 @@ def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
     assert (tmp_path / "checkpoints" / "latest").exists()
 
 
-def test_training_goes_on_from_a_given_policy(tmp_path, hub):
+def test_training_starts_from_an_initial_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
     stopped = threading.Event()
     stopped.set()

@@ -46,7 +46,7 @@ def _rollouts(*spreads):
     worker.physics.close()
 
 
-def test_whatever_an_engine_produces_is_within_the_ranges():
+def test_engine_output_is_within_the_ranges():
     """Actions of three units make hands beat about, and of 30 throw objects away."""
     ranges = task_ranges(suite.TASK, CurriculumConfig())
     ended = 0

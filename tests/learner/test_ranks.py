@@ -68,7 +68,7 @@ def party(monkeypatch):
         party.end(rank)
 
 
-def test_everyone_is_given_the_same_entries_in_rank_order_and_the_arrays_of_rank_0(party):
+def test_all_ranks_receive_entries_in_order_and_rank_0s_arrays(party):
     decisions = {}
 
     def exchange(rank: int) -> None:
@@ -82,7 +82,7 @@ def test_everyone_is_given_the_same_entries_in_rank_order_and_the_arrays_of_rank
         np.testing.assert_array_equal(decision.arrays["x"], np.arange(3) + turn)
 
 
-def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_late(party):
+def test_an_urgent_entry_ends_the_round_for_all(party):
     first, second, third = party.ranks
     second.post({"end": ""})
     assert second.poll(0.2) is None
@@ -94,7 +94,7 @@ def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_la
     party.everywhere(lambda rank: party.ranks[rank].exchange({}))
 
 
-def test_a_dead_rank_ends_the_others_who_are_told_why(party):
+def test_a_failed_rank_ends_the_others_with_its_reason(party):
     party.ranks[1].fail(CongraspError("The disk is full."))
     party.end(1)
     assert party.all_said({0, 2})
@@ -119,7 +119,7 @@ def test_a_silent_rank_ends_the_others(monkeypatch):
     assert any("silent" in text for text in party.said.values())
 
 
-def test_ranks_that_leave_cleanly_miss_nobody(party, monkeypatch):
+def test_ranks_that_leave_cleanly_report_no_loss(party, monkeypatch):
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
     party.everywhere(lambda rank: party.ranks[rank].close())
     for rank in (1, 0, 2):
@@ -167,7 +167,7 @@ def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
         Ranks.join(*arguments)
 
 
-def test_nobody_waits_for_ever_for_a_rank_that_never_comes(monkeypatch):
+def test_joining_ends_at_the_deadline(monkeypatch):
     monkeypatch.setattr(ranks_module, "JOIN_SECONDS", 0.5)
     with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not join"):
         Ranks.join(0, 2, f"127.0.0.1:{free_port()}")
@@ -284,7 +284,7 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
 
 @pytest.mark.timeout(900)
 @pytest.mark.slow
-def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_resumes(job):
+def test_a_rank_dying_in_any_phase_ends_the_other(job):
     saved = 0
     mode = "fresh"
     for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):

@@ -9,7 +9,7 @@ from congrasp.learner.hub.queue import Sequences
 from tests.learner.hub_bench import bundle, sequences
 
 
-def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
+def test_resumed_hub_knows_used_and_counts_lost_rollouts(bench):
     b = bench(version=3, batch=3)
     for i in range(5):
         assert b.send(i, version=3)["outcome"] == "accepted"
@@ -58,7 +58,7 @@ def test_deduplication_is_exact_within_its_window(arrivals):
     assert decisions.rollouts == sum(decided.values())
 
 
-def test_deduplication_stays_small_whatever_is_missing():
+def test_deduplication_memory_is_bounded():
     decisions = Sequences(granted=20_000)
     for sequence in range(1, 20_000, 2):
         decisions.add(_header(sequence), sequence % 3 > 0)
@@ -69,7 +69,7 @@ def test_deduplication_stays_small_whatever_is_missing():
     assert decisions.missing == 10_000
 
 
-def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
+def test_invented_sequence_numbers_do_not_inflate_missing(bench):
     b = bench(version=0, batch=100)
     assert b.send(0, version=0)["outcome"] == "accepted"
     made_up = [number * 10**12 for number in range(1, 71)]
@@ -82,7 +82,7 @@ def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
     assert resumed.ledger()["missing"] <= 2 * 64 + 71
 
 
-def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
+def test_decisions_after_the_checkpoint_count_as_missing(bench):
     b = bench(version=5, batch=2)
     assert b.send(0, version=0)["outcome"] == "stale"
     assert b.send(2, version=5)["outcome"] == b.send(3, version=5)["outcome"] == "accepted"

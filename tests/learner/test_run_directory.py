@@ -42,7 +42,7 @@ def run(tmp_path):
     return tmp_path / "run", config
 
 
-def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
+def test_settings_of_the_learner_alone_may_change(run):
     folder, config = run
     changed = dataclasses.replace(config, updates=9, ppo=dataclasses.replace(config.ppo, clip=0.1))
     continue_run(folder, changed)
@@ -52,7 +52,7 @@ def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
 @pytest.mark.parametrize(
     "change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}, {"algorithm": "a2c"}]
 )
-def test_what_actors_use_may_not(run, change):
+def test_settings_of_the_actors_may_not_change(run, change):
     folder, config = run
     with pytest.raises(
         CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"
@@ -61,7 +61,7 @@ def test_what_actors_use_may_not(run, change):
     assert open_run(folder) == config
 
 
-def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run):
+def test_resuming_starts_from_the_runs_configuration(run):
     folder, config = run
     assert defaults(["--resume", "--run-dir", str(folder)]) == {"config": config}
     assert defaults([f"--run-dir={folder}", "--or-resume", "--preset", "human"])["config"] == config
@@ -95,7 +95,7 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
         b'{"ppo": {"clip": NaN}}',
     ],
 )
-def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text):
+def test_an_invalid_configuration_names_its_file(run, text):
     folder, _ = run
     (folder / "config.json").write_bytes(text)
     with pytest.raises(CongraspError, match=r"run/config\.json ") as caught:
@@ -103,7 +103,7 @@ def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text)
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_left_of_a_run_is_not_begun_anew(run):
+def test_an_existing_run_is_not_started_again(run):
     folder, config = run
     assert not has_checkpoints(folder)
     (folder / "policy.safetensors").write_bytes(b"a policy")
@@ -129,7 +129,7 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
 @pytest.mark.parametrize(
     "damage", [b"", bytes(21), b"\xff\xfe", b"0" * 20 + b"\n", b"9" * 20 + b"\n", b"-5"]
 )
-def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run, damage):
+def test_versions_continue_from_journals_without_the_version_file(run, damage):
     folder, _ = run
     assert published_version(folder) == -1
     note_version(folder, 22)
@@ -193,7 +193,7 @@ def tree(value: float) -> dict:
     }
 
 
-def test_leaves_come_back_where_and_what_they_were(tmp_path):
+def test_leaves_round_trip_with_type_and_place(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(tree(1.0), {"hub": {"seen": [1, 2]}, "run_id": "e"}, 1)
     loaded, meta = checkpoints.load(tree(0.0))
@@ -286,7 +286,7 @@ def lines_of(checkpoints: Checkpoints) -> tuple[float, list[str]]:
 
 
 @pytest.mark.parametrize("link", ["missing", "dangling", "of an older one"])
-def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
+def test_the_newest_checkpoint_is_found_with_any_link(tmp_path, link):
     checkpoints = Checkpoints(tmp_path)
     for version in (8, 9, 10):
         checkpoints.save(tree(version), {}, version)

@@ -118,7 +118,7 @@ def test_an_actor_keeps_its_pace_beside_slow_links(eta, batch, send, count):
 
 
 @pytest.mark.parametrize(("batch", "least"), [(2, 1.0), (8, 6.0)])
-def test_what_a_slower_actor_makes_in_time_is_learnt_from(batch, least):
+def test_rollouts_of_slower_actors_are_used(batch, least):
     """Nobody waits for a rollout of 0.15 s, which is three times as slow; all of them are fresh
     enough where updates of eight take 0.4 s, and some where those of two take 0.1 s."""
     _, *others = among(1, batch, *[{"make": 0.15, "send": 0.01}] * 2)

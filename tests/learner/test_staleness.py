@@ -79,7 +79,7 @@ def test_a_resumed_learner_measures_from_its_checkpoint():
     assert staleness.lag(3) == 2
 
 
-def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_owner():
+def test_a_rollout_of_an_earlier_session_uses_its_owners_ticket():
     """An actor with one upload at a time would wait for the very place that its next ticket
     holds.
     """
@@ -91,7 +91,7 @@ def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_
     assert staleness.arrive(A, "new", 0) == "full"  # until the next version
 
 
-def test_checkpoint_keeps_what_is_settled():
+def test_a_checkpoint_keeps_settled_counters():
     staleness = manager()
     staleness.grant(A, "x")
     staleness.grant(A, "y")
@@ -287,7 +287,7 @@ TestAdmission = Admission.TestCase
 TestAdmission.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
+def test_undelivered_tickets_do_not_block_other_actors():
     """Batch 2 and eta 1 make four tickets. One certificate asks for all it can get, under ever new
     names, for ever.
     """
@@ -322,7 +322,7 @@ def test_who_holds_tickets_and_delivers_nothing_stops_nobody():
     assert 4 < staleness.counters()["expired"] < 40
 
 
-def test_shares_follow_what_was_delivered_and_expiry_what_was_needed():
+def test_shares_follow_deliveries_and_expiry_follows_durations():
     now = [0.0]
     # Eight tickets
     staleness = manager(batch=4, ticket_seconds=120.0, tickets_per_owner=10, clock=lambda: now[0])

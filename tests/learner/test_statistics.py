@@ -70,7 +70,7 @@ def test_errors_and_success_count_where_their_constraint_was_active():
     assert "success/affordance" not in means
 
 
-def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_both():
+def test_a_pose_with_a_trajectory_counts_for_both():
     """The fingers follow the pose; the distance of its wrist says nothing there."""
     means = episode_means(
         [
@@ -137,7 +137,7 @@ def first_alarm(success, links, patience=20):
     return None
 
 
-def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
+def test_a_fall_below_half_of_the_best_raises_an_alarm():
     # Ten updates at 80 % and then none: the mean of ten is below 40 % from the sixth on, so the
     # twentieth is the 25th.
     update, alarm = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
@@ -145,7 +145,7 @@ def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
     assert "fell from 80% to 0%" in alarm
 
 
-def test_a_hand_that_never_touches_is_said():
+def test_a_hand_that_never_touches_raises_an_alarm():
     update, alarm = first_alarm([0.0] * 50, [0.05] * 50)
     assert update == 20
     assert "hardly touched" in alarm
@@ -160,11 +160,11 @@ def test_a_hand_that_never_touches_is_said():
         ([0.0] * 19 + [0.1] + [0.0] * 19, [0.0] * 19 + [1.0] + [0.0] * 19),
     ],
 )
-def test_what_may_still_become_something_goes_on(success, links):
+def test_slow_starts_raise_no_alarm(success, links):
     assert first_alarm(success, links) is None
 
 
-def test_without_patience_nothing_is_said():
+def test_without_patience_there_is_no_alarm():
     assert first_alarm([0.8] * 10 + [0.0] * 500, [0.0] * 510, patience=0) is None
 
 

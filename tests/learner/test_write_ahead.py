@@ -26,7 +26,7 @@ def on_disk(folder):
     return [int(path.stem.split("~")[3]) for path in sorted(folder.glob("*.safetensors"))]
 
 
-def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log, folder):
+def test_a_resumed_learner_uses_logged_rollouts_oldest_first(bench, log, folder):
     b = bench(version=3, batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     for i, version in enumerate((3, 2, 3, 2)):
         assert b.send(i, version=version)["outcome"] == "accepted"
@@ -58,7 +58,7 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
     assert resumed.ticket()["granted"]
 
 
-def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log, folder):
+def test_the_log_keeps_only_rollouts_queued_at_a_checkpoint(bench, log, folder):
     b = bench(version=5, batch=2, log=log())
     for i in range(3):
         assert b.send(i, version=5)["outcome"] == "accepted"
@@ -80,7 +80,7 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log, f
     assert on_disk(folder) == []
 
 
-def test_nothing_is_acknowledged_before_it_is_written(bench, log, folder):
+def test_rollouts_are_acknowledged_after_they_are_written(bench, log, folder):
     """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was
     noted.
     """
@@ -106,7 +106,7 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log, folder):
     assert b.send(1)["outcome"] == "retry"
 
 
-def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log, folder):
+def test_a_discarded_batch_is_not_recovered(bench, log, folder):
     b = bench(version=0, log=log())
     for i in range(3):
         b.send(i)
@@ -114,7 +114,7 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, lo
     assert on_disk(folder) == [2]
 
 
-def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log, folder):
+def test_damaged_torn_and_foreign_files_are_told_apart(bench, log, folder):
     logged = []
     b = bench(version=0, log=log())
     for i in range(4):
@@ -139,7 +139,7 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log, folder)
     assert other.ledger()["queued"] == 0
 
 
-def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log, folder):
+def test_without_writing_existing_rollouts_are_recovered(bench, log, folder):
     b = bench(version=0, log=log())
     b.send(0)
     resumed = bench(version=1, log=log(write=False))
@@ -148,7 +148,7 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
     assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 1]
 
 
-def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
+def test_a_failing_disk_is_logged_once_and_training_continues(bench, tmp_path):
     logged = []
     (tmp_path / "file").touch()
     folder = tmp_path / "file" / "log"

@@ -262,9 +262,7 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         ),
     ],
 )
-def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(
-    error, line, monkeypatch, capsys
-):
+def test_a_full_or_failing_disk_is_reported_in_one_line(error, line, monkeypatch, capsys):
     def fail(arguments):
         raise error
 
@@ -369,7 +367,7 @@ def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_pla
         ("INTERNAL: CUDA_ERROR_OUT_OF_MEMORY", "OUT_OF_MEMORY"),
     ],
 )
-def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, monkeypatch, capsys):
+def test_insufficient_memory_is_one_line(said, what, monkeypatch, capsys):
     monkeypatch.setattr(cli, "run", mock.Mock(side_effect=RuntimeError(said)))
     with pytest.raises(SystemExit) as end:
         cli.main([])
@@ -384,9 +382,7 @@ def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, m
 @pytest.mark.parametrize(
     "number", [errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG]
 )
-def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(
-    number, monkeypatch, capsys
-):
+def test_an_unusable_path_is_one_line_but_a_bug_is_not(number, monkeypatch, capsys):
     def refuse(arguments):
         raise OSError(number, os.strerror(number), *arguments)
 
@@ -443,9 +439,7 @@ def test_an_output_without_some_characters_gets_escapes():
         ),
     ],
 )
-def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(
-    tmp_path, shell, code, words
-):
+def test_closed_output_and_removed_folder_are_not_bugs(tmp_path, shell, code, words):
     command = ["sh", "-c", shell.format(sys.executable)]
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
@@ -555,7 +549,7 @@ def test_a_misspelt_file_is_named_before_anything_is_imported(
         cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])
 
 
-def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(
+def test_long_work_alone_is_announced_with_its_duration(
     capsys: pytest.CaptureFixture,
 ) -> None:
     with announced("Compiling", first=60.0):
@@ -568,7 +562,7 @@ def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(
     assert set(lines) == {"Compiling: 0 s so far."}
 
 
-def test_without_a_terminal_the_current_task_and_its_counts_are_named(capsys, monkeypatch):
+def test_progress_without_a_terminal_names_task_and_counts(capsys, monkeypatch):
     monkeypatch.setattr(console, "announced", functools.partial(announced, first=0.01, every=0.01))
     with console.tracked() as track:
         track("heading", 12)(5)

@@ -183,7 +183,7 @@ def test_queries_for_it_are_answered_and_checked(ask) -> None:
         ask(["fingers"], fingers_allowed=PINCH)
 
 
-def test_the_studio_asks_for_what_is_allowed_alone() -> None:
+def test_the_studio_requests_only_allowed_fingers() -> None:
     studio = Studio(HAND, TASK, MUG)
     studio.ask("fingers", True)
     assert describe_request(studio)["active"]["masks"]["fingers"]

@@ -166,7 +166,7 @@ def test_a_wrist_that_turns_on_and_on_names_the_range(robot):
         follow(robot, still, np.random.default_rng(0))
 
 
-def test_what_the_arm_runs_into_is_named(robot):
+def test_collisions_of_the_arm_are_named(robot):
     path = path_of(robot, swing())
     data = mujoco.MjData(robot.model)
     data.qpos[robot.joints] = swing()[0]

@@ -126,7 +126,7 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("name", ["hand_plain", "hand_swapped"])
-def test_a_confined_process_reads_what_this_one_does(name, tmp_path):
+def test_a_confined_process_reads_the_same(name, tmp_path):
     prepared(name, tmp_path)
     messages = []
     for read in (import_hand, model_files.propose):

@@ -59,7 +59,7 @@ def test_a_method_without_a_policy_is_named_and_no_error(saved):
     ]
 
 
-def test_a_student_stands_beside_the_pretrained_policy_of_its_hand(saved):
+def test_a_student_is_compared_with_the_pretrained_policy(saved):
     student = read_entrants([str(saved("student"))])
     both = [("human", "ours", ("sensing",)), ("human", "student", ("sensing",))]
     assert who(line_up(["sensing"], student, "human")) == both
@@ -78,7 +78,7 @@ def test_a_policy_is_evaluated_once_for_all_its_tables(saved):
     assert who(line_up(["composed"], [], "allegro")) == [("allegro", "ours", ("composed",))]
 
 
-def test_a_folder_stands_for_the_policies_of_its_runs(saved, tmp_path):
+def test_a_folder_means_the_policies_of_its_runs(saved, tmp_path):
     for method in ("ours", "two-phase"):
         saved(method)
     assert [one.method for one in read_entrants([str(tmp_path)])] == ["ours", "two-phase"]
@@ -101,7 +101,7 @@ def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
         (["/nonexistent/policy.safetensors"], "cannot be read"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
+def test_incomparable_entrants_are_refused(saved, tmp_path, texts, words):
     (tmp_path / "empty").mkdir()
     names = {
         "ours": saved("ours"),

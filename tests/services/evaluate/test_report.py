@@ -172,7 +172,7 @@ def test_causes_are_counted():
     assert count_causes(["held", "slipped", "held"]) == "2 held, 1 slipped"
 
 
-def test_limits_name_what_is_bad_by_the_figures():
+def test_limits_of_a_report_follow_from_its_figures():
     good = row("heading", 0.99, 0.975, 0.995)
     assert limits([good]) == ["No row is below the paper's success, or below 80 %."]
     worst = [
@@ -193,7 +193,7 @@ def test_limits_name_what_is_bad_by_the_figures():
     ]
 
 
-def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
+def test_a_model_card_describes_observation_and_training(policy):
     ranged = dataclasses.replace(policy.task, friction_range=(0.5, 1.2), mass_range=(1.0, 1.0))
     card = model_card(dataclasses.replace(policy, task=ranged), [])
     assert "It observes exact poses, velocities and contact forces." in card["limits"]

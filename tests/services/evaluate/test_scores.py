@@ -190,9 +190,7 @@ def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
         ("", "human", "ours", "heading", "", None),
     ],
 )
-def test_rows_stand_beside_those_that_were_made_alike(
-    source, hand, method, constraint, group, success
-):
+def test_rows_are_matched_by_equal_settings(source, hand, method, constraint, group, success):
     row = paper_row(source, hand, method, constraint, group)
     assert (row and row.success) == success
 
@@ -391,7 +389,7 @@ def test_every_cause_has_its_label(metrics, said):
     assert cause(lost([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
-def test_what_slips_in_a_lift_is_measured_from_the_wrist():
+def test_slip_in_a_lift_is_relative_to_the_wrist():
     made = lost([0.1] * 8)
     links = np.zeros_like(made.link_position)
     links[:, :, 2] = np.array([0.2, 0.2, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3])[:, None]

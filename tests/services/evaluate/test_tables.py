@@ -96,7 +96,7 @@ def test_curves_show_every_kind_of_noise(tmp_path):
         assert (blue - red > 100).sum() > 50
 
 
-def test_a_level_is_what_it_says(bank):
+def test_sensing_levels_match_their_labels(bank):
     """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than
     one a step.
     """
@@ -145,7 +145,7 @@ def test_a_policy_observes_trackers_only_there():
     assert SENSING[0].task(TASK).sensed
 
 
-def test_friction_is_stiff_whatever_the_training_s_was():
+def test_policies_run_with_stiff_friction_after_any_training():
     """One option of the scene, in training alone."""
     soft = dataclasses.replace(TASK, impratio=1.0)
     assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [

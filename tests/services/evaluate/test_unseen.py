@@ -81,7 +81,7 @@ def pools_of(*groups, left_out=()):
     return Pools("test", max(map(len, groups)), makes)
 
 
-def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
+def test_episodes_of_an_object_do_not_depend_on_its_pool(simulated):
     told = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
     all_pools, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
@@ -112,7 +112,7 @@ def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
     assert heaviest in {obj["name"] for obj in heavy.objects}
 
 
-def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
+def test_a_stopped_evaluation_resumes_at_the_next_pool(simulated, tmp_path):
     complete = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
     simulated.clear()
 

@@ -211,7 +211,7 @@ def test_a_controller_can_take_the_trajectory_of_a_bag(
     np.testing.assert_allclose(since, 1.0 + robot.time, atol=1e-9)
 
 
-def test_a_usd_has_the_rate_that_is_asked_for(odd_hand: Episode, tmp_path: pathlib.Path) -> None:
+def test_a_usd_has_the_requested_rate(odd_hand: Episode, tmp_path: pathlib.Path) -> None:
     slower = at_rate(odd_hand, 24.0)
     assert len(slower.time) == int((T - 1) * 24 / 100) + 1
     formats.export_motions([slower], "usd", tmp_path / "m.usda")

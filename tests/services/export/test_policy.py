@@ -65,7 +65,9 @@ def test_exported_policies_answer_as_the_flax_policy(
             assert json.loads(archive.read("meta.json"))["hand"] == "human"
 
 
-def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_the_exported_file_describes_every_number(
+    bundle: PolicyBundle, tmp_path: pathlib.Path
+) -> None:
     exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     meta = {
@@ -202,7 +204,7 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     ]
 
 
-def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
+def test_the_example_observes_the_training_layout(pretrained_onnx: pathlib.Path) -> None:
     example, grasp = example_grasp(pretrained_onnx)
     for _ in range(57):  # the hand holds the object, and the table is gone
         grasp.step()

@@ -179,7 +179,7 @@ def test_each_environment_has_its_own_seed(manual):
     assert len(np.unique([*observations, *different], axis=0)) == 2 * COUNT
 
 
-def test_an_environment_alone_draws_what_it_draws_among_others(manual):
+def test_an_environment_draws_the_same_alone_and_among_others(manual):
     env = GraspEnv(**SHORT)
     np.testing.assert_array_equal(env.reset(seed=3)[0], manual.reset(seed=[1, 3, 5, 7])[0][1])
     env.close()

@@ -68,7 +68,7 @@ def faults(run_dir):
     }
 
 
-def test_a_pipe_in_the_folder_holds_nobody_up(run_dir):
+def test_a_pipe_in_the_folder_does_not_block(run_dir):
     learner(run_dir, life(), used(0, 1))
     os.mkfifo(run_dir / AUDIT / "b.jsonl")
     with pytest.raises(CongraspError, match=r"b\.jsonl is not a regular file"):
@@ -122,7 +122,7 @@ def test_lost_duplicated_corrupted_and_unmatched(run_dir, capsys):
     assert "a/1/3" in capsys.readouterr().out
 
 
-def test_what_a_resume_undid_is_no_duplicate_and_no_loss(run_dir):
+def test_rollouts_undone_by_a_resume_are_not_faults(run_dir):
     """The checkpoint is of version 2: uses from there on are undone; 2 and 3 came again, 4 and 5
     did not.
     """
@@ -140,7 +140,7 @@ def test_what_a_resume_undid_is_no_duplicate_and_no_loss(run_dir):
     assert faults(run_dir) == {"undone": 1, "too old after a restart": 1}
 
 
-def test_a_rollout_that_was_fresh_after_a_restart_and_did_not_come_is_lost(run_dir):
+def test_a_fresh_rollout_missing_after_a_restart_is_lost(run_dir):
     learner(run_dir, life(), used(0, 1), used(2, 3), life("y", version=4), {"end": []})
     assert faults(run_dir) == {"lost": 2}
 
@@ -235,7 +235,7 @@ def test_a_torn_line_counts_among_the_lost_lines(run_dir, monkeypatch):
     assert report.counts["used, not in the journals"] == 4
 
 
-def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
+def test_an_unfinished_last_line_is_not_damage(run_dir):
     """Its writer comes back: its next line counts the unfinished one, and what it told is not
     judged.
     """
@@ -277,9 +277,7 @@ def test_lines_of_older_versions_are_read_and_reported_as_unchecked(run_dir, cap
 
 
 @pytest.mark.parametrize("which", ["a.jsonl", "learner-0.jsonl"])
-def test_lines_that_were_cut_out_show_and_an_emptied_journal_is_no_clean_one(
-    tmp_path, which, capsys
-):
+def test_removed_lines_and_emptied_journals_are_reported(tmp_path, which, capsys):
     whole_run(tmp_path)
     assert command(tmp_path) == 0
     path = tmp_path / AUDIT / which

@@ -25,7 +25,7 @@ def folder(tmp_path):
     return tmp_path / "certs"
 
 
-def test_a_certificate_says_run_role_number_hosts_and_end(folder):
+def test_a_certificate_contains_run_role_number_hosts_and_expiry(folder):
     made = read(
         issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt"
     )
@@ -55,7 +55,7 @@ def test_a_certificate_says_run_role_number_hosts_and_end(folder):
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
-def test_openssl_agrees_who_may_listen(folder, tmp_path):
+def test_openssl_accepts_listeners_only(folder, tmp_path):
     create_authority(tmp_path / "other")
 
     def verify(ca, certificate, purpose):
@@ -113,7 +113,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
         ("actor", {"days": float("nan")}, "days"),
     ],
 )
-def test_what_makes_no_sense_is_not_issued(folder, role, options, words):
+def test_invalid_certificate_requests_are_refused(folder, role, options, words):
     with pytest.raises(CongraspError, match=words):
         issue(folder, role, **options)
     assert [one.name for one in certificates(folder)] == ["ca"]
@@ -149,7 +149,7 @@ def test_a_common_name_that_is_none_of_ours_is_nobodys(name):
     assert parse_identity("r.s.actor.255") == ("r.s", "actor", 255)
 
 
-def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(folder):
+def test_revoked_certificates_are_listed_and_not_reissued(folder):
     learner = issue(folder, "learner")
     actor = issue(folder, "actor")
     assert revoke(folder, "actor", 0) == "human.actor.0"

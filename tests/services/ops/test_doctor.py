@@ -38,7 +38,7 @@ def findings(**options):
     return {finding.what: finding for finding in doctor.examine(**options)}
 
 
-def test_this_machine_is_looked_at(capsys):
+def test_doctor_prints_a_line_for_each_check(capsys):
     assert set(ALWAYS) <= findings().keys()
     code = command()
     lines = capsys.readouterr().out.splitlines()
@@ -49,7 +49,7 @@ def test_this_machine_is_looked_at(capsys):
     assert code == int(any(line.startswith("BAD") for line in lines))
 
 
-def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypatch, capsys):
+def test_another_mujoco_version_names_the_required_one(monkeypatch, capsys):
     real = importlib.metadata.version
     monkeypatch.setattr(
         importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name)
@@ -62,7 +62,7 @@ def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypa
     assert any(line.startswith("BAD  mujoco") for line in capsys.readouterr().out.splitlines())
 
 
-def test_a_package_that_is_missing_comes_with_the_command_that_installs_it(monkeypatch):
+def test_a_missing_package_names_the_install_command(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -132,7 +132,7 @@ CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda 
         ("jax", "RuntimeError: no such device", lambda m: m.setattr(jax, "devices", _broken)),
     ],
 )
-def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
+def test_each_failed_check_names_its_problem(monkeypatch, what, words, patch):
     if what == "python":
         monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
     with monkeypatch.context() as change:
@@ -147,7 +147,7 @@ def _broken():
     raise RuntimeError("no such device")
 
 
-def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
+def test_an_old_driver_names_the_required_one(monkeypatch):
     answer = "NVIDIA H100, 81559, 1024, 535.1\nNVIDIA H100, 81559, 0, 580.65\n"
     monkeypatch.setattr(doctor, "NVIDIA_DEVICE", os.devnull)
     monkeypatch.setattr(
@@ -160,7 +160,7 @@ def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
     assert by_check["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
 
 
-def test_certificates_are_looked_at(tmp_path):
+def test_certificates_near_their_expiry_are_reported(tmp_path):
     (none,) = doctor.check_certificates(tmp_path)
     assert not none.fine
     assert "congrasp certs init" in none.text
@@ -177,7 +177,7 @@ def test_certificates_are_looked_at(tmp_path):
     assert "issue --force" in observer.text
 
 
-def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
+def test_learner_connection_and_clock_offset_are_checked(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
         hub = learner_hub(server, "r").hub

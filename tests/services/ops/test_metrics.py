@@ -228,7 +228,7 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")
 
 
-def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
+def test_a_json_log_continues_after_an_error(capfd):
     @contextlib.contextmanager
     def outer():
         try:

@@ -41,7 +41,7 @@ def endpoint():
             yield endpoint
 
 
-def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
+def test_status_lists_roles_and_counters(endpoint, capsys):
     assert Status(connect=endpoint, run="r", json=True)() == 0
     state = json.loads(capsys.readouterr().out)
     assert state["run"] == "r"
@@ -77,7 +77,7 @@ def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     assert page == View(run="r", policy=tmp_path / "run" / POLICY_FILE, recordings=tmp_path / "run")
 
 
-def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
+def test_a_run_folder_excludes_other_options(tmp_path):
     folder = tmp_path / "run"
     other = {"connect": "tcp/127.0.0.1:1"}
     for command, named in (
@@ -110,7 +110,7 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
     assert words == "2 rollouts are counted as queued, but the queue holds 1."
 
 
-def test_watching_goes_on_until_it_is_interrupted(endpoint):
+def test_watching_continues_until_interrupted(endpoint):
     command = [sys.executable, "-m", "congrasp", "status", "--connect", endpoint, "--run", "r"]
     with subprocess.Popen(
         [*command, "--watch", "--every", "0.1", "--json"], stdout=subprocess.PIPE, text=True
@@ -127,7 +127,7 @@ def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
         Status(connect=endpoint, run="other")()
 
 
-def test_a_terminal_of_80_columns_shows_whole_names(endpoint):
+def test_names_fit_into_80_columns(endpoint):
     """A long name continues in the next line of its cell."""
     state = ask_with_tokens(endpoint, 70)
     role = {**state["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
@@ -142,7 +142,7 @@ def test_a_terminal_of_80_columns_shows_whole_names(endpoint):
     assert "".join(cells) == "node-17.cluster-12345"
 
 
-def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):
+def test_unlisted_processes_are_counted_and_names_escaped(endpoint):
     """600 liveliness tokens of one certificate, some with names that a terminal or a table would
     take for more.
     """

@@ -50,7 +50,7 @@ def metrics(**values):
     return Message({}, {"time": 1.0, "values": values})
 
 
-def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():
+def test_new_metric_names_are_bounded():
     convert = Converter()
     evil = KEYS.log("metrics", "actor", "1.b")
     honest = KEYS.log("metrics", "actor", "0.a")
@@ -174,7 +174,7 @@ def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
     assert convert(KEYS.log("episode", "actor", "0.a"), message, 10**18)
 
 
-def test_a_live_view_bounds_what_waits(monkeypatch):
+def test_a_live_view_bounds_its_queue(monkeypatch):
     monkeypatch.setattr("congrasp.services.record.live.MAX_QUEUED_BYTES", 1 << 20)
     convert = Converter()
     with LiveServer(0) as server:

@@ -68,7 +68,7 @@ doctor = functools.partial(python, "-m", "pymcap_cli.cli", "doctor", env={"COLUM
 """Runs `pymcap-cli doctor`."""
 
 
-def test_a_finished_file_is_sound_and_says_what_its_numbers_mean(tmp_path: pathlib.Path) -> None:
+def test_a_finished_file_is_sound_and_describes_its_fields(tmp_path: pathlib.Path) -> None:
     raw = Entry(
         opaque_channel("/rollout/a", "congrasp.Rollout"),
         5,
@@ -118,7 +118,7 @@ def test_rotation_by_age_and_by_size_keeps_everything(tmp_path: pathlib.Path) ->
     ]
 
 
-def test_what_belongs_together_is_not_split_over_files(tmp_path: pathlib.Path) -> None:
+def test_entries_written_together_are_in_one_file(tmp_path: pathlib.Path) -> None:
     writer = LogWriter(tmp_path, "log", max_seconds=2.5)
     writer.write(*metric_entries(10))
     writer.write(*metric_entries(3, start=10))
@@ -188,7 +188,7 @@ def test_a_full_disk_is_an_error_and_keeps_what_was_flushed(tmp_path: pathlib.Pa
     assert updates(log_files(tmp_path)[0])[: flushed + 1] == [*range(flushed + 1)]
 
 
-def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
+def test_another_kind_of_file_is_refused(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match="no recording"):
         log_files(tmp_path)
     (tmp_path / "a.mcap").write_text("a text")
@@ -220,7 +220,7 @@ def flushed_file(
 
 @pytest.mark.parametrize("damaged", [0, 2, 4])
 @pytest.mark.parametrize("at", [-5, 32], ids=["contents", "uncompressed size"])
-def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_path, damaged, at):
+def test_reading_continues_after_a_damaged_chunk(tmp_path, damaged, at):
     path, chunks = flushed_file(tmp_path)
     data = bytearray(path.read_bytes())
     start, length = chunks[damaged]
@@ -237,7 +237,7 @@ def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_pat
     assert notes == [f"{path} is {places}"]
 
 
-def test_what_was_dropped_is_warned_of_by_default(
+def test_dropped_chunks_are_warned_of_by_default(
     tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path, ((start, length), *_) = flushed_file(tmp_path)
@@ -252,9 +252,7 @@ def test_what_was_dropped_is_warned_of_by_default(
 
 @settings(max_examples=150, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
-    tmp_path_factory, place, bit
-):
+def test_a_flipped_bit_costs_at_most_one_chunk_with_a_note(tmp_path_factory, place, bit):
     folder = tmp_path_factory.mktemp("flip")
     path, _ = flushed_file(folder)
     data = bytearray(path.read_bytes())

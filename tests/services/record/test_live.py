@@ -178,7 +178,7 @@ def test_other_sites_in_a_browser_cannot_watch(headers: dict[str, str], admitted
     assert answer.startswith("HTTP/1.1 101 " if admitted else "HTTP/1.1 403 ")
 
 
-def test_a_busy_port_is_said_in_words() -> None:
+def test_a_busy_port_is_one_line() -> None:
     with (
         LiveServer(0) as server,
         pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"),

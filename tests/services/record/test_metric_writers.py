@@ -94,7 +94,7 @@ def test_weights_and_biases_offline(
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, monkeypatch, capsys):
+def test_a_failing_metric_writer_does_not_stop_the_recording(tmp_path, monkeypatch, capsys):
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 

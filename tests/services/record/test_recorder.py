@@ -126,7 +126,7 @@ def test_damaged_messages_are_left_out_and_counted(
     assert [record.topic for record in read_records(recorder.files[0])] == ["/metrics/learner/0"]
 
 
-def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(transport, tmp_path):
+def test_messages_faster_than_the_disk_are_dropped_and_counted(transport, tmp_path):
     recorder = Recorder(transport, "r", tmp_path, depth=10)
     for update in range(25):
         transport.publish(METRICS, metrics(update))
@@ -242,7 +242,7 @@ def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path):
     assert "Traceback" not in errors
 
 
-def test_a_killed_recorder_leaves_every_record_up_to_its_last_flush_and_the_run_goes_on(tmp_path):
+def test_a_killed_recorder_keeps_records_up_to_its_last_flush(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as transport:
         with recorder_process(endpoint, tmp_path / "out"):
@@ -281,7 +281,7 @@ def codes(path: pathlib.Path) -> set[str]:
     return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", doctor(path).stdout))
 
 
-def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
+def test_a_suspended_recorder_does_not_block_the_run(tmp_path: pathlib.Path) -> None:
     """Twenty megabytes are published at it, more than it may keep; when it goes on, it says how
     much it missed.
     """

@@ -185,7 +185,7 @@ def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entr
     assert 2000 < count < 2100
 
 
-def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
+def test_an_independent_reader_finds_the_skin_in_place(
     tmp_path: Path,
 ) -> None:
     """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
@@ -306,7 +306,7 @@ def test_a_clock_that_is_set_back_drops_no_episode() -> None:
     assert left < min(times) - (START - day) < 2 * left
 
 
-def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
+def test_invalid_colours_and_paths_as_names_are_refused(tmp_path):
     message = episode_message()
     colours = {
         "colour_points": np.zeros((2, 3), np.float32),

@@ -44,7 +44,7 @@ def running(batcher, gate):
     return answer
 
 
-def test_a_batch_holds_what_weighs_no_more_than_its_size(gate):
+def test_a_batch_is_limited_by_weight(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=10, weigh=lambda item: item)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(weight, 10.0) for weight in (3, 1, 2, 4, 1, 1)]
@@ -65,7 +65,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher.close()
 
 
-def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
+def test_peers_take_turns_and_a_flooding_peer_is_refused(gate):
     batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0, peer=Peer("greedy")) for i in (1, 2, 3)]
@@ -211,7 +211,7 @@ def test_a_failure_reaches_its_own_batch_alone():
     batcher.close()
 
 
-def test_closing_refuses_what_waits_and_what_comes(gate):
+def test_closing_refuses_waiting_and_new_items(gate):
     batcher = Batcher(gate, size=1, window=0.0, depth=4)
     first = running(batcher, gate)
     waiting = batcher.submit(1, 10.0)

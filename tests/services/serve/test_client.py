@@ -98,7 +98,7 @@ def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     np.testing.assert_allclose(second["q_initial"], REQUEST.q, rtol=1e-6)
 
 
-def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
+def test_the_client_reconnects_to_a_restarted_server(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
         client.reset(REQUEST)
@@ -144,6 +144,6 @@ def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
     server.close()
 
 
-def test_nobody_there_is_said_in_one_line(endpoint):
+def test_a_missing_server_is_one_line(endpoint):
     with pytest.raises(TransportError, match="No response from"):
         PolicyClient(endpoint, wait=0.5)

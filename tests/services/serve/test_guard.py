@@ -173,7 +173,7 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
         ({"q": np.full(FINGERS, np.nan)}, "freeze"),
     ],
 )
-def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
+def test_a_possibly_held_object_is_dropped_only_by_open(changed, mode):
     clock = Clock(100.0)
     policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
@@ -211,7 +211,7 @@ def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
         assert guard.step(STATE).mode == "open"
 
 
-def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
+def test_a_camera_policy_is_queried_without_object_pose():
     """Its hand opens after a silence, unless the table's absence says that something may be
     held.
     """
@@ -292,7 +292,7 @@ def test_the_palm_stays_above_the_table():
         np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
-def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
+def test_an_episode_starts_from_the_last_finger_targets_unless_moved():
     clock = Clock(100.0)
     policy = ScriptedPolicy(TransportError("Nobody is there."))
     elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
@@ -303,7 +303,7 @@ def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_
         np.testing.assert_array_equal(guard.step({}).q_target, elsewhere.q)
 
 
-def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
+def test_the_hand_follows_again_when_answers_return():
     clock = Clock(100.0)
     policy = ScriptedPolicy(TransportError("Nobody is there."))
     with guarded(policy, clock) as guard:
@@ -346,7 +346,7 @@ def test_a_late_answer_does_not_replace_the_next_one():
     assert outcome.answer.q_target[0] == 0.1
 
 
-def test_a_policy_that_hangs_does_not_hold_the_loop_up():
+def test_a_hanging_policy_does_not_block_the_loop():
     release, policy = (
         threading.Event(),
         ScriptedPolicy(lambda state: (release.wait(20.0), answer(np.ones(2)))[1]),
@@ -369,7 +369,7 @@ def test_a_policy_that_hangs_does_not_hold_the_loop_up():
     guard.close()
 
 
-def test_the_policy_is_told_what_is_not_measured():
+def test_missing_measurements_are_nan_in_the_query():
     """A client's query would have zeros there."""
     policy = ScriptedPolicy(answer(np.zeros(FINGERS)))
     with guarded(policy, Clock(100.0)) as guard:
@@ -394,7 +394,7 @@ def test_the_policy_is_told_what_is_not_measured():
         (None, "lost"),
     ],
 )
-def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
+def test_an_invalid_answer_is_counted_and_holds(outcome, counter):
     with guarded(ScriptedPolicy(outcome), Clock(100.0)) as guard:
         command = guard.step(STATE)
     assert command.mode == "hold"
@@ -424,7 +424,7 @@ TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
     st.lists(st.tuples(OUTCOMES, STATES, TIMES, st.booleans()), min_size=1, max_size=12),
     st.sampled_from(["freeze", "open"]),
 )
-def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
+def test_no_command_ever_leaves_the_limits(steps, fallback):
     clock = Clock(100.0)
     policy = ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
@@ -452,7 +452,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
     assert guard.counters.steps == len(steps)
 
 
-def test_what_makes_no_guard_is_refused():
+def test_invalid_guard_options_are_refused():
     for wrong in (
         {"wait": 0.01},
         {"stale": 0.0},

@@ -69,7 +69,7 @@ STEPS = st.lists(
 @settings(max_examples=60, deadline=None)
 @example([([], [], [], -1e-187), ([], [], [], 0.0)], [0.0] * JOINTS)
 @given(STEPS, st.lists(NEAR, min_size=JOINTS, max_size=JOINTS))
-def test_positions_speeds_and_torques_stay_within_the_limits_whatever_comes_in(steps, start):
+def test_limiter_output_stays_within_limits_for_any_input(steps, start):
     limiter = Limiter(LIMITS, np.array(start), period=PERIOD, floor=FLOOR)
     last = limiter.target
     least = min(FLOOR.clearance(last[-6:]), 0.0)
@@ -102,7 +102,7 @@ def test_over_any_times_a_target_is_no_faster_than_its_limit(times):
     assert (np.abs(limiter.target - begin) <= LIMITS.speed * passed + 1e-12).all()
 
 
-def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits():
+def test_a_target_moves_at_the_speed_and_torque_limits():
     limits = JointLimits(*(np.append(x, np.ones(6)) for x in (-1.0, 1.0, 6.0, 0.6, 3.0, 0.1)))
     limits = dataclasses.replace(limits, lower=-limits.upper)
     limiter = Limiter(limits, np.zeros(7), period=PERIOD)

@@ -189,7 +189,7 @@ def test_bad_states_leave_the_episode(policies, episode, change, words):
     same(*answers)
 
 
-def test_what_a_request_lacks_is_named_at_once(policies, episode):
+def test_a_missing_field_of_a_request_is_named(policies, episode):
     for policy in policies:
         with pytest.raises(RefusedError, match=r"^The request lacks 'surface' and 'wrist'"):
             policy.reset(dataclasses.replace(episode.request, surface=None, wrist=None))

@@ -79,7 +79,7 @@ def test_fields_land_in_their_places_and_absent_sensors_read_zero():
     np.testing.assert_array_equal(received["asked"], [1, 0, 0, 0])
 
 
-def test_the_bits_say_what_was_asked_in_the_order_of_the_constraints():
+def test_flags_follow_the_order_of_the_constraints():
     pose = {"pose_q": np.zeros(20), "pose_position": np.zeros(3), "pose_quaternion": IDENTITY}
     query, fields = parse(("pose", "affordance"), **pose)
     assert query.asked == ("affordance", "pose")
@@ -119,7 +119,7 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
 
 
 @pytest.mark.parametrize("count", [3, 8, 20])
-def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
+def test_surface_points_are_resampled_to_the_policys_number(count):
     points = np.arange(count)[:, None] * np.ones(3)
     _, received = parse(surface_points=points, surface_avoid=np.arange(count) >= count // 2)
     coordinates = received["surface_points"][:, 0]

@@ -174,7 +174,7 @@ def test_a_cloud_is_read_as_it_comes_over_either_bus(example):
         assert read(Fields(**{**vars(message), **wrong})).shape == (0, 3)
 
 
-def test_a_hidden_object_stays_where_it_was_and_a_silent_camera_stops_the_hand(example):
+def test_a_hidden_object_keeps_its_place_until_the_camera_is_silent(example):
     bus = Wire()
     with camera_node(example, bus, age=0.5) as (node, policy):
         bus.said = camera_says(cloud_of(surroundings()))

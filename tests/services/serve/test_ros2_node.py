@@ -41,7 +41,7 @@ def example():
     return examples.example("ros2_node")
 
 
-def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
+def test_node_over_zenoh_exchanges_cdr_with_other_libraries(example, capsys):
     """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags; long
     ones share memory.
     """
@@ -168,7 +168,7 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
         check(policy, obj, [sent["joint_command"], sent["wrist_command"]])
 
 
-def test_stamps_are_of_a_simulator_s_clock_where_one_is_published(example, capsys):
+def test_stamps_refer_to_a_published_clock(example, capsys):
     def stamp(seconds):
         return Fields(sec=int(seconds), nanosec=300_000_000)
 
@@ -216,7 +216,7 @@ def test_a_bus_that_is_absent_is_one_line(example, monkeypatch, options, words):
     assert "cargo" not in str(caught.value)
 
 
-def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
+def test_missing_inputs_are_named_and_joints_are_mapped(example):
     """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object
     in a lost frame.
     """
@@ -247,7 +247,7 @@ def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
         sys.modules["ros2_sensors"].joints_of(("elbow=motor_1",), NAMES)
 
 
-def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example):
+def test_poses_are_converted_through_frames_and_offsets(example):
     """The base stands at (1, 0, 0), turned by 90 degrees about z; the camera hangs 2 m above it and
     looks along its z; it is really 1 cm farther along its own x axis. The palm is 10 cm along the
     flange's z axis.
@@ -292,7 +292,7 @@ def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example)
         assert "tf from its frame 'camera'" in node.sensors.missing()
 
 
-def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
+def test_hand_rises_after_the_approach_and_dry_run_is_silent(example):
     """3 steps of approach; then 10 cm at 2 cm a step, with a smooth beginning and end: 3 s^2 - 2
     s^3.
     """
@@ -337,9 +337,7 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
 
 
 @pytest.mark.parametrize(("radius", "height"), [(0.06, 0.04), (0.015, 0.0)])
-def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_middle(
-    example, radius, height
-):
+def test_hand_centre_stops_below_the_surface_or_at_the_middle(example, radius, height):
     """Of a ball, from above: 6 cm - 2 cm over the middle; the middle of a ball of 1.5 cm is nearer
     to its surface.
     """
@@ -350,7 +348,7 @@ def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_mid
     np.testing.assert_allclose(stop - middle, [0.0, 0.0, height], atol=1e-3)
 
 
-def test_the_policy_s_clock_reaches_the_removal_when_the_object_may_leave_the_table(example):
+def test_policy_clock_reaches_the_removal_after_the_approach(example):
     plan = example.Plan(
         "world", approach_steps=200, trained_steps=100, lift=0.1, step=0.001, dry_run=False
     )

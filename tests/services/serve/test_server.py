@@ -105,9 +105,7 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     assert after["congrasp_policy_version",] == 0
 
 
-def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
-    served, monkeypatch
-):
+def test_swapping_weights_fails_no_query(served, monkeypatch):
     path, endpoint, episode = served
     monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
     policy = task.policy()
@@ -145,7 +143,7 @@ def test_a_latency_test_sends_no_more_than_its_rate(served):
 
 
 @pytest.mark.parametrize("beside_others", [False, True])
-def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(
+def test_several_states_equal_single_queries_and_keep_the_episode(
     served, beside_others, monkeypatch
 ):
     """Beside other clients the eleven are inferred in three parts."""
@@ -213,7 +211,7 @@ def test_bad_lists_of_states_are_refused(served):
         assert len(client.act_each([good] * 64)) == 64
 
 
-def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
+def test_queries_beyond_the_queue_are_refused_at_once(served, metrics, monkeypatch):
     _, endpoint, episode = served
     entered = threading.Semaphore(0)
     go = threading.Event()
@@ -248,7 +246,7 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         assert len({future.result(60) for future in futures}) == 1
 
 
-def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):
+def test_a_mismatched_newer_policy_is_refused(served):
     path, endpoint, _ = served
     with PolicyClient(endpoint) as client:
         version = client.health()["version"]
@@ -302,7 +300,7 @@ def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
         server.close()
 
 
-def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
+def test_a_server_needs_a_readable_policy(tmp_path: pathlib.Path):
     with MemoryTransport(MemoryHub()) as transport:
         with pytest.raises(CongraspError, match="cannot be read"):
             PolicyServer(transport, "p", follow_file(tmp_path / "none.safetensors"))
@@ -316,6 +314,6 @@ def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: path
             transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
 
 
-def test_a_name_that_cannot_be_one_is_refused_before_a_policy_is_loaded():
+def test_an_invalid_name_is_refused_before_loading():
     with pytest.raises(CongraspError, match="'a/b' cannot be the name of a run"):
         PolicyServer(mock.Mock(), "a/b", mock.Mock(side_effect=AssertionError))

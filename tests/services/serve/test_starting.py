@@ -48,7 +48,7 @@ def responding(client):
         return client.health()
 
 
-def test_health_tells_that_it_compiles(compiling):
+def test_health_reports_compilation(compiling):
     endpoint, _ = compiling
     with PolicyClient(endpoint) as client:
         health = eventually(lambda: responding(client))

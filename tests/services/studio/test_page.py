@@ -324,9 +324,7 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(
 
 
 @pytest.mark.slow
-def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(
-    opened: Any, site: Site
-) -> None:
+def test_a_training_page_leads_from_a_dip_to_its_episodes(opened: Any, site: Site) -> None:
     opened.click("#show-training")
     opened.wait_for_selector("tr[data-actor=a099]", state="attached")
     # The studio's policy may be older than the run's, which a tile shows

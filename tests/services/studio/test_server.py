@@ -94,7 +94,7 @@ def page(grasping: fake.FakePolicy) -> Iterator[Page]:
     session.close()
 
 
-def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
+def test_only_the_page_and_its_modules_are_served(page: Page) -> None:
     assert b"<title>congrasp" in page.ask("GET", "/")[1]
     assert page.ask("GET", "/static/picture.js")[0] == 200
     assert page.ask("GET", "/prefix/static/vendor/three.module.min.js")[0] == 200
@@ -347,7 +347,7 @@ def test_a_request_for_no_host_is_refused_on_every_interface(host: str) -> None:
         server.close()
 
 
-def test_hands_are_known_by_name_and_no_file_is_opened(page: Page, tmp_path: pathlib.Path) -> None:
+def test_a_hand_is_named_and_no_file_opened(page: Page, tmp_path: pathlib.Path) -> None:
     file = pathlib.Path(__file__).parents[2] / "hands" / "claw.json"
     assert b"skin_points" in page.ask("GET", "/api/hand?name=allegro")[1]
     assert b"skin_points" in page.ask("GET", "/api/hand?name=human")[1]

@@ -65,7 +65,7 @@ def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) ->
     np.testing.assert_allclose(turn @ grasp_frame(hand).heading, [0, 0, -1], atol=1e-4)
 
 
-def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: Studio) -> None:
+def test_the_brush_labels_points_and_requests_the_affordance(studio: Studio) -> None:
     center = MUG.points[0]
     studio.paint([center], 0.02, avoid=True)
     far = np.linalg.norm(MUG.points - center, axis=-1)
@@ -110,7 +110,7 @@ def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studi
     np.testing.assert_allclose(view["active"]["direction"], studio.arrow.direction, atol=1e-6)
 
 
-def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
+def test_the_arrow_has_the_depth_of_training_and_rolls(studio: Studio) -> None:
     studio.set_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross

@@ -115,7 +115,7 @@ def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> No
     assert window.view()["names"] == {}
 
 
-def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
+def test_a_follower_notices_the_learners_start_and_end() -> None:
     hub = MemoryHub()
     learner = MemoryTransport(hub)
     client = MemoryTransport(hub)

@@ -50,7 +50,7 @@ def silent(label, total):
     return lambda done: None
 
 
-def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
+def test_a_failed_or_hanging_training_does_not_stop_the_rest(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
     trainings = request(tmp_path, 3.0)
@@ -69,7 +69,7 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     assert not any("--resume" in child.arguments for child in started)
 
 
-def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
+def test_a_stopped_training_resumes_or_restarts_without_checkpoint(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}
     trainings = request(tmp_path, 20.0, "--updates", "9")

@@ -182,7 +182,7 @@ def test_a_configuration_that_cannot_run_leaves_no_run_behind(
 
 
 @pytest.mark.parametrize("existed", [False, True])
-def test_a_failed_start_removes_what_it_made(printed_lines, monkeypatch, tmp_path, existed):
+def test_a_failed_start_removes_its_files(printed_lines, monkeypatch, tmp_path, existed):
     run_dir = tmp_path / "new" / "run"
     if existed:
         run_dir.mkdir(parents=True)
@@ -243,7 +243,7 @@ def test_a_resume_while_a_learner_restarts_is_refused(printed_lines, monkeypatch
         command.run_training(changed, tmp_path, LAUNCH, resume=True, evaluation=0)
 
 
-def test_a_run_says_at_its_start_what_was_made_easier(printed_lines, monkeypatch, tmp_path):
+def test_easier_settings_are_printed_at_the_start(printed_lines, monkeypatch, tmp_path):
     def stop(*args, **options):
         raise KeyboardInterrupt
 

@@ -89,7 +89,7 @@ def request(hand, out, **changes):
     return dataclasses.replace(made_request, **changes)
 
 
-def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
+def test_existing_results_are_not_recomputed(stages, claw, tmp_path):
     ran, _ = stages
     notes = []
     policy = train_hand(request(claw, tmp_path / "out"), notes.append)
@@ -122,7 +122,7 @@ def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
     assert "no GPU" not in "\n".join(notes)
 
 
-def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, claw, tmp_path):
+def test_a_hand_that_fails_its_check_is_trained_only_on_request(stages, claw, tmp_path):
     ran, does = stages
     does["findings"] = BAD
     for _ in range(2):
@@ -194,9 +194,7 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.timeout(300)
 @pytest.mark.slow
-def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(
-    claw, monkeypatch, tmp_path
-):
+def test_a_killed_training_of_a_hand_resumes_to_its_policy(claw, monkeypatch, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / HAND).write_text(hand_text(claw))

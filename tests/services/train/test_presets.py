@@ -59,7 +59,7 @@ def test_the_full_task_is_that_of_the_hand_that_a_command_line_names(claw):
     assert get_preset("quickstart", "allegro") == dataclasses.replace(quick, task=task)
 
 
-def test_what_was_made_easier_is_said_and_nothing_else():
+def test_easier_settings_alone_are_listed():
     assert easier(get_preset("human")) == []
     words = easier(get_preset("quickstart"))
     assert {"hands approach from above only", "friction is soft"} <= set(words)
@@ -81,7 +81,7 @@ RULES = {
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_the_hands_of_the_package_have_what_the_rules_give(name):
+def test_hands_of_the_package_follow_the_rules(name):
     hand = get_hand(name)
     assert rules(hand) == RULES[name]
     assert fitting_scale(grasp_frame(hand).opening) == hand.object_scale

@@ -70,7 +70,7 @@ def supervise(tmp_path: pathlib.Path):
     assert all(child.process.poll() is not None for child in children)
 
 
-def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp_path):
+def test_all_ranks_restart_if_one_dies(supervise, tmp_path):
     writes = f"import pathlib; pathlib.Path({str(tmp_path)!r}, 'again').touch(); {WAITS}"
     waits_for_it = (
         f"import pathlib, time\nwhile not pathlib.Path({str(tmp_path)!r}, 'again').exists(): "
@@ -80,7 +80,7 @@ def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp
     assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
 
 
-def test_the_rank_that_failed_is_named_and_not_those_that_lost_it(supervise):
+def test_the_failed_rank_is_named(supervise):
     notes = supervise([LOST, "pass"], [FULL, "pass"])
     assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
 
@@ -93,7 +93,7 @@ def test_the_rank_that_failed_too_often_ends_the_run(supervise, monkeypatch):
         supervise([LOST], [FULL])
 
 
-def test_a_killed_rank_is_named_with_its_signal_and_each_life_with_its_own_words(supervise):
+def test_a_killed_rank_is_named_with_its_signal(supervise):
     """Two ranks that fail at the same time are both named, since their ends have no order."""
     killed = "import os; print('info: Update 3.', flush=True); os.kill(os.getpid(), 9)"
     silent = "import os, time; time.sleep(0.5); os._exit(1)"

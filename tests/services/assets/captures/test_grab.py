@@ -55,7 +55,7 @@ def write(case, root, wrist, *, labels=None, change=lambda data: None):
     )
 
 
-def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tmp_path, mano):
+def test_a_synthetic_grasp_is_recovered_with_the_subjects_template(run_import, tmp_path, mano):
     template = content()["v_template"] + np.array([0.003, -0.002, 0.004])
     folder = tmp_path / "tools" / "subject_meshes" / "male"
     folder.mkdir(parents=True)
@@ -72,7 +72,7 @@ def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tm
     assert not sets["box"].arrays["surface/avoid"].any()
 
 
-def test_without_a_mano_file_the_human_hands_bones_stand_in(run_import, tmp_path):
+def test_without_a_mano_file_the_human_hands_bones_are_used(run_import, tmp_path):
     case = known.make("box_lift_1", "box", 4)
     write(case, tmp_path, MEAN_WRIST)
     sets, _ = run_import("grab", tmp_path / "grab" / "s1" / "box_lift_1.npz")
@@ -91,7 +91,7 @@ def test_grabnet_names_the_grasping_frame(run_import, tmp_path):
     assert [row["frame"] for row in report.kept] == [70]
 
 
-def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
+def test_a_faulty_file_names_its_fault(run_import, tmp_path):
     case = known.make("box_lift", "box", 6)
 
     def variant(name, change, **options):

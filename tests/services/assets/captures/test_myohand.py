@@ -67,7 +67,7 @@ def test_the_arm_is_that_of_the_model():
         assert (turn * other.inv()).magnitude() < 1e-5
 
 
-def test_a_known_answer_comes_back(run_import, tmp_path):
+def test_a_synthetic_grasp_is_recovered(run_import, tmp_path):
     cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed) for seed in range(2)]
     for case in cases:
         write(case, tmp_path / "data" / f"{case.name}.npz")
@@ -84,9 +84,7 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
 
 @pytest.mark.parametrize("headings", ["sampled", "demonstrated"])
 @pytest.mark.slow
-def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(
-    run_import, tmp_path, headings
-):
+def test_a_fifth_of_all_sequences_is_held_out(run_import, tmp_path, headings):
     for seed, name in enumerate("abcde"):
         case = known.make(f"MyoHand_{name}_lift", name, seed)
         write(case, tmp_path / "data" / f"{case.name}.npz")
@@ -108,7 +106,7 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
         } == names
 
 
-def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
+def test_a_faulty_file_names_its_fault(run_import, tmp_path):
     case = known.make("MyoHand_box_lift", "box")
     folder = tmp_path / "data"
     right = write(case, folder / "MyoHand_box_right.npz")

@@ -12,7 +12,7 @@ from congrasp.services.assets.captures.grab import hand_template
 from congrasp.services.assets.captures.sequence import Dropped, Meshes
 
 
-def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folders(tmp_path):
+def test_names_in_data_sets_stay_inside_their_folders(tmp_path):
     (tmp_path / "x.obj").write_text("v 0 0 0\n")
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "y.obj").write_text("v 0 0 0\n")

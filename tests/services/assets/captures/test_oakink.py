@@ -103,7 +103,7 @@ def write_parts(case, root, border):
         (folder / f"part_{i}.json").write_text(json.dumps({"name": name, "attr": ["held_by_hand"]}))
 
 
-def test_a_known_answer_comes_back_with_its_affordance(run_import, tmp_path):
+def test_a_synthetic_grasp_is_recovered_with_its_affordance(run_import, tmp_path):
     case = known.make("A01001_0001_0000", "A01001", 9, tail=0.08)
     write(case, tmp_path)
     border = case.size[2] / 2 - 0.045
@@ -139,7 +139,7 @@ def test_one_camera_counts_and_frames_are_sorted(tmp_path):
     np.testing.assert_allclose(sequence.wrist_position, case.wrist_position[::2], atol=1e-6)
 
 
-def test_what_is_wrong_with_annotations_is_said(run_import, tmp_path):
+def test_faulty_annotations_name_their_fault(run_import, tmp_path):
     case = known.make("right", "A01001", 11)
 
     def variant(name, change):

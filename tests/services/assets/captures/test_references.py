@@ -145,7 +145,7 @@ def test_a_grasp_that_is_noticed_late_belongs_to_where_the_object_was_picked_up(
         (np.linspace(0.30, 0.10, 21), LIFT),  # another hand lifts it while this one comes
     ],
 )
-def test_an_object_that_this_hand_does_not_carry_leaves_the_frame_as_it_is(wrist, lift):
+def test_an_object_not_carried_by_the_hand_keeps_the_frame(wrist, lift):
     assert picked(wrist, lift) == 20
 
 
@@ -185,7 +185,7 @@ def straight(contact):
     )
 
 
-def test_what_is_wider_than_the_hand_opens_is_too_wide():
+def test_an_object_wider_than_the_hand_opens_is_dropped():
     opening = widest_gap(HUMAN)
     cross = np.asarray(grasp_frame(HUMAN).cross)
     fitting, wide = (straight(np.outer([0, share * opening], cross)) for share in (0.97, 1.03))
@@ -264,7 +264,7 @@ def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
 # --- sequences of which no episode is drawn ---
 
 
-def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
+def test_from_below_means_excluded_by_the_approach_alone():
     """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming
     down, up and up.
     """

@@ -50,7 +50,7 @@ def test_two_fingers_part_evenly():
     np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
 
 
-def test_where_one_may_not_go_the_other_does():
+def test_the_other_finger_moves_if_one_is_at_its_limit():
     """`a` cannot leave -0.38 rad, where its tip is at 2 cm - 5 cm sin(0.38) from the middle: `b`
     makes all the room.
     """
@@ -76,7 +76,7 @@ def test_followers_still_follow():
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
 @pytest.mark.slow
-def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
+def test_overlapping_poses_are_separated_within_limits(name):
     hand = get_hand(name)
     rng = np.random.default_rng(3)
     share = rng.uniform(0.0, 1.0, (12, 1))

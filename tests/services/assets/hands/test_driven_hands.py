@@ -69,7 +69,7 @@ def test_one_motor_moves_a_gripper_of_two_fingers():
     assert "capsules follow from inertias ('capsules' in the hand file): right_pad" in words
 
 
-def test_palm_and_thumb_are_found_on_an_arm_beside_a_door_without_names(driven):
+def test_palm_and_thumb_are_found_in_a_scene_without_names(driven):
     hand = driven.hand
     assert driven.palm == "base"
     assert hand.thumb == "side_end"
@@ -128,7 +128,7 @@ def test_a_left_hand_is_the_mirror_image(driven, tmp_path):
     np.testing.assert_allclose(ours.center, theirs.center * [1, -1, 1], atol=0.005)
 
 
-def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path, monkeypatch):
+def test_visual_meshes_of_a_file_are_stored_and_drawn(driven, tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     get_hand.cache_clear()
     path = tmp_path / "driven.json"
@@ -167,7 +167,7 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     assert load_meshes(path, driven.hand) == {}
 
 
-def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
+def test_a_hand_can_collide_by_the_shapes_of_its_file(driven):
     """Every geom of the file that collides is in the hand's model, where it is in the file, and the
     masses stay.
     """

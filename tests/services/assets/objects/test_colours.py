@@ -91,9 +91,7 @@ def test_files_without_colours_have_none(tmp_path):
         assert sample_colours([tmp_path / f"cube.{suffix}"], seed=0) is None
 
 
-def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
-    tmp_path, quick_import
-):
+def test_colours_of_an_imported_object_are_stored_and_drawn(tmp_path, quick_import):
     (source,) = find_sources(textured(tmp_path / "cube.glb"))
     obj = import_source(source, ImportOptions(scale=0.5, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is not None
@@ -134,9 +132,7 @@ def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):
     assert sample_colours([tmp_path / "cube.glb"], seed=0) is None
 
 
-def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(
-    tmp_path, quick_import
-):
+def test_invalid_texture_coordinates_cost_only_the_colours(tmp_path, quick_import):
     box = cube()
     box.visual = trimesh.visual.TextureVisuals(
         uv=np.full((36, 2), np.nan), image=Image.new("RGB", (4, 4), RED)

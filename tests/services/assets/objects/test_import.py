@@ -468,7 +468,7 @@ def _fallback(tree):
         ),
     ],
 )
-def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
+def test_a_file_that_announces_too_much_is_refused_unread(tmp_path, name, data, why):
     (tmp_path / name).write_bytes(data)
     message = limited(read_mesh, tmp_path / name)
     assert message.startswith(f"CongraspError: {tmp_path / name}"), message
@@ -481,7 +481,7 @@ def _inline(tree):
     )
 
 
-def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
+def test_a_scene_of_many_instances_is_read_in_bounded_memory(tmp_path):
     (tmp_path / "a.glb").write_bytes(_glb(_many))
     assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
 

@@ -114,7 +114,7 @@ def test_a_handle_of_one_sheet_is_kept(rows):
         (lambda mesh: mesh.apply_translation([1e5, -2e5, 3e5]), ""),
     ],
 )
-def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil, note):
+def test_repairable_meshes_are_solid(tmp_path, quick_import, spoil, note):
     spoil(ball()).export(tmp_path / "a.obj", digits=9)
     obj = one_object(
         tmp_path / "a.obj", ImportOptions(density=1000.0, cache_dir=str(tmp_path / "cache"))
@@ -129,7 +129,7 @@ def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.06)
 
 
-def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
+def test_a_mesh_rounded_by_single_precision_is_refused(tmp_path):
     ball().apply_translation([1e5, 0, 0]).export(tmp_path / "a.stl")
     with pytest.raises(
         CongraspError,

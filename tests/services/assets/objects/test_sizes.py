@@ -44,7 +44,7 @@ def test_numbers_at_their_limits_are_accepted() -> None:
         (300.0, "mm"),
     ],
 )
-def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(
+def test_the_unit_is_guessed_if_only_one_gives_a_hand_sized_object(
     longest: float, unit: str
 ) -> None:
     sides = (longest / 2, longest, longest / 3)
@@ -57,7 +57,7 @@ def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(
 
 
 @pytest.mark.parametrize("longest", [1e-4, 2e4])
-def test_what_is_for_no_hand_in_any_unit_is_refused(longest: float) -> None:
+def test_a_size_unsuited_in_every_unit_is_refused(longest: float) -> None:
     with pytest.raises(
         CongraspError,
         match=r"a\.stl is .* units long, which is not a size for a hand in any of the units",
@@ -65,7 +65,7 @@ def test_what_is_for_no_hand_in_any_unit_is_refused(longest: float) -> None:
         guessed_unit("a.stl", (longest, longest, longest))
 
 
-def test_the_size_in_every_unit_says_whether_a_hand_could_grasp_that() -> None:
+def test_sizes_in_every_unit_note_graspability() -> None:
     assert sizes_by_unit((6.0, 4.5, 9.0)) == {
         "m": ("6 x 4.5 x 9 m", False),
         "cm": ("6 x 4.5 x 9 cm", True),
@@ -97,7 +97,7 @@ def test_a_solid_weighs_its_volume():
     )
 
 
-def test_what_is_too_thick_for_its_material_weighs_its_wall():
+def test_an_object_too_thick_for_its_material_weighs_its_wall():
     ball = trimesh.creation.icosphere(4, radius=0.05)
     mass = weight(ball, "ceramic")
     assert mass.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
@@ -107,7 +107,7 @@ def test_what_is_too_thick_for_its_material_weighs_its_wall():
     assert weight(ball, "wood").mass == pytest.approx(640 * 4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
-def test_a_thin_shell_weighs_what_its_two_walls_enclose():
+def test_a_thin_shell_weighs_the_volume_between_its_walls():
     tube = trimesh.creation.annulus(0.037, 0.04, 0.1)
     assert weight(tube, "ceramic").mass == pytest.approx(
         2400 * np.pi * (0.04**2 - 0.037**2) * 0.1, rel=0.01

@@ -39,7 +39,7 @@ def find(cells, table, constraint, quantity=SUCCESS, hand="human", method="ours"
     ]
 
 
-def test_a_figure_stands_beside_the_papers_of_the_same_hand_method_and_source():
+def test_figures_are_matched_by_hand_method_and_source():
     heading = row(
         "heading",
         0.99,
@@ -99,7 +99,7 @@ def test_captured_rows_of_several_data_sets_each_have_a_cell():
     assert [(cell.data, cell.ours) for cell in table_cell] == [("grab", 0.8), ("oakink", 0.9)]
 
 
-def test_reasons_say_what_is_missing():
+def test_missing_rows_have_a_reason():
     absent = {PolicyKey("human", "graspxl"): "its training failed"}
     cells = compare([result("hands", row("heading", 0.9, 0.8, 0.95))], absent, ("human",))
     (graspxl,) = find(cells, "objects", "heading", method="graspxl", group="small")

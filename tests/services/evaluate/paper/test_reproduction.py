@@ -41,9 +41,7 @@ def policy(tmp_path_factory):
 
 @pytest.mark.timeout(600)
 @pytest.mark.slow
-def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
-    policy, tmp_path, capsys, monkeypatch
-):
+def test_a_reproduction_writes_its_files_once(policy, tmp_path, capsys, monkeypatch):
     command = [
         "--quick",
         "--hands",
