@@ -5,9 +5,6 @@ In the packages and in the tests:
 
 * `a, b = x, y` for independent values: one statement a value. A swap or a rotation (a name is read
   on the right and bound on the left) needs the tuple and passes.
-
-In the packages:
-
 * A comprehension inside a comprehension, and a comprehension with more than one `for`.
 
 In the tests:
@@ -171,7 +168,7 @@ def private_uses(tree: ast.Module) -> Iterator[Finding]:
 
 CHECKS = {
     **dict.fromkeys(PACKAGES, (packed_assignments, nested_comprehensions)),
-    TESTS: (packed_assignments, private_uses),
+    TESTS: (packed_assignments, nested_comprehensions, private_uses),
 }
 """Checks of the files in each folder."""
 

@@ -1,5 +1,6 @@
 """A learner's end, and small valid messages for it."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -37,8 +38,7 @@ def bundle(
     shapes = {"observation": (form.observation,), "value": ()}
     arrays = {
         f"{kind}/{name}": np.zeros(shape)
-        for kind, shape in shapes.items()
-        for name in ("mean", "m2")
+        for (kind, shape), name in itertools.product(shapes.items(), ("mean", "m2"))
     }
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     arrays["actor/w"] = np.full(parameters, version, np.float32)

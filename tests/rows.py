@@ -1,12 +1,15 @@
 """Rows of an evaluation that no evaluation made, for what shows and compares them."""
 
+import itertools
+
 from congrasp.services.evaluate.paper.figures import paper_row
 from congrasp.services.evaluate.scores import ERRORS, Row, RowDescription, summarise
 
+ALL_ERRORS = tuple(itertools.chain.from_iterable(ERRORS.values()))
+"""Names of the errors of all constraints."""
 FORCES = {
     f"{name}_{of}": 1.0
-    for name in ("link_force", "force_sum", "torque_share")
-    for of in ("mean", "p95")
+    for name, of in itertools.product(("link_force", "force_sum", "torque_share"), ("mean", "p95"))
 }
 FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
 
@@ -49,7 +52,7 @@ def row(  # noqa: PLR0913
         held_2s_low=None,
         held_2s_high=None,
         held_all=None,
-        errors={name: 0.0 for names in ERRORS.values() for name in names.values()} | (errors or {}),
+        errors=dict.fromkeys(ALL_ERRORS, 0.0) | (errors or {}),
         forces=FORCES,
         episode_return=0.0,
         links_at_removal=5.0,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -111,7 +112,7 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     return (
         state,
         surface,
-        Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch)),
+        Goal(values, active(*_all_blocks(), batch=batch)),
     )
 
 
@@ -129,7 +130,12 @@ def lone_scene(task: TaskConfig, *blocks: str, **goals: dict[str, np.ndarray]) -
 
 def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:
     """Which blocks are active: these, everywhere."""
-    return {block: np.full(batch, block in blocks) for c in CONSTRAINTS for block in c.blocks}
+    return {block: np.full(batch, block in blocks) for block in _all_blocks()}
+
+
+def _all_blocks():
+    """Names of the blocks of all constraints."""
+    return itertools.chain.from_iterable(constraint.blocks for constraint in CONSTRAINTS)
 
 
 def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:

@@ -3,6 +3,7 @@ inputs.
 """
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -125,7 +126,8 @@ def test_teacher_and_critic_see_the_true_state(running):
     assert "cloud" not in names
     assert rollout.teacher_observation.shape[-1] > size
     assert rollout.privileged.shape[-1] == sum(size for _, size in privileged.layout(HAND, TASK))
-    described = {field.name for block in observation.fields(HAND, TASK).values() for field in block}
+    fields = itertools.chain.from_iterable(observation.fields(HAND, TASK).values())
+    described = {field.name for field in fields}
     assert (
         not {"object_displacement", "object_rotation", "past object_position", "force"} & described
     )

@@ -444,7 +444,8 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
     data = mujoco.MjData(model)
     data.mocap_pos[model.body("table").mocapid[0]] = TABLE_AWAY
     wrist = [model.joint(joint) for joint in WRIST_JOINTS]
-    places, speeds = ([int(getattr(j, field)[0]) for j in wrist] for field in ("qposadr", "dofadr"))
+    places = [int(joint.qposadr[0]) for joint in wrist]
+    speeds = [int(joint.dofadr[0]) for joint in wrist]
     momentum = jnp.zeros((1, 6))
     u = np.zeros((1, 6))
     v = np.zeros((1, 6))

@@ -1,6 +1,7 @@
 """Episodes: sampling, protocol, success, and rollouts that continue."""
 
 import dataclasses
+import itertools
 import re
 
 import jax
@@ -457,18 +458,18 @@ def test_programs_stay_small(name, most):
             jax.random.key_data(key),
         ),
     }
-    counted = _equations(jax.make_jaxpr(getattr(programs, f"_{name}"))(*arguments[name]).jaxpr)
+    counted = _equations(jax.make_jaxpr(getattr(programs, name))(*arguments[name]).jaxpr)
     assert 0.6 * most < counted <= most, counted
     worker.physics.close()
 
 
 def _equations(program) -> int:
     """Equations of a jaxpr and of those within it."""
-    inner = [
-        [part for value in equation.params.values() for part in _programs_in(value)]
-        for equation in program.eqns
-    ]
-    return sum(sum(map(_equations, parts)) if parts else 1 for parts in inner)
+    count = 0
+    for equation in program.eqns:
+        inner = list(itertools.chain(*map(_programs_in, equation.params.values())))
+        count += sum(map(_equations, inner)) if inner else 1
+    return count
 
 
 def _programs_in(value):

@@ -111,10 +111,8 @@ def test_servos_follow_the_target_of_so_many_steps_ago(late):
 
 def test_a_teacher_sees_all_beside_a_student(late):
     _, rollout = late
-    sizes = [
-        sum(size for _, size in layout)
-        for layout in (observation.layout(HAND, TASK), full_layout(TASK))
-    ]
+    layouts = (observation.layout(HAND, TASK), full_layout(TASK))
+    sizes = [sum(dict(layout).values()) for layout in layouts]
     assert [
         rollout.observation.shape[-1],
         rollout.teacher_observation.shape[-1] - extra(HAND),

@@ -122,10 +122,10 @@ def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path, sets):
     allowed = mug["heading/allowed"] & mug["heading/training"][:, None]
     save(Message({**mug, "heading/allowed": allowed}, sets[MUG.name].meta), tmp_path)
     save(sets[BOX.name], tmp_path)
-    left = {
-        split: [obj.name for obj in load_for(tmp_path, [MUG, BOX], split)[0]]
-        for split in get_args(Split)
-    }
+    left = {}
+    for split in get_args(Split):
+        objects, _ = load_for(tmp_path, [MUG, BOX], split)
+        left[split] = [obj.name for obj in objects]
     every = [MUG.name, BOX.name]
     assert left == {"all": every, "training": every, "held-out": every[1:]}
 

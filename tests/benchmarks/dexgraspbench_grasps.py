@@ -188,9 +188,8 @@ def convex_object(motion: Episode) -> GraspObject:
     bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
     if len(bodies) > MAX_MESH_PIECES:
         bodies = [trimesh.Trimesh(*shape)]
-    pieces = [
-        piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))
-    ]
+    most = max(1, MAX_MESH_PIECES // len(bodies))
+    pieces = list(itertools.chain.from_iterable(_pieces(body, most) for body in bodies))
     if not pieces:
         raise CongraspError(
             f"The mesh of '{motion.object}' has no volume.", "Generate the motion again."
@@ -258,8 +257,7 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
         mujoco.mj_kinematics(model, data)
         gap = min(
             mujoco.mj_geomDistance(model, data, a, b, 2 * CLEARANCE, None)
-            for a in theirs
-            for b in geoms
+            for a, b in itertools.product(theirs, geoms)
         )
         if gap > farthest:
             best = t

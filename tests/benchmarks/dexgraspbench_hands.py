@@ -69,11 +69,12 @@ class BenchmarkHand:
     @property
     def joints(self) -> tuple[str, ...]:
         """F names."""
-        return tuple(
-            f"{finger}{len(rows) - i if self.from_tip else i}"
-            for finger, rows in self.fingers.items()
-            for i in range(len(rows))
-        )
+        names = []
+        for finger, rows in self.fingers.items():
+            for i in range(len(rows)):
+                number = len(rows) - i if self.from_tip else i
+                names.append(f"{finger}{number}")
+        return tuple(names)
 
     @property
     def rows(self) -> np.ndarray:

@@ -78,9 +78,11 @@ def replayed(
 
 def summary(replays: Sequence[Replayed]) -> str:
     """Summary of replayed grasps in one line."""
-    held, closed = (
-        100 * np.mean([getattr(one, f"from_{start}") for one in replays]) for start in STARTS
-    )
+
+    def share(start: str) -> float:
+        return 100 * float(np.mean([getattr(replay, f"from_{start}") for replay in replays]))
+
+    held, closed = map(share, STARTS)
     depth, self_depth, pushed = np.array(
         [(one.depth_mm, one.self_mm, one.pushed_mm) for one in replays]
     ).T

@@ -82,9 +82,10 @@ def measures(
     workers = [worker(lambda scene, index, data: None), worker(plausibility.sample)]
     for one in workers:
         run(one)
-    timed = np.array(
-        [[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)]
-    )
+    rounds = []
+    for _ in range(repeats):
+        rounds.append([_timed(functools.partial(run, one)) for one in workers])
+    timed = np.array(rounds)
     table = Table(
         title=f"{physics}: {environments} episodes of {steps} control steps, medians of {repeats}"
     )

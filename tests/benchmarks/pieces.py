@@ -3,6 +3,7 @@ in shape.
 """
 
 import dataclasses
+import itertools
 import pathlib
 import time
 
@@ -71,12 +72,17 @@ def pieces(
     """
     loaded = objects_of(objects)
     task = TaskConfig(hand=hand)
-    budgets = [(p, v) for p in counts for v in vertices]
-    variants = [[coarser(obj, p, v) for obj in loaded] for p, v in budgets]
-    held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
-    seconds = np.array(
-        [[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)]
-    )
+    budgets = list(itertools.product(counts, vertices))
+    variants = []
+    scenes = []
+    for count, limit in budgets:
+        objects_of_budget = [coarser(obj, count, limit) for obj in loaded]
+        variants.append(objects_of_budget)
+        scenes.append([_closed_around(get_hand(hand), task, obj) for obj in objects_of_budget])
+    rounds = []
+    for _ in range(repeats):
+        rounds.append([_timed(*scene, task) for scene in itertools.chain(*scenes)])
+    seconds = np.array(rounds).reshape(repeats, len(budgets), len(loaded))
     per_step = np.median(seconds, axis=0).sum(-1) / (len(loaded) * _STEPS * task.substeps)
     table = Table(title=f"{len(loaded)} objects, {hand} hand, {repeats} repeats")
     for column in (
@@ -91,7 +97,7 @@ def pieces(
         table.add_column(column, justify="right")
     for i, (p, v) in enumerate(budgets):
         used = np.mean([len(obj.pieces) for obj in variants[i]])
-        contacts = np.mean([data.ncon for _, data in held[i]])
+        contacts = np.mean([data.ncon for _, data in scenes[i]])
         error = np.mean([_error(obj) for obj in variants[i]])
         cost = [f"{1 / per_step[i]:,.0f}", f"{per_step[0] / per_step[i]:.2f}"]
         table.add_row(

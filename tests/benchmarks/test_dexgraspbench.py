@@ -3,6 +3,7 @@ are examined.
 """
 
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -81,8 +82,7 @@ PHALANX = [
 ]
 BOXES = {
     f"{name}j{i}": (size, (0, 0, size[2]))
-    for name in ("ff", "mf", "rf")
-    for i, size in enumerate(PHALANX)
+    for name, (i, size) in itertools.product(("ff", "mf", "rf"), enumerate(PHALANX))
 } | {
     "thj0": ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
     "thj1": ((0.0098, 0.01375, 0.00885), (0, 0, 0.00885)),
@@ -263,10 +263,13 @@ def test_a_shadow_hand_is_recognised_by_its_kinematics(motion):
     """A file that has its palm elsewhere, fingers in another order under other names, and joints
     that turn back.
     """
-    turned = [
-        [(f"x{n}", p, q, tuple(-x for x in axis)) for n, p, q, axis in finger]
-        for finger in SHADOW[::-1]
-    ]
+    turned = []
+    for finger in SHADOW[::-1]:
+        joints = []
+        for name, position, quaternion, axis in finger:
+            opposite = tuple(-x for x in axis)
+            joints.append((f"x{name}", position, quaternion, opposite))
+        turned.append(joints)
     renamed = mujoco.MjModel.from_xml_string(
         benchmark_model(turned, "pos='0.01 0.02 0.03' quat='1 1 0 0'", root=False)
     )

@@ -98,7 +98,9 @@ def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
         _through_queries,
         _through_sockets,
     )
-    rates = [[way(senders, seconds) for way in ways] for _ in range(repeats)]
+    rates = []
+    for _ in range(repeats):
+        rates.append([way(senders, seconds) for way in ways])
     return [statistics.median(each) for each in zip(*rates, strict=True)]
 
 

@@ -2,6 +2,7 @@
 tests.cases.make`.
 """
 
+import itertools
 import json
 import pathlib
 import re
@@ -110,10 +111,11 @@ def archive(*names: str) -> bytes:
 def ply(header: str, rows: np.ndarray) -> bytes:
     """A PLY file of points."""
     names = "".join(f"property float {name}\n" for name in header.split())
-    return (
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n".encode()
-        + "\n".join(" ".join(f"{x:.3f}" for x in row) for row in rows).encode()
-    )
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
+    lines = []
+    for row in rows:
+        lines.append(" ".join(f"{x:.3f}" for x in row))
+    return (header + "\n".join(lines)).encode()
 
 
 def collada(mesh: trimesh.Trimesh) -> bytes:
@@ -199,8 +201,7 @@ def main() -> None:
         "archive_zip/part.stl": archive("models/mug.obj", "licence.txt"),
         **{
             f"{case}/{folder}/mug.stl": box
-            for case in ("sets_of_one_name", "equal_names")
-            for folder in "ab"
+            for case, folder in itertools.product(("sets_of_one_name", "equal_names"), "ab")
         },
         "names/碗.stl": box,
         "names/कटोरी.stl": box,

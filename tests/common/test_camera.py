@@ -4,6 +4,7 @@ the object's pose.
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,8 @@ def cube():
     grid = np.linspace(-0.029, 0.029, 8)
     a, b = (axis.ravel() for axis in np.meshgrid(grid, grid))
     faces = [
-        np.insert(np.stack([a, b], 1), axis, side, 1) for axis in range(3) for side in (-0.03, 0.03)
+        np.insert(np.stack([a, b], 1), axis, side, 1)
+        for axis, side in itertools.product(range(3), (-0.03, 0.03))
     ]
     return jnp.asarray(np.concatenate(faces)[None], jnp.float32)
 

@@ -62,7 +62,7 @@ def full_scene():
 
 def _without(full_scene, constraint):
     """The scene with this constraint's blocks inactive."""
-    others = (block for other in OPTIONAL if other is not constraint for block in other.blocks)
+    others = itertools.chain(*(other.blocks for other in OPTIONAL if other is not constraint))
     return full_scene._replace(goal=dataclasses.replace(full_scene.goal, active=active(*others)))
 
 
@@ -80,25 +80,25 @@ def test_block_sizes_equal_the_sum_of_their_fields(constraint, full_scene):
 
 
 def test_names_are_unique_over_all_constraints():
-    arrays = [
-        f"{constraint.name}_{name}" for constraint in CONSTRAINTS for name in constraint.arrays
-    ]
-    errors = [error for constraint in CONSTRAINTS for error in constraint.errors]
+    arrays = []
+    errors = []
+    weights = []
+    block_names = []
+    options = []
+    for constraint in CONSTRAINTS:
+        arrays += [f"{constraint.name}_{name}" for name in constraint.arrays]
+        errors += constraint.errors
+        weights += [weight.name for weight in constraint.weights]
+        block_names += constraint.blocks or (constraint.name,)
+        options += [option.name for option in constraint.options]
     groups = {
         "constraints": NAMES,
         "goal arrays": arrays,
         "errors": [error.name for error in errors],
         "columns": [error.column or error.name for error in errors],
-        "weights": [
-            *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
-            *(term.name for term in GRASP),
-        ],
-        "blocks": [
-            "state",
-            *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)),
-            "mask",
-        ],
-        "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
+        "weights": [*weights, *(term.name for term in GRASP)],
+        "blocks": ["state", *block_names, "mask"],
+        "options": options,
     }
     for group, names in groups.items():
         twice = [name for name, count in Counter(names).items() if count > 1]
@@ -198,9 +198,10 @@ def test_neutral_arrays_match_declarations(constraint, hand, sizes):
 @each
 def test_names_that_it_gives_are_there(constraint):
     weaker = CONSTRAINTS[: NAMES.index(constraint.name)]
-    assert set(constraint.overrides) <= {
-        name for other in weaker for name in (other.name, *other.blocks)
-    }
+    overridable = set()
+    for other in weaker:
+        overridable |= {other.name, *other.blocks}
+    assert set(constraint.overrides) <= overridable
     assert set(constraint.overridden_by) <= {*NAMES} - {constraint.name}
     assert {relation.weaker for relation in constraint.relations} <= {
         other.name for other in weaker
@@ -273,7 +274,8 @@ def test_task_ignores_unsupported_constraints():
     """A choice of fingers and a limit of the force: f_max stays a number."""
     task = TaskConfig(constraints=PAPER)
     state, surface, goal = scene(5)
-    flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
+    known_blocks = itertools.chain(*(get_constraint(name).blocks for name in PAPER))
+    flags = {block: goal.active[block] for block in known_blocks}
     known_alone = Goal({name: goal[name] for name in PAPER}, flags)
     some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
     np.testing.assert_array_equal(
@@ -302,7 +304,10 @@ def test_requests_fill_the_arrays_that_they_give():
     np.testing.assert_array_equal(goal["fingers"].allowed, [True, False, True, False, False])
     assert goal["fingers"].allowed.dtype == bool
     assert goal["heading"].direction.dtype == np.float32
-    assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
+    names = set()
+    for constraint in CONSTRAINTS:
+        names |= {f"{constraint.name}_{name}" for name in constraint.arrays}
+    assert set(goal.flat()) == names
 
 
 def test_active_blocks():

@@ -84,7 +84,7 @@ def test_joint_limits_torques_and_masses_are_the_makers():
     assert len(sharpa.joints) == 22
     assert sum(link.mass for link in allegro.links) == pytest.approx(0.955, abs=1e-3)
     assert sum(link.mass for link in sharpa.links) == pytest.approx(1.246, abs=1e-3)
-    joints = {joint.name: joint for hand in (allegro, sharpa) for joint in hand.joints}
+    joints = {joint.name: joint for joint in (*allegro.joints, *sharpa.joints)}
     expected = {
         "thumb_0": (0.263, 1.396, 0.7),
         "thumb_1": (-0.105, 1.163, 0.7),

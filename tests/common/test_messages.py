@@ -1,6 +1,7 @@
 """What messages must hold."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -194,8 +195,9 @@ def test_every_half_is_looked_at(value, at):
 def bundle(**arrays):
     statistics = {
         f"{kind}/{name}": np.zeros(shape)
-        for kind, shape in (("observation", 5), ("value", ()))
-        for name in ("mean", "m2")
+        for (kind, shape), name in itertools.product(
+            (("observation", 5), ("value", ())), ("mean", "m2")
+        )
     }
     counts = {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     weights = {

@@ -150,7 +150,7 @@ def test_seed_and_family_decide_the_object(seed, family):
 
 def test_no_two_of_many_are_alike():
     many = generate_many(48, 10)
-    volumes = [sum(shapes.volume(piece) for piece in obj.pieces) for obj in many]
+    volumes = [sum(map(shapes.volume, obj.pieces)) for obj in many]
     assert len(np.unique(np.round(volumes, 12))) == 48
     assert len({obj.name for obj in many}) == 48
     assert {obj.family for obj in many} == set(BASIC_FAMILIES)
@@ -206,7 +206,9 @@ def test_unknown_families_and_negative_seeds_are_named():
 
 def test_actors_have_objects_of_their_own():
     config = ObjectsConfig(count=2, seed=3, families=("box",))
-    pools = [[obj.name for obj in load_pool(config, shift)] for shift in (0, 1)]
+    pools = []
+    for shift in (0, 1):
+        pools.append([obj.name for obj in load_pool(config, shift)])
     assert pools == [["box_3", "box_4"], ["box_5", "box_6"]]
 
 

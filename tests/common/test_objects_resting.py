@@ -1,6 +1,7 @@
 """Resting poses against solid angles worked out by hand, and what keeps round objects still."""
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -70,7 +71,9 @@ def test_a_face_beside_which_the_centre_of_mass_falls_is_no_resting_pose():
     # An oblique prism that leans over by more than its foot: it cannot stand on it.
     foot = np.array([[-0.01, -0.01], [0.01, -0.01], [0.01, 0.01], [-0.01, 0.01]])
     lean = np.array([0.03, 0.0])
-    vertices = np.array([[*(xy + side * lean), side * 0.04] for side in (-1, 1) for xy in foot])
+    vertices = np.array(
+        [[*(xy + side * lean), side * 0.04] for side, xy in itertools.product((-1, 1), foot)]
+    )
     poses, likelihood = quasi_static_poses((Piece("mesh", (0, 0, 0), vertices=vertices),))
     down = np.array([-shapes.matrix(pose[3:])[2] for pose in poses])
     assert (np.abs(down[:, 2]) < 0.99).all()

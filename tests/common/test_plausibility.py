@@ -4,6 +4,7 @@ simple motions.
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import mujoco
@@ -141,7 +142,7 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     blade = procedural.generate(1, "box")
     plate = Piece("box", (0.06, 0.001, 0.06))
     vertices = np.array(
-        [[x, y, z] for x in (-0.06, 0.06) for y in (-0.001, 0.001) for z in (-0.06, 0.06)],
+        list(itertools.product((-0.06, 0.06), (-0.001, 0.001), (-0.06, 0.06))),
         np.float32,
     )
     blade = type(blade)(**{**blade.__dict__, "pieces": (plate,), "visual_vertices": vertices})

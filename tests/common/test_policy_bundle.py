@@ -288,11 +288,9 @@ def test_a_policy_that_observes_less_begins_with_the_same_actions():
     normals = TaskConfig(surface_normals=True)
     spec, wider = (bundles.policy_spec(task, sizes) for task in (plain, normals))
     rng = np.random.default_rng(2)
-    names = [
-        field.name
-        for field in fields(get_hand("human"), normals)["state"]
-        for _ in range(field.size)
-    ]
+    names = []
+    for field in fields(get_hand("human"), normals)["state"]:
+        names += [field.name] * field.size
     is_observed = np.ones(sum(size for _, size in wider.layout), bool)
     is_observed[: len(names)] = [name not in ("normal", "height") for name in names]
     count = 1e9

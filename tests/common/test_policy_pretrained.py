@@ -1,6 +1,7 @@
 """Policies that come with the package."""
 
 import dataclasses
+import itertools
 import pathlib
 import tomllib
 
@@ -85,8 +86,9 @@ def test_shipped_policies_are_installed_and_load():
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
     assert {path.stem for path in module.FOLDER.glob("*.safetensors")} == {
         f"{hand}{kind}"
-        for hand in pretrained_hands()
-        for kind in ("", "-reference", "-student", "-camera")
+        for hand, kind in itertools.product(
+            pretrained_hands(), ("", "-reference", "-student", "-camera")
+        )
     }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand

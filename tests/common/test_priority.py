@@ -184,9 +184,8 @@ def test_redirection_ends_where_a_hand_closes():
     """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the
     most.
     """
-    wide, narrow = (
-        [[x, y, 0] for y in np.linspace(-half, half, 15)] for x, half in ((0.0, 0.07), (0.1, 0.03))
-    )
+    wide = [[0.0, y, 0] for y in np.linspace(-0.07, 0.07, 15)]
+    narrow = [[0.1, y, 0] for y in np.linspace(-0.03, 0.03, 15)]
     heading = _redirected([*wide, *narrow], [[-0.1, 0, 0]], [0, 0, -1], [0, 1, 0])
     np.testing.assert_allclose(heading.position[[0, 2]], [0.1, -0.02], atol=1e-6)
 

@@ -2,6 +2,7 @@
 understands.
 """
 
+import itertools
 import json
 import pathlib
 import re
@@ -29,12 +30,11 @@ VERSIONS = ("1.29", "1.37")  # of Kubernetes: the oldest and the newest
 
 def manifests(text=None):
     files = [text] if text else [path.read_text() for path in KUBERNETES.glob("*.yaml")]
-    documents = [
-        document
-        for file in files
-        for document in yaml.safe_load_all(file)
-        if "apiVersion" in document
-    ]
+    documents = []
+    for file in files:
+        for document in yaml.safe_load_all(file):
+            if "apiVersion" in document:
+                documents.append(document)
     return [
         document for document in documents if not document["apiVersion"].startswith("kustomize")
     ]
@@ -69,11 +69,8 @@ def kubernetes_commands():
 def unit_commands():
     for unit in UNITS:
         text = unit.read_text().replace("\\\n", "")
-        values = dict(
-            pair.split("=", 1)
-            for line in re.findall("^Environment=(.*)", text, re.M)
-            for pair in line.split()
-        )
+        pairs = " ".join(re.findall("^Environment=(.*)", text, re.M)).split()
+        values = dict(pair.split("=", 1) for pair in pairs)
         command = re.search("^ExecStart=(.*)", text, re.M)[1]
         for name, value in values.items():
             command = command.replace(f"${{{name}}}", value).replace(f"${name}", value)
@@ -344,10 +341,12 @@ def test_every_expression_names_metrics_that_are_exposed():
     with exposed(port, "127.0.0.1", learner, actor, server):
         metrics = scrape(port)
     names = {name for name, *_ in metrics}
-    labels = {label for _, *rest in metrics for label in rest}
-    expressions = [
-        target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])
-    ]
+    labels = set()
+    for _, *of_metric in metrics:
+        labels.update(of_metric)
+    expressions = []
+    for panel in DASHBOARD["panels"]:
+        expressions += [target["expr"] for target in panel.get("targets", [])]
     assert len(expressions) > 20
     for expression in expressions:
         bare = re.sub(r"\{[^}]*\}|\[[^]]*\]", "", expression)
@@ -366,11 +365,9 @@ def test_the_panels_do_not_overlap():
     taken = set()
     for panel in DASHBOARD["panels"]:
         at = panel["gridPos"]
-        cells = {
-            (x, y)
-            for x in range(at["x"], at["x"] + at["w"])
-            for y in range(at["y"], at["y"] + at["h"])
-        }
+        columns = range(at["x"], at["x"] + at["w"])
+        rows = range(at["y"], at["y"] + at["h"])
+        cells = set(itertools.product(columns, rows))
         assert not cells & taken
         assert max(x for x, _ in cells) < 24
         taken |= cells

@@ -4,6 +4,7 @@ run.
 
 import importlib
 import inspect
+import itertools
 import os
 import pathlib
 import re
@@ -161,7 +162,8 @@ def test_the_commands_of_the_tutorials_run(tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     pages = [ROOT / "docs" / "tutorials" / f"{name}.md" for name in ("my-object", "constraints")]
-    lines = "".join(text for page in pages for text in blocks(page, "sh")).splitlines()
+    text = "".join(itertools.chain.from_iterable(blocks(page, "sh") for page in pages))
+    lines = text.splitlines()
     assert len(lines) == 4
     for line in lines:
         program, *arguments = shlex.split(line, comments=True)
@@ -188,7 +190,8 @@ def test_the_loop_of_the_robots_page_runs_as_printed_with_numpy_and_zenoh_alone(
 
 def example_lines():
     pages = (ROOT / "docs" / name for name in ("robots.md", "ros2.md"))
-    text = "".join(block for page in pages for block in blocks(page, "sh")).replace("\\\n", " ")
+    text = "".join(itertools.chain.from_iterable(blocks(page, "sh") for page in pages))
+    text = text.replace("\\\n", " ")
     return [line for line in text.splitlines() if line.startswith("python examples/")]
 
 

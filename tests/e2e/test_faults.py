@@ -5,6 +5,7 @@ Every test ends with the audit of `Cluster.stop`: nothing that was accepted is l
 corrupted, and nothing was learnt from that is older than the cap.
 """
 
+import itertools
 import random
 import signal
 import time
@@ -30,7 +31,7 @@ def actors(status):
 def taken_up(folder):
     """Rollouts that sessions of the learner took up from those before them."""
     lines = read_journal(folder / AUDIT / "learner-0.jsonl").intact
-    return [tuple(rollout) for line in lines for rollout in line.get("taken", ())]
+    return list(map(tuple, itertools.chain(*(line.get("taken", ()) for line in lines))))
 
 
 def stop_with_rollouts(cluster, learner):

@@ -37,7 +37,7 @@ def rollout(number, bundle):
     """The same whatever policy is asked for it."""
     rng = np.random.default_rng(number)
     meta = bundle.meta
-    sizes = (sum(width for _, width in meta[name]) for name in ("layout", "privileged"))
+    sizes = (sum(dict(meta[name]).values()) for name in ("layout", "privileged"))
     arrays = random_steps(rng, STEPS, WORLDS, *sizes) | {
         "action": rng.normal(size=(STEPS, WORLDS, meta["action_size"])).astype(np.float32),
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),

@@ -51,10 +51,12 @@ def batch(run, seed, worlds=WORLDS):
     can learn from.
     """
     rng = np.random.default_rng(seed)
-    student_seen, teacher_seen = (
-        sum(size for _, size in policy_spec(task, NETWORK).layout)
-        for task in (run.task, dataclasses.replace(run.task, observation="full"))
-    )
+
+    def observation_size(task):
+        return sum(size for _, size in policy_spec(task, NETWORK).layout)
+
+    student_seen = observation_size(run.task)
+    teacher_seen = observation_size(dataclasses.replace(run.task, observation="full"))
     seen = rng.normal(size=(STEPS, worlds, max(student_seen, teacher_seen))).astype(np.float32)
     # One for all: it can be learnt
     mean = np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)

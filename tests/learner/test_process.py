@@ -1,5 +1,6 @@
 """The learner process with actors that act with its bundles on made-up observations."""
 
+import collections
 import contextlib
 import dataclasses
 import threading
@@ -96,10 +97,9 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     ).resolve().name == "checkpoint_000000003.safetensors"
 
     received = list(iter(lambda: logs.receive(0.0), None))
-    kinds = {
-        kind: [m.meta for k, m in received if k.split("/")[3] == kind]
-        for kind in ("metrics", "version", "event")
-    }
+    kinds = collections.defaultdict(list)
+    for key, message in received:
+        kinds[key.split("/")[3]].append(message.meta)
     assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
     values = kinds["metrics"][-1]["values"]

@@ -268,13 +268,15 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     job.start(saved + 3, "resume")
     first, second = job.finish()
     steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
-    (said,), (other,) = (
-        [line.split()[1:] for line in text.splitlines() if "bundle" in line]
-        for text in (first, second)
-    )
+
+    def bundle(text):
+        (line,) = [line for line in text.splitlines() if "bundle" in line]
+        return line.split()[1:]
+
+    of_rank_0 = bundle(first)
     # Weights, normalisers and versions, bit for bit, though the rollouts were not the same
-    assert said == other
-    assert int(said[1]) == steps * (saved + 3)
+    assert of_rank_0 == bundle(second)
+    assert int(of_rank_0[1]) == steps * (saved + 3)
 
     job.start(saved + 5, "resume", count=1)
     (alone,) = job.finish()

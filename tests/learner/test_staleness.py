@@ -1,5 +1,6 @@
 """Admission: the bound holds, capacity returns, and every rollout is accounted for."""
 
+import itertools
 import math
 import statistics
 
@@ -25,7 +26,7 @@ def test_tickets_worked_out_by_hand():
     """
     staleness = manager()
     assert staleness.capacity == 4
-    assert all(staleness.grant(owner, i) for owner in (A, B) for i in "xy")
+    assert all(staleness.grant(owner, i) for owner, i in itertools.product((A, B), "xy"))
     assert staleness.grant(("c", "1"), "z") is None
     for owner in (A, B):
         assert staleness.arrive(owner, "x", 0) == "accepted"

@@ -13,12 +13,11 @@ def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Messag
 
 
 def figures(*batches: list[Message]) -> dict[str, float]:
-    return overall(
-        [
-            summary(messages, [9 - int(message.meta["version"]) for message in messages])
-            for messages in batches
-        ]
-    )
+    summaries = []
+    for messages in batches:
+        lags = [9 - int(message.meta["version"]) for message in messages]
+        summaries.append(summary(messages, lags))
+    return overall(summaries)
 
 
 def episode_means(messages: list[Message]) -> dict[str, float]:

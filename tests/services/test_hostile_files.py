@@ -3,6 +3,7 @@ memory and time.
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import pathlib
@@ -168,7 +169,7 @@ def test_letters_of_any_script_stay_in_names_and_equal_names_become_distinct():
     ):
         assert safe_name(text) == name
         file_name(name, "an object")
-    long = [safe_name(letter * 150 + end) for letter in "x碗" for end in "ab"]
+    long = [safe_name(letter * 150 + end) for letter, end in itertools.product("x碗", "ab")]
     assert len({file_name(name, "an object") for name in long}) == 4
     assert distinct_names(["mug", "Mug", "mug", "mug-2", "cup"]) == [
         "mug",

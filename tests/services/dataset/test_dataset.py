@@ -103,7 +103,10 @@ def columns(dataset) -> dict[str, np.ndarray]:
     """Its grasps."""
     batches = [dict(batch) for batch in loader()(dataset, size=3)]
     assert max(len(batch["q"]) for batch in batches) <= 3
-    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    columns = {}
+    for name in batches[0]:
+        columns[name] = np.concatenate([batch[name] for batch in batches])
+    return columns
 
 
 @pytest.mark.slow

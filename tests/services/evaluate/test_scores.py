@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import json
 
 import numpy as np
@@ -246,7 +247,7 @@ def test_objects_are_grouped_by_terciles_and_family():
 
 
 def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
-    names = dict.fromkeys(name for names in TABLES.values() for name in names)
+    names = dict.fromkeys(itertools.chain.from_iterable(TABLES.values()))
     objects = list("abcdefgh")
     rows = [
         summarised(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects)
@@ -270,8 +271,7 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
 def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
     rows = [
         made_row(name, 0.9, 0.8, 0.95, method=method)
-        for method in ("ours", "pd")
-        for name in ("heading", "pose")
+        for method, name in itertools.product(("ours", "pd"), ("heading", "pose"))
     ]
     rates, *_ = tables_of(rows, "title", [("human", "graspxl", "not trained")])
     assert rates.columns[:3] == ["constraint", "hand", "method"]

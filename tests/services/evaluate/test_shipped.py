@@ -58,7 +58,8 @@ def test_a_shipped_policy_is_as_good_as_its_figures(hand):
     pool = exam_pool("development", EPISODES)
     hold = policy.task.hold_steps
     experiment = Experiment(policy, pool, episodes=EPISODES, hold=hold)
-    for row in (result.row for result in experiment.run([Variation(name) for name in names])):
+    results = experiment.run([Variation(name) for name in names])
+    for row in (result.row for result in results):
         record = recorded_rows[row.constraint]
         assert row.success >= farthest(record.success, row.covered, record.independent), (
             row.constraint

@@ -122,17 +122,13 @@ def test_sensing_levels_match_their_labels(bank):
     np.testing.assert_allclose(episodes["friction 0.5"].reset_state.friction, 0.5)
     np.testing.assert_allclose(episodes["gains -20 %"].reset_state.gain_scale, 0.8)
     for level in SENSING[2:]:
-        changed = [
-            name
-            for part in ("sensors", "reset_state")
-            for name, a, b in zip(
-                getattr(nominal, part)._fields,
-                getattr(nominal, part),
-                getattr(episodes[level.label], part),
-                strict=True,
-            )
-            if not np.array_equal(a, b)
-        ]
+        changed = []
+        for part in ("sensors", "reset_state"):
+            before = getattr(nominal, part)
+            after = getattr(episodes[level.label], part)
+            for name, a, b in zip(before._fields, before, after, strict=True):
+                if not np.array_equal(a, b):
+                    changed.append(name)
         assert len(changed) == (
             2 if "noise" in level.label or "6\N{DEGREE SIGN}" in level.label else 1
         ), level.label

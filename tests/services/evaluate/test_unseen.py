@@ -4,6 +4,7 @@ goes on.
 
 import contextlib
 import dataclasses
+import itertools
 import types
 
 import numpy as np
@@ -203,5 +204,5 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
     objects = [make().objects for make in pools.make]
     assert pools.size == 2
     assert [len(pool) for pool in objects] == [2, 2, 2]
-    names = [obj.name for pool in objects for obj in pool]
+    names = [obj.name for obj in itertools.chain(*objects)]
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, FAMILIES)]

@@ -1,5 +1,6 @@
 """A layout shows what is in the recording."""
 
+import itertools
 import json
 import pathlib
 from typing import Any
@@ -27,7 +28,7 @@ def record(folder: pathlib.Path, *messages: tuple[str, Message]) -> pathlib.Path
 def panels(content: dict[str, Any]) -> list[dict[str, Any]]:
     if content["type"] == "panel":
         return [content]
-    return [panel for item in content["items"] for panel in panels(item["content"])]
+    return list(itertools.chain(*(panels(item["content"]) for item in content["items"])))
 
 
 def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib.Path) -> None:

@@ -511,10 +511,8 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
     )
     assert np.abs(first - second).mean() < 2  # the same motion twice
     rows = pq.read_table(path / "meta" / "episodes").to_pylist()
-    spans = [
-        [row[f"videos/observation.images.front/{end}_timestamp"] for end in ("from", "to")]
-        for row in rows
-    ]
+    video = "videos/observation.images.front"
+    spans = [[row[f"{video}/from_timestamp"], row[f"{video}/to_timestamp"]] for row in rows]
     np.testing.assert_allclose(spans, [[0, count / 100], [count / 100, 2 * count / 100]])
     stats = json.loads((path / "meta" / "stats.json").read_text())["observation.images.front"]
     np.testing.assert_allclose(

@@ -62,7 +62,10 @@ Frame Time: 0.02
 """
     angles = [turn.as_euler(order, degrees=True) for turn in turns]
     rows = np.concatenate([root, *angles, np.zeros((FRAMES, 3))], 1)
-    path.write_text(text + "\n".join(" ".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
+    lines = []
+    for row in rows:
+        lines.append(" ".join(f"{x:.6f}" for x in row))
+    path.write_text(text + "\n".join(lines) + "\n")
     return path
 
 
@@ -169,12 +172,10 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
         f"stamp,frame_id,note,{ROS}",
         [[i, "", '"a, b"', *row] for i, row in enumerate(rows)],
     )
-    save(
-        "dec.csv",
-        ROS.replace(",", ";"),
-        [[str(x).replace(".", ",") for x in row] for row in rows],
-        ";",
-    )
+    with_commas = []
+    for row in rows:
+        with_commas.append([str(x).replace(".", ",") for x in row])
+    save("dec.csv", ROS.replace(",", ";"), with_commas, ";")
     save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
     with pytest.raises(CongraspError, match="quaternions whose length is not one"):
         save("turned.csv", "X,Y,Z,W,X,Y,Z", [row[3:] + row[:3] for row in rows])

@@ -257,10 +257,10 @@ def test_lines_of_older_versions_are_read_and_reported_as_unchecked(run_dir, cap
     for path in (run_dir / AUDIT).glob("*.jsonl"):
         path.with_name(f"{path.name}.end").unlink()
         lines = [json.loads(line) for line in path.read_text().split("\n") if line]
-        texts = [
-            json.dumps({k: v for k, v in line.items() if k not in ("after", "crc32")})[:-1]
-            for line in lines
-        ]
+        texts = []
+        for line in lines:
+            entry = {k: v for k, v in line.items() if k not in ("after", "crc32")}
+            texts.append(json.dumps(entry)[:-1])
         path.write_text(
             "".join(f'{text}, "crc32": "{zlib.crc32(text.encode()):08x}"}}\n' for text in texts)
         )

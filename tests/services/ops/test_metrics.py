@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import errno
+import itertools
 import json
 import logging
 import os
@@ -57,11 +58,8 @@ def scrape(port: int) -> dict[tuple[str, ...], float]:
     """Samples by their name and the values of their labels."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as reply:
         families = text_string_to_metric_families(reply.read().decode())
-        return {
-            (one.name, *one.labels.values()): one.value
-            for family in families
-            for one in family.samples
-        }
+        samples = itertools.chain.from_iterable(family.samples for family in families)
+        return {(sample.name, *sample.labels.values()): sample.value for sample in samples}
 
 
 def test_a_learner_shows_its_status_and_its_last_update():

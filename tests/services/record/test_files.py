@@ -3,6 +3,7 @@
 import errno
 import functools
 import io
+import itertools
 import json
 import pathlib
 import struct
@@ -113,9 +114,8 @@ def test_rotation_by_age_and_by_size_keeps_everything(tmp_path: pathlib.Path) ->
     entries = [Entry(blob, i, noise.bytes(1 << 20)) for i in range(6)]
     by_size = write(tmp_path / "size", entries, max_bytes=2 << 20)
     assert len(by_size) >= 2
-    assert [r.data for path in log_files(tmp_path / "size") for r in read_records(path)] == [
-        e.data for e in entries
-    ]
+    records = itertools.chain(*map(read_records, log_files(tmp_path / "size")))
+    assert [record.data for record in records] == [entry.data for entry in entries]
 
 
 def test_entries_written_together_are_in_one_file(tmp_path: pathlib.Path) -> None:

@@ -1,6 +1,7 @@
 """Rigid parts of the hand's surface."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -26,11 +27,11 @@ def _posed(name: str, share: float) -> tuple[np.ndarray, np.ndarray, Skin]:
         hand, hand.q_open + share * (hand.q_closed - hand.q_open)
     )
     turns = Rotation.from_quat(quaternion, scalar_first=True)
-    corners = [
-        (turns[k].apply(part.points) + position[k])[part.faces]
-        for k, parts_of_link in enumerate(surface_parts(hand))
-        for part in parts_of_link
-    ]
+    corners = []
+    for k, parts_of_link in enumerate(surface_parts(hand)):
+        corners += [
+            (turns[k].apply(part.points) + position[k])[part.faces] for part in parts_of_link
+        ]
     return np.concatenate(corners), skin.posed(position, turns.as_matrix())[0][skin.faces], skin
 
 
@@ -39,21 +40,17 @@ def test_a_robots_parts_are_its_surface_in_every_pose(name: str) -> None:
     parts, surface, _ = _posed(name, 0.7)
     assert cKDTree(parts.mean(1)).query(surface.mean(1))[0].max() < 1e-4
     assert cKDTree(surface.mean(1)).query(parts.mean(1))[0].max() < 1e-4
-    assert {
-        part.colour for parts_of_link in surface_parts(get_hand(name)) for part in parts_of_link
-    } == {SKIN, JOINT}
+    parts = itertools.chain(*surface_parts(get_hand(name)))
+    assert {part.colour for part in parts} == {SKIN, JOINT}
 
 
 def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> None:
     hand = get_hand("human")
     skin = skin_of(hand)
-    still = np.concatenate(
-        [
-            (p.points + o)[p.faces]
-            for parts_of_link, o in zip(surface_parts(hand), skin.origins, strict=True)
-            for p in parts_of_link
-        ]
-    )
+    corners = []
+    for parts_of_link, origin in zip(surface_parts(hand), skin.origins, strict=True):
+        corners += [(part.points + origin)[part.faces] for part in parts_of_link]
+    still = np.concatenate(corners)
     assert cKDTree(still.mean(1)).query(skin.points[skin.faces].mean(1))[0].max() < 1e-4
     parts, surface, _ = _posed("human", 0.5)
     mesh = trimesh.Trimesh(
@@ -62,9 +59,8 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     points = trimesh.sample.sample_surface(mesh, 60_000, seed=0)[0]
     distance = cKDTree(points).query(surface.mean(1))[0]
     assert np.percentile(distance, 95) < 0.004
-    assert {part.colour for parts_of_link in surface_parts(hand) for part in parts_of_link} == {
-        COLOURS[name] for name in ("flesh", "nail", "sleeve")
-    }
+    colours = {part.colour for part in itertools.chain(*surface_parts(hand))}
+    assert colours == {COLOURS[name] for name in ("flesh", "nail", "sleeve")}
 
 
 def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(
@@ -85,7 +81,7 @@ def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(
     )
     monkeypatch.setattr(hand_parts, "skin_of", lambda hand: fine)
     parts = surface_parts(dataclasses.replace(hand, name="fine"))
-    assert sum(len(part.faces) for links in parts for part in links) <= 12_000
+    assert sum(len(part.faces) for part in itertools.chain(*parts)) <= 12_000
     for (part,) in parts:
         np.testing.assert_allclose(np.linalg.norm(part.points, axis=-1), 0.02, atol=1e-3)
 

@@ -1,5 +1,6 @@
 """Metrics of a learner on TensorBoard and Weights & Biases, as their own readers find them."""
 
+import itertools
 import pathlib
 import struct
 from collections.abc import Sequence
@@ -63,10 +64,11 @@ def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
     assert [path.name for path in (tmp_path / "tensorboard").iterdir()] == ["learner-0"]
     (first,) = events(tmp_path / "tensorboard" / "learner-0")
     assert first[0].file_version == "brain.Event:2"
-    scalars = {(e.step, v.tag): v.simple_value for e in first for v in e.summary.value}
-    assert set(scalars) == {
-        (update, tag) for update in range(5) for tag in ("episode/success", "kl")
-    }
+    scalars = {}
+    for event in first:
+        for value in event.summary.value:
+            scalars[event.step, value.tag] = value.simple_value
+    assert set(scalars) == set(itertools.product(range(5), ("episode/success", "kl")))
     assert scalars[3, "episode/success"] == pytest.approx(0.3)
     assert first[1].step == 0
     assert first[1].session_log.status == SessionLog.START

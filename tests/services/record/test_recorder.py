@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import itertools
 import json
 import pathlib
 import re
@@ -291,7 +292,7 @@ def test_a_suspended_recorder_does_not_block_the_run(tmp_path: pathlib.Path) -> 
     rollouts = KEYS.log("rollout", "actor", "a")
 
     def sizes() -> list[int]:
-        records = (record for path in log_files(tmp_path / "out") for record in read_records(path))
+        records = itertools.chain.from_iterable(map(read_records, log_files(tmp_path / "out")))
         return [len(record.data) for record in records if record.topic.startswith("/rollout/")]
 
     with (

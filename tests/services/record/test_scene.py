@@ -235,20 +235,21 @@ def test_a_recording_holds_the_hand_once_and_small(entries: list[Entry]) -> None
     hand = sum(entity.ByteSize() for entity in scene.entities if entity.id.startswith("hand/"))
     one_frame = len(skin_of(HAND).points) * 3 * 9  # three doubles and their tags
     assert hand < 3 * one_frame
-    assert not any(
-        e.id.startswith("hand/")
-        for x in of(entries, "contacts")
-        for e in SceneUpdate.FromString(x.data).entities
-    )
+    for entry in of(entries, "contacts"):
+        update = SceneUpdate.FromString(entry.data)
+        assert not any(entity.id.startswith("hand/") for entity in update.entities)
+
+
+def entities_of(update):
+    """Entities of an update of the scene, by their names."""
+    return {entity.id: entity for entity in update.entities}
 
 
 def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> None:
     updates = [SceneUpdate.FromString(entry.data) for entry in of(entries, "contacts")]
-    has_table = [any(e.id == "table" for e in update.entities) for update in updates]
+    has_table = ["table" in entities_of(update) for update in updates]
     assert has_table == [True] * 8 + [False] * 4
-    arrows = [
-        len(next(e for e in update.entities if e.id == "forces").arrows) for update in updates
-    ]
+    arrows = [len(entities_of(update)["forces"].arrows) for update in updates]
     assert arrows == [0] * 6 + [5] * 6
     for update in updates:
         assert all(
@@ -286,14 +287,14 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     second = convert(KEY, episode_message(), START + 1)
     assert min(e.time for e in second) > max(e.time for e in first)
     other = convert("congrasp/run/log/episode/actor/b", episode_message(), START)
-    transforms = [
-        FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data)
-        for es in (first, other)
-    ]
-    places = [
-        next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x
-        for tf in transforms
-    ]
+
+    def place(entries):
+        entry = next(entry for entry in entries if entry.channel.topic.endswith("/tf"))
+        transforms = FrameTransforms.FromString(entry.data).transforms
+        in_world = next(frame for frame in transforms if frame.parent_frame_id == "world")
+        return in_world.translation.x
+
+    places = [place(first), place(other)]
     assert places == [0.0, pytest.approx(SPACING_M)]
 
 

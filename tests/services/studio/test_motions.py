@@ -20,11 +20,10 @@ from tests.episodes import episode, older
 
 STEPS = 30
 REMOVAL = 18
-TOLERANCES = {
-    (name, error.unit): error.tolerance
-    for name in ("heading", "trajectory")
-    for error in get_constraint(name).errors
-}
+TOLERANCES = {}
+for _name in ("heading", "trajectory"):
+    for _error in get_constraint(_name).errors:
+        TOLERANCES[_name, _error.unit] = _error.tolerance
 
 
 def with_error(made: Episode, **values: float | np.ndarray) -> Message:

@@ -1,6 +1,7 @@
 """Actions of the studio's user, and the effects of the priority rules."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -219,9 +220,9 @@ def same(one: Studio, edit: object) -> bool:
 
 def leaves(tree: object) -> list[object]:
     if isinstance(tree, dict):
-        return [leaf for key in sorted(tree) for leaf in leaves(tree[key])]
+        return list(itertools.chain(*(leaves(tree[key]) for key in sorted(tree))))
     if isinstance(tree, tuple):
-        return [leaf for part in tree for leaf in leaves(part)]
+        return list(itertools.chain(*map(leaves, tree)))
     return [tree]
 
 

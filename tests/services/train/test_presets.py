@@ -104,44 +104,31 @@ def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
     assert config == dataclasses.replace(human, name=name, task=task, curriculum=config.curriculum)
 
 
+def with_torques(hand, factor):
+    """A hand whose torque limits are `factor` times as large."""
+    links = []
+    for link in hand.links:
+        joints = [
+            dataclasses.replace(joint, torque_limit=factor * joint.torque_limit)
+            for joint in link.joints
+        ]
+        links.append(dataclasses.replace(link, joints=tuple(joints)))
+    return dataclasses.replace(hand, links=tuple(links))
+
+
 def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever():
     # Allegro's straight finger: the second joint is 119 mm from the tip, its 0.7 N.m make 5.9 N
     # there, less than the next ones' on shorter levers; the thumb's first joint is 151 mm from its
     # tip and makes 4.6 N.
     allegro = get_hand("allegro")
     assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
-    links = tuple(
-        dataclasses.replace(
-            link,
-            joints=tuple(
-                dataclasses.replace(joint, torque_limit=2 * joint.torque_limit)
-                for joint in link.joints
-            ),
-        )
-        for link in allegro.links
-    )
-    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(
-        2 * tip_forces(allegro)
-    )
+    assert tip_forces(with_torques(allegro, 2.0)) == pytest.approx(2 * tip_forces(allegro))
 
 
 def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
     allegro = get_hand("allegro")
 
-    def with_torque(factor):
-        links = tuple(
-            dataclasses.replace(
-                link,
-                joints=tuple(
-                    dataclasses.replace(j, torque_limit=factor * j.torque_limit)
-                    for j in link.joints
-                ),
-            )
-            for link in allegro.links
-        )
-        return rules(dataclasses.replace(allegro, links=links))
-
-    configs = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
+    configs = [rules(with_torques(allegro, factor)) for factor in (0.5, 1, 4, 20)]
     assert [one.p_affordance for one in configs] == sorted(
         (one.p_affordance for one in configs), reverse=True
     )

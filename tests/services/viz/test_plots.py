@@ -1,5 +1,6 @@
 """Figures of runs and of evaluations: every metric once, and what their files say."""
 
+import itertools
 import json
 import pathlib
 
@@ -66,9 +67,10 @@ def test_settings_of_matplotlib_change_no_figure(tmp_path: pathlib.Path) -> None
 def test_every_metric_is_in_exactly_one_panel() -> None:
     series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
     groups = figures({"run": series})
-    plotted = [
-        metric for _, panels in groups.values() for panel in panels for metric in panel.metrics
-    ]
+    plotted = []
+    for _, panels in groups.values():
+        for panel in panels:
+            plotted += panel.metrics
     assert sorted(plotted) == sorted(METRICS)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [
         ("term/contact",),
@@ -89,7 +91,7 @@ def test_a_run_becomes_png_files(
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     figures = ("learning", "reward_terms", "episodes", "details")
     assert [file.name for file in files] == [
-        f"{name}.{kind}" for name in figures for kind in ("png", "pdf")
+        f"{name}.{kind}" for name, kind in itertools.product(figures, ("png", "pdf"))
     ]
     assert all(file.read_bytes().startswith(b"%PDF-") for file in files if file.suffix == ".pdf")
     assert all(file.parent == tmp_path / "run" / "plots" for file in files)
@@ -114,10 +116,9 @@ def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Pa
         "learner/0/term/drop": flat,
         "learner/0/term/contact": 3 * flat,
     }
-    runs = {
-        name: {metric: (np.arange(4), values) for metric, values in run.items()}
-        for name, run in (("a", one), ("b", two))
-    }
+    runs = {}
+    for name, run in (("a", one), ("b", two)):
+        runs[name] = {metric: (np.arange(4), values) for metric, values in run.items()}
     groups = figures(runs)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",)]
     figure = draw("Learning", groups["learning"][1], runs)
@@ -236,7 +237,7 @@ def test_an_evaluation_becomes_png_and_pdf(
     assert plot((tmp_path / "e.json",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     assert [f.name for f in files] == [
-        f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")
+        f"{n}.{k}" for n, k in itertools.product(("table", "success", "errors"), ("png", "pdf"))
     ]
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF-"}
     assert all(file.read_bytes().startswith(starts[file.suffix]) for file in files)

@@ -1,6 +1,7 @@
 """Pictures show all shapes, in their places and colours."""
 
 import dataclasses
+import itertools
 import pathlib
 from typing import Any
 
@@ -168,7 +169,10 @@ def test_a_border_between_two_colours_is_sharp_and_straight() -> None:
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array(
-        [[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)]
+        [
+            [0.1, y, z]
+            for y, z in itertools.product(np.linspace(-0.1, 0.1, 11), np.linspace(-0.1, 0.1, 11))
+        ]
     )
     paint = Colours(points, np.where(points[:, 2:] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
     painted = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)

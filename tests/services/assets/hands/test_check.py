@@ -28,16 +28,14 @@ SLOW = ("allegro", "sharpa")
 
 def with_joints(hand, change, only=""):
     """The hand with `change` of each joint, or of the one of this name."""
-    links = tuple(
-        dataclasses.replace(
-            link,
-            joints=tuple(
-                change(joint) if only in ("", joint.name) else joint for joint in link.joints
-            ),
-        )
-        for link in hand.links
-    )
-    return dataclasses.replace(hand, links=links)
+
+    def changed(joint):
+        return change(joint) if only in ("", joint.name) else joint
+
+    links = []
+    for link in hand.links:
+        links.append(dataclasses.replace(link, joints=tuple(map(changed, link.joints))))
+    return dataclasses.replace(hand, links=tuple(links))
 
 
 @functools.cache

@@ -47,8 +47,7 @@ def test_a_urdf_is_understood(claw):
         "palm",
         *(
             f"{finger}_{part}"
-            for finger in ("left", "right", "opposing")
-            for part in ("lower", "upper")
+            for finger, part in itertools.product(("left", "right", "opposing"), ("lower", "upper"))
         ),
     ]
     joints = {joint.name: joint for joint in hand.joints}

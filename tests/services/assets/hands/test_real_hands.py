@@ -67,10 +67,10 @@ def test_a_real_hand_is_understood_without_an_option(name):
     assert {joint: np.sign(closed[joint]) for joint in expected["flexes"]} == expected["flexes"]
     assert expected["opening"][0] < grasp_frame(hand).opening < expected["opening"][1]
     # Closing brings thumb and fingers together, to less than half of the opening.
-    gaps = [
-        float(np.linalg.norm(tips[1:].mean(0) - tips[0]))
-        for tips in (_tips(hand, q) for q in _ways(hand))
-    ]
+    gaps = []
+    for q in _ways(hand):
+        tips = _tips(hand, q)
+        gaps.append(float(np.linalg.norm(tips[1:].mean(0) - tips[0])))
     assert min(gaps) < 0.5 * gaps[0]
     # The hand centre is ahead of the palm, on the side to which the heading points.
     frame = grasp_frame(hand)

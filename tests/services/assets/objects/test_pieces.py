@@ -21,11 +21,9 @@ def prism(outline, depth):
     low, high = (
         np.column_stack([outline, np.full(len(outline), z)]) for z in (-depth / 2, depth / 2)
     )
-    caps = [
-        [side[0], side[i], side[i + 1]]
-        for side in (low[::-1], high)
-        for i in range(1, len(side) - 1)
-    ]
+    caps = []
+    for side in (low[::-1], high):
+        caps += [[side[0], side[i], side[i + 1]] for i in range(1, len(side) - 1)]
     walls = [[low[i - 1], low[i], high[i]] for i in range(len(low))]
     return np.array(caps + walls + [[low[i - 1], high[i], high[i - 1]] for i in range(len(low))])
 

@@ -1,5 +1,6 @@
 """Broken meshes: each is repaired with a note, or rejected with the remedy."""
 
+import itertools
 import struct
 
 import numpy as np
@@ -93,11 +94,9 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     a = np.linspace(0, np.pi, rows)
     spine = np.stack([0.04 + 0.03 * np.sin(a), 0 * a, 0.025 * np.cos(a)], -1)[:, None]
     strap = (spine + np.array([[0, 0, 0], [0, 0.004, 0]])).reshape(-1, 3)
-    faces = [
-        face
-        for i in range(0, 2 * rows - 2, 2)
-        for face in ((i, i + 1, i + 2), (i + 1, i + 3, i + 2))
-    ]
+    faces = []
+    for i in range(0, 2 * rows - 2, 2):
+        faces += [(i, i + 1, i + 2), (i + 1, i + 3, i + 2)]
     mug = trimesh.util.concatenate([cup, trimesh.Trimesh(strap, faces, process=False)])
     mug.merge_vertices()
     assert mug.faces.shape == (len(cup.faces) + len(faces), 3)
@@ -144,7 +143,7 @@ _ARROW = [(0, 0), (2, 0), (0.5, 0.5), (0, 2)]
 
 def _prism(outline):
     """Points and polygons of a prism, as modelling programs export it: one polygon for each end."""
-    points = [(x, y, z) for z in (0, 3) for x, y in outline]
+    points = [(x, y, z) for z, (x, y) in itertools.product((0, 3), outline)]
     n = len(outline)
     sides = [(i, (i + 1) % n, (i + 1) % n + n, i + n) for i in range(n)]
     return points, [tuple(range(n))[::-1], tuple(range(n, 2 * n)), *sides]
@@ -161,12 +160,13 @@ property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"""
     rows = [("3f", *point) for point in points]
     rows += [(f"B{len(one)}i3B", len(one), *one, 9, i, 7) for i, one in enumerate(faces)]
     order = ">" if "big" in kind else "<"
-    packed = [struct.pack(order + row[0], *row[1:]) for row in rows]
-    return header.encode() + b"".join(
-        packed
-        if number is None
-        else [(" ".join(number % x for x in row[1:]) + "\n").encode() for row in rows]
-    )
+    written = []
+    for form, *values in rows:
+        if number is None:
+            written.append(struct.pack(order + form, *values))
+        else:
+            written.append((" ".join(number % x for x in values) + "\n").encode())
+    return header.encode() + b"".join(written)
 
 
 _QUADS = _ply(_ARROW, "binary_little_endian")
@@ -351,8 +351,7 @@ def _moebius():
             np.sin(t) * (1 + s * np.cos(t / 2)),
             s * np.sin(t / 2),
         )
-        for t in turns
-        for s in (-0.2, 0.2)
+        for t, s in itertools.product(turns, (-0.2, 0.2))
     ]
     faces = []
     for i in range(24):
