@@ -355,22 +355,27 @@ def test_policy_clock_reaches_the_removal_after_the_approach(example):
     assert [plan.time(followed) for followed in (0, 100, 200, 230)] == [0.0, 50.0, 100.0, 130.0]
 
 
-def test_a_step_waits_for_the_measurement_of_its_time(example):
+def test_a_step_waits_for_the_measurement_of_its_time(example, monkeypatch):
     """Not for one that came more than half a period early, and for none more than half a period
     late.
     """
     bus = Wire()
+    now = 0.0
+
+    def sleep(seconds):
+        nonlocal now
+        now += seconds
+
+    monkeypatch.setattr(example, "time", Fields(monotonic=lambda: now, sleep=sleep))
     with node_of(example, bus) as (node, _, obj):
-        bus.receive = lambda: robot_says(obj)
-        began = node.wait(0.1)
-        bus.receive = lambda: robot_says(obj) if time.monotonic() > began + 0.07 else []
+        bus.receive = lambda: robot_says(obj) if now > 0.07 else []
         in_time = node.wait(0.1)
-        assert 0.07 <= in_time - began < 0.1
+        assert in_time == pytest.approx(0.07, abs=0.002)
         bus.receive = lambda: robot_says(obj)
         early = node.wait(0.1)
-        assert 0.05 <= early - in_time < 0.1
+        assert early - in_time == pytest.approx(0.05, abs=0.002)
         bus.receive = lambda: []
-        assert node.wait(0.1) - early >= 0.15
+        assert node.wait(0.1) - early == pytest.approx(0.15, abs=0.002)
 
 
 def test_a_slow_hand_has_a_share_of_the_speed(example):
