@@ -39,8 +39,8 @@ def _opcodes(value: Any) -> bytes:
     if isinstance(value, Global):
         return b"c" + value.replace(" ", "\n").encode() + b"\n"
     if isinstance(value, Reduced):
-        made = _opcodes(value.name) + _opcodes(value.arguments) + (b"\x81" if value.new else b"R")
-        return made if value.state is None else made + _opcodes(value.state) + b"b"
+        code = _opcodes(value.name) + _opcodes(value.arguments) + (b"\x81" if value.new else b"R")
+        return code if value.state is None else code + _opcodes(value.state) + b"b"
     if isinstance(value, np.ndarray):
         return _opcodes(_array(value))
     if isinstance(value, str | bytes):

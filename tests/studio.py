@@ -140,19 +140,19 @@ def metrics(update: int) -> Message:
 
 def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
     """Training window of a run with many actors after some updates."""
-    made = TrainingWindow("fake")
+    training = TrainingWindow("fake")
     keys = Keys("fake")
     now = time.time()
     for update in range(updates):
-        made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
-    made.take_status(status(actors), now)
+        training.take(keys.log("metrics", "learner", "0"), metrics(update), now)
+    training.take_status(status(actors), now)
     for number in range(actors):
-        made.take(
+        training.take(
             keys.log("episode", "actor", f"a{number:03d}"),
             actor_episode(number, number % 4 > 0),
             now,
         )
-    return made
+    return training
 
 
 def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
@@ -188,8 +188,8 @@ class FakeImporter:
 
 
 def session(grasping: FakePolicy | None = None, **more: Any) -> Session:
-    made = grasping or FakePolicy()
-    return Session({"of the run": lambda: made}, objects(), FakeImporter(), **more)
+    policy = grasping or FakePolicy()
+    return Session({"of the run": lambda: policy}, objects(), FakeImporter(), **more)
 
 
 class Site:

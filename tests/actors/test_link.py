@@ -79,16 +79,16 @@ class Learner:
 def ends():
     """(in-memory hub, function that makes a link)."""
     hub = MemoryHub()
-    made = []
+    links = []
 
     def make(**options):
         transport = MemoryTransport(hub)
         link = ActorLink(transport, "test", "a", **{"request_timeout": 20.0, **options})
-        made.append((transport, link))
+        links.append((transport, link))
         return link
 
     yield hub, make
-    for transport, link in made:
+    for transport, link in links:
         link.close()
         transport.close()
 

@@ -77,9 +77,9 @@ def scanned(folders):
 
 
 def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, scanned):
-    made = training_set(HAND, _run(), 0)
-    assert [obj.name for obj in made.objects] == [obj.name for obj in OBJECTS]
-    jax.tree.map(np.testing.assert_array_equal, made.bank, suite.bank())
+    training = training_set(HAND, _run(), 0)
+    assert [obj.name for obj in training.objects] == [obj.name for obj in OBJECTS]
+    jax.tree.map(np.testing.assert_array_equal, training.bank, suite.bank())
     assert [obj.name for obj in scanned.objects] == sorted(obj.name for obj in OBJECTS)
     mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
     assert len(mixed.objects) == 8

@@ -58,7 +58,7 @@ def measures(
     console.print(f"Grids of {len(objects)} objects: {seconds:.1f} s, {size:.0f} MB")
 
     def worker(probe: Probe) -> RolloutWorker:
-        made = RolloutWorker(
+        rollout_worker = RolloutWorker(
             hand,
             task,
             make_physics(physics, hand, task, objects, threads=threads),
@@ -69,8 +69,8 @@ def measures(
             half_precision=False,
             probe=probe,
         )
-        made.adjust(probe_data=field)
-        return made
+        rollout_worker.adjust(probe_data=field)
+        return rollout_worker
 
     def run(worker: RolloutWorker) -> None:
         worker.restart()

@@ -114,15 +114,15 @@ def _grasped(page: Any) -> str:
         page.wait_for_function(
             "(n) => document.querySelectorAll('[data-motion]').length > n", arg=len(before)
         )
-        (made,) = {
+        (motion,) = {
             item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()
         } - before
-        page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
+        page.wait_for_selector(f"[data-motion='{motion}'][data-shown]")
         if "not held" not in page.inner_text("#result") and "held" in page.inner_text("#result"):
             break
         page.click("#edit")
     _stopped(page, _SCRUB)
-    return str(made)
+    return str(motion)
 
 
 def _stopped(page: Any, share: float) -> None:

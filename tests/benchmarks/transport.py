@@ -155,7 +155,7 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
     endpoint = local_url()
     ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
-        made = learner_hub(
+        bench = learner_hub(
             transport,
             _RUN,
             form=_FORM,
@@ -164,8 +164,8 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
             log=WriteAheadLog(folder / FOLDER, 1, write=write_ahead),
             admission=Admission(lambda: ranges),
         )
-        yield made, endpoint
-        made.rollouts.close()
+        yield bench, endpoint
+        bench.rollouts.close()
 
 
 def _rollout() -> Message:

@@ -262,11 +262,11 @@ def test_nothing_depends_on_where_the_scene_is(seed):
 @jax.jit
 def _judged(state, surface, goal, action):
     """Reward terms of a scene; and its observation, errors and targets."""
-    made = traced_scene(HAND, TASK, state, surface, goal)
-    return reward_terms(made, RewardWeights()), (
-        observe(made),
-        metrics.errors(made),
-        decode(made, TASK.control, action),
+    traced = traced_scene(HAND, TASK, state, surface, goal)
+    return reward_terms(traced, RewardWeights()), (
+        observe(traced),
+        metrics.errors(traced),
+        decode(traced, TASK.control, action),
     )
 
 

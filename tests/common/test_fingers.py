@@ -50,7 +50,7 @@ def pinch(on: bool = True):
 
     Palm, thumb, index, middle and ring finger touch it; index and middle with 3 and 5 N.
     """
-    made = lone_scene(TASK, *["fingers"] * on, fingers={"allowed": PINCH})
+    pinching = lone_scene(TASK, *["fingers"] * on, fingers={"allowed": PINCH})
     nearest = np.zeros((1, len(HAND.keypoints), 3), np.float32)
     nearest[..., 0] = 0.2
     nearest[0, THUMB_TIP] = [0.001, 0.0, 0.0]
@@ -60,8 +60,8 @@ def pinch(on: bool = True):
     force = np.zeros((1, L, 3), np.float32)
     force[0, INDEX, 0] = 3.0
     force[0, MIDDLE, 2] = 5.0
-    return made._replace(
-        features=made.features._replace(nearest=nearest, touching=touching, force=force)
+    return pinching._replace(
+        features=pinching.features._replace(nearest=nearest, touching=touching, force=force)
     )
 
 
@@ -187,12 +187,12 @@ def test_the_distance_reward_is_that_of_the_set():
     4 = 15 count.
     """
     assert len(HAND.keypoints) == 21
-    made = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))[
+    rewards = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))[
         "distance"
     ]
     # 6 link origins and the palm at 0.2 m, the thumb's tip at 1 mm, the index finger's at 0.2 m;
     # all weigh 21 together.
-    np.testing.assert_allclose(made, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
+    np.testing.assert_allclose(rewards, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
     free = evaluated(
         reward_terms, pinch(on=False), RewardWeights(**dict.fromkeys(terms(TASK), 1.0))
     )["distance"]
@@ -283,9 +283,9 @@ def test_features_of_a_whole_step_reach_it():
     skin.
     """
     state, surface, goal = scene(4)
-    made = scene_of(TASK, state, surface, goal)
-    ((_, room, _),) = evaluated(FINGERS.observe, made)
-    skin = np.linalg.norm(made.features.nearest, axis=-1) - HAND.keypoint_radii
+    scene_of_step = scene_of(TASK, state, surface, goal)
+    ((_, room, _),) = evaluated(FINGERS.observe, scene_of_step)
+    skin = np.linalg.norm(scene_of_step.features.nearest, axis=-1) - HAND.keypoint_radii
     for finger in range(5):
         per_step = [
             i

@@ -29,13 +29,15 @@ MIDDLE = 9
 
 def pressing(on: bool = True, limit: float = 3.0):
     """Thumb, index and middle finger press with 5, 2 and 20 N; the limit is 3 N."""
-    made = lone_scene(TASK, *["force_limit"] * on, force={"limit": np.array([limit], np.float32)})
+    limited = lone_scene(
+        TASK, *["force_limit"] * on, force={"limit": np.array([limit], np.float32)}
+    )
     force = np.zeros((1, L, 3), np.float32)
     force[0, THUMB, 0] = 5.0
     force[0, INDEX, 1] = -2.0
     force[0, MIDDLE] = (12.0, 0.0, 16.0)
     touching = np.isin(np.arange(L), (THUMB, INDEX, MIDDLE))[None]
-    return made._replace(features=made.features._replace(force=force, touching=touching))
+    return limited._replace(features=limited.features._replace(force=force, touching=touching))
 
 
 def test_observation_by_hand():

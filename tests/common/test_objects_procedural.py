@@ -39,9 +39,13 @@ def is_primitive(obj):
 
 
 def test_most_basic_families_are_primitive():
-    made = [generate(0, family) for family in BASIC_FAMILIES]
-    assert sum(is_primitive(obj) for obj in made) >= 12
-    assert {obj.family for obj in made if not is_primitive(obj)} == {"ring", "bowl", "cup"}
+    objects_of_families = [generate(0, family) for family in BASIC_FAMILIES]
+    assert sum(is_primitive(obj) for obj in objects_of_families) >= 12
+    assert {obj.family for obj in objects_of_families if not is_primitive(obj)} == {
+        "ring",
+        "bowl",
+        "cup",
+    }
 
 
 @settings(max_examples=12, deadline=None)

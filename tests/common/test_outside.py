@@ -300,12 +300,12 @@ def studio(task):
     from congrasp.services.studio.page import describe
     from congrasp.services.studio.state import Studio
 
-    made = Studio(get_hand("human"), task, procedural.generate(0, "box"))
-    made.choose("level", "wrist", [True])
+    session = Studio(get_hand("human"), task, procedural.generate(0, "box"))
+    session.choose("level", "wrist", [True])
     row = {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}}
-    assert row in describe(made)["constraints"]
-    assert made.asked == {"level"}
-    assert made.request.constraints["level"]["wrist"].tolist() == [True]
+    assert row in describe(session)["constraints"]
+    assert session.asked == {"level"}
+    assert session.request.constraints["level"]["wrist"].tolist() == [True]
 
 
 def onnx(task):

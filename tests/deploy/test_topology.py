@@ -153,8 +153,8 @@ class Cluster:
 def test_a_run_on_three_hosts(hosts, tmp_path):
     cluster = Cluster(hosts, tmp_path)
     (script,) = cluster.words("certs", SERVICES["certs"]["command"])
-    made = cluster.run("learner", ["sh", "-c", script.replace("|| congrasp", f"|| {CONGRASP}")])
-    assert made.returncode == 0, made.stderr
+    output = cluster.run("learner", ["sh", "-c", script.replace("|| congrasp", f"|| {CONGRASP}")])
+    assert output.returncode == 0, output.stderr
     run_dir = tmp_path / "runs" / "quickstart"
     try:
         cluster.start("learner", "learner", *TINY)

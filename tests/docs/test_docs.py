@@ -134,11 +134,13 @@ def test_help_pages_show_no_parser_internals(capsys):
 def test_the_example_mug_equals_the_output_of_its_code(tmp_path):
     runpy.run_path(str(ROOT / "examples" / "make_mug.py"))["main"](tmp_path)
     for name in ("mug.obj", "handle.obj"):
-        made, shipped = (trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples"))
+        generated, shipped = (
+            trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples")
+        )
         assert (ROOT / "examples" / name).stat().st_size < 200_000
         assert shipped.is_watertight
-        np.testing.assert_allclose(made.vertices, shipped.vertices, atol=2e-5)
-        np.testing.assert_array_equal(made.faces, shipped.faces)
+        np.testing.assert_allclose(generated.vertices, shipped.vertices, atol=2e-5)
+        np.testing.assert_array_equal(generated.faces, shipped.faces)
 
 
 @pytest.mark.timeout(600)

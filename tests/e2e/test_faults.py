@@ -67,7 +67,7 @@ def test_a_killed_learner_costs_no_rollout(cluster):
     # What a learner refused as stale before it died is a gap for the next one.
     assert final["counters"]["missing"] <= counts["made"] - counts["accepted"]
     assert_books_balance(final)
-    made = 0
+    finished = 0
     unknown = 0
     for name in ("a", "b"):
         outcomes = cluster.outcomes(name)
@@ -80,12 +80,12 @@ def test_a_killed_learner_costs_no_rollout(cluster):
         assert {
             sequence for actor, _, sequence in final["history"] if actor == name
         } <= taken | undecided
-        made, unknown = made + len(outcomes), unknown + len(undecided)
+        finished, unknown = finished + len(outcomes), unknown + len(undecided)
     ledger = final["counters"]
     assert (
-        made - unknown
+        finished - unknown
         <= sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing"))
-        <= made
+        <= finished
     )
 
 

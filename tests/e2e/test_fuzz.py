@@ -207,18 +207,18 @@ def memory():
 def requests():
     """A valid message for every key that is asked, and for every one that is published under."""
     who = {"actor": "NAME", "incarnation": "01"}
-    made = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
-    named = {**made.arrays, "episode/success": np.ones(1, np.float32)}
+    sample_rollout = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
+    named = {**sample_rollout.arrays, "episode/success": np.ones(1, np.float32)}
     queries = {
         KEYS.config: Message(),
         KEYS.status: Message(),
         KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
         KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
-        KEYS.rollout("NAME"): Message(named, made.meta),
+        KEYS.rollout("NAME"): Message(named, sample_rollout.meta),
         KEYS.act: Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
         KEYS.health: Message(),
     }
-    told = {
+    publications = {
         KEYS.log("metrics", "actor", "NAME"): Message(
             meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}
         ),
@@ -233,7 +233,7 @@ def requests():
             meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}
         ),
     }
-    return list(queries.items()), list(told.items())
+    return list(queries.items()), list(publications.items())
 
 
 LAYOUT = Layout(get_hand("human"), TaskConfig(surface_points=8, trajectory_points=3))
@@ -267,7 +267,7 @@ def served(endpoint, folder):
 def test_mutated_messages_at_every_key(tmp_path):
     rng = random.Random(SEED)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    queries, told = requests()
+    queries, publications = requests()
     with (
         no_tracebacks(),
         served(endpoint, tmp_path) as (hub, rollouts, recorder),
@@ -277,7 +277,7 @@ def test_mutated_messages_at_every_key(tmp_path):
         first = 0
         sent = 0
         while (now := time.monotonic()) < began + SECONDS:
-            key, message = rng.choice(queries if rng.random() < 0.7 else told)
+            key, message = rng.choice(queries if rng.random() < 0.7 else publications)
             name = f"{rng.randrange(2000)}.x"
             meta = {k: name if v == "NAME" else v for k, v in message.meta.items()}
             session = raw.session(key)

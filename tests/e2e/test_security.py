@@ -117,14 +117,14 @@ def listening(certs):
 @pytest.fixture
 def fresh(certs):
     """A run of a test's own."""
-    with listening(certs) as made:
-        yield made
+    with listening(certs) as listeners:
+        yield listeners
 
 
 @pytest.fixture(scope="module")
 def shared(certs):
-    with listening(certs) as made:
-        yield made
+    with listening(certs) as listeners:
+        yield listeners
 
 
 @pytest.fixture
@@ -195,8 +195,8 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(fresh):
 
 
 def test_an_actor_whose_certificate_came_later_works_at_once(run):
-    made = issue(run.certs, "actor", number=77)
-    link = ActorLink(run.connect(made.name), "safe", "77.x", request_timeout=5.0)
+    certificate = issue(run.certs, "actor", number=77)
+    link = ActorLink(run.connect(certificate.name), "safe", "77.x", request_timeout=5.0)
     with link:
         link.config(10)
         assert link.upload(rollout(), link.acquire_ticket(5)).result(10) == "accepted"
@@ -658,13 +658,13 @@ def test_a_certificate_for_another_host_is_not_trusted(certs):
 
 
 def test_a_connection_ends_when_its_certificate_expires(run):
-    made = issue(run.certs, "actor", number=50, days=4 / 86400)
-    left = 86400 * read(made / "tls.crt").days
-    session = run.connect(made.name, flows=("control",))
+    certificate = issue(run.certs, "actor", number=50, days=4 / 86400)
+    left = 86400 * read(certificate / "tls.crt").days
+    session = run.connect(certificate.name, flows=("control",))
     assert answers(session, KEYS.config)
     time.sleep(left + 0.5)
     eventually(lambda: not answers(session, KEYS.config))
-    _refused(run.endpoint, Credentials(made, "actor"), "expired")
+    _refused(run.endpoint, Credentials(certificate, "actor"), "expired")
 
 
 def test_too_long_and_too_frequent_messages_are_dropped(fresh):

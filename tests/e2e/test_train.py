@@ -84,16 +84,16 @@ def kill_an_actor_and_the_learner(run: Run, count: int) -> None:
 
 @pytest.fixture
 def start(tmp_path):
-    made = []
+    processes = []
 
     def run(actors: int, updates: int) -> Run:
         options = ["--updates", str(updates), *SMALL]
-        made.append(Run(tmp_path / f"run{len(made)}", actors, options, subprocess.PIPE))
-        made[-1].start()
-        return made[-1]
+        processes.append(Run(tmp_path / f"run{len(processes)}", actors, options, subprocess.PIPE))
+        processes[-1].start()
+        return processes[-1]
 
     yield run
-    for one in made:
+    for one in processes:
         if one.alive:
             one.kill()
         one.close()

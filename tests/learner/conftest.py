@@ -15,6 +15,6 @@ def bench():
         return benches[-1]
 
     yield make
-    for made in benches:
-        made.peer.close()
-        made.server.close()
+    for opened in benches:
+        opened.peer.close()
+        opened.server.close()

@@ -273,10 +273,10 @@ def test_thousands_of_tokens_are_not_listed(bench):
     assert [role["id"] for role in b.ask(KEYS.status)["roles"] if role["role"] == "actor"] == [
         "0.a"
     ]
-    told = 0
+    events_received = 0
     while events.receive(0.05):
-        told += 1
-    assert told == 64  # one for each that was listed
+        events_received += 1
+    assert events_received == 64  # one for each that was listed
 
 
 def test_a_refused_rollout_redeems_its_ticket(bench):

@@ -42,14 +42,14 @@ def hub() -> MemoryHub:
 @pytest.fixture
 def act(hub):
     """A function that starts made-up actors, which end with the test."""
-    made = []
+    actors = []
 
     def make(*arguments, **options) -> MadeUpActor:
-        made.append(MadeUpActor(MemoryTransport(hub), *arguments, **options))
-        return made[-1]
+        actors.append(MadeUpActor(MemoryTransport(hub), *arguments, **options))
+        return actors[-1]
 
     yield make
-    for actor in made:
+    for actor in actors:
         actor.stop.set()
         actor.join(10.0)
 

@@ -133,15 +133,15 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     assert goal["force_limit"] == 3.0
     assert "Only the named fingers may touch the object." in grasp.active
     assert "No link may press harder than the force limit." in grasp.active
-    made = grasp.episode
-    errors = made.require_recorded().errors
-    steps = made.steps
+    recorded = grasp.episode
+    errors = recorded.require_recorded().errors
+    steps = recorded.steps
     other = np.isin(HAND.link_fingers, (2, 3, 4))
-    links = np.linalg.norm(made.link_force, axis=-1)
+    links = np.linalg.norm(recorded.link_force, axis=-1)
     np.testing.assert_array_equal(errors["fingers_ratio"] > 0, ((links > 0) & other).any(-1))
     np.testing.assert_array_equal(errors["force_ratio"] > 0, (links > 3.0).any(-1))
-    assert made.active["fingers"]
-    assert not made.active["pose_finger"]
+    assert recorded.active["fingers"]
+    assert not recorded.active["pose_finger"]
     assert lanes(grasp.episode)["fingers"].met.shape == (steps,)
     assert "lane/fingers/share" in for_page(grasp.episode).arrays
 

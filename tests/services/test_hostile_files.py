@@ -267,9 +267,9 @@ def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
     ],
 )
 def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, part, changes, why):
-    made = decode(policy_file(None).read_bytes())
-    meta = {**made.meta, **({part: {**made.meta[part], **changes}} if part else changes)}
-    (tmp_path / "a.safetensors").write_bytes(encode(Message(made.arrays, meta)))
+    bundle = decode(policy_file(None).read_bytes())
+    meta = {**bundle.meta, **({part: {**bundle.meta[part], **changes}} if part else changes)}
+    (tmp_path / "a.safetensors").write_bytes(encode(Message(bundle.arrays, meta)))
     with pytest.raises(CongraspError, match=why):
         bundles.load(tmp_path / "a.safetensors")
 
@@ -380,43 +380,43 @@ def test_motion_whose_object_is_a_path_is_neither_written_nor_read(tmp_path):
 
 
 def constraint_set():
-    made = {
+    meta = {
         "object": "mug",
         "hand": "human",
         "object_scale": 1.0,
         "object_digest": "0" * 16,
         "kind": "constraints",
     }
-    made |= {"format": 2, "variants": list(set_file.REGIONS), "finger_joints": ["a", "b"]}
+    meta |= {"format": 2, "variants": list(set_file.REGIONS), "finger_joints": ["a", "b"]}
     sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
     arrays = {}
     for name, meaning in set_file.MEANING.items():
         letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
         kind = bool if "bool" in meaning else np.int32 if "indices" in meaning else np.float32
         arrays[name] = np.ones([int(x) if x.isdigit() else sizes[x] for x in letters], kind)
-    return Message(arrays, made)
+    return Message(arrays, meta)
 
 
 def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
     path = tmp_path / "a.safetensors"
-    made = constraint_set()
+    intact = constraint_set()
     for change, why in (
-        (Message(made.arrays, {**made.meta, "object": "../../x"}), "cannot name the object"),
-        (Message(made.arrays, {**made.meta, "object_scale": -1}), "object_scale"),
+        (Message(intact.arrays, {**intact.meta, "object": "../../x"}), "cannot name the object"),
+        (Message(intact.arrays, {**intact.meta, "object_scale": -1}), "object_scale"),
         (
-            Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta),
+            Message({**intact.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, intact.meta),
             "pose/q holds",
         ),
         (
-            Message({**made.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, made.meta),
+            Message({**intact.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, intact.meta),
             r"pose/q has shape \(2, 3, 9\), but",
         ),
     ):
         path.write_bytes(encode(change))
         with pytest.raises(CongraspError, match=why):
             set_file.load(path)
-    path.write_bytes(encode(made))
-    assert set_file.load(path).meta == made.meta
+    path.write_bytes(encode(intact))
+    assert set_file.load(path).meta == intact.meta
 
 
 def refused(function, path, why):

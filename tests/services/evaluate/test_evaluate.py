@@ -59,19 +59,19 @@ def experiment():
 
 def test_references_are_grasps_and_made_once(experiment, monkeypatch):
     policy = references.reference_policy(task.policy())[0]
-    told = []
+    progress = []
     arguments = (policy, experiment.task, experiment.scaled, experiment.bank)
-    made = references.make(
-        *arguments, physics="native", progress=lambda *counts: told.append(counts)
+    first = references.make(
+        *arguments, physics="native", progress=lambda *counts: progress.append(counts)
     )
-    assert made.grasps[:, 0].sum() > 4  # most of the 8 episodes succeed
-    assert told[-1][0] >= made.grasps.sum()
-    assert [count for count, _ in told] == sorted(count for count, _ in told)
+    assert first.grasps[:, 0].sum() > 4  # most of the 8 episodes succeed
+    assert progress[-1][0] >= first.grasps.sum()
+    assert [count for count, _ in progress] == sorted(count for count, _ in progress)
     monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
     again = references.make(*arguments, physics="native")
     assert isinstance(again, references.References)
-    np.testing.assert_array_equal(again.bank.pose_q, made.bank.pose_q)
-    np.testing.assert_array_equal(again.grasps, made.grasps)
+    np.testing.assert_array_equal(again.bank.pose_q, first.bank.pose_q)
+    np.testing.assert_array_equal(again.grasps, first.grasps)
 
 
 def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):

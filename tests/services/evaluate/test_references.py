@@ -66,18 +66,18 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
     of_policy, *below = (
         low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down)
     )
-    made = references.with_references(
+    with_grasps = references.with_references(
         policy,
         task.TASK,
         bank,
         [[[of_policy, below[0], of_policy], []], [[below[1]], []], *[[[], []]] * 2],
     )
-    np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
-    np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(of_policy.q, (POSES, 1)))
+    np.testing.assert_array_equal(with_grasps.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(with_grasps.bank.pose_q[0, 0], np.tile(of_policy.q, (POSES, 1)))
     closed = np.asarray(bank.pose_q)[1, 0]
-    for q in np.asarray(made.bank.pose_q)[1, 0]:
+    for q in np.asarray(with_grasps.bank.pose_q)[1, 0]:
         assert any(np.array_equal(q, other) for other in closed)
     # Of those that the table leaves room for
-    assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()
+    assert np.asarray(with_grasps.bank.pose_valid)[:, 0].any(1).all()
     for field in ("points", "heading_position", "rest"):
-        np.testing.assert_array_equal(getattr(made.bank, field), getattr(bank, field))
+        np.testing.assert_array_equal(getattr(with_grasps.bank, field), getattr(bank, field))

@@ -229,8 +229,8 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     of the episode.
     """
     recorded = episode(9)
-    made = turntable(recorded)
-    data = json.loads(made["data"])
+    scene = turntable(recorded)
+    data = json.loads(scene["data"])
 
     def array(name, kind, *shape):
         return np.frombuffer(base64.b64decode(data[name]), kind).reshape(-1, *shape)
@@ -254,7 +254,7 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     )
     assert array("faces", "<u4", 3).max() < len(points)
     assert data["table"][1] == array("faces", "<u4").size
-    motion = {**made, "constraint": "x"}
+    motion = {**scene, "constraint": "x"}
     content = ReportContent(policy, "p", [], "", Commands("c", ""), motion=motion)
     write_report(tmp_path / "r.html", content)
     assert "A grasp to turn around" in (tmp_path / "r.html").read_text()

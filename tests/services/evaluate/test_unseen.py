@@ -83,16 +83,16 @@ def pools_of(*groups, left_out=()):
 
 
 def test_episodes_of_an_object_do_not_depend_on_its_pool(simulated):
-    told = []
+    progress = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
-    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
+    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: progress.append)
     assert {obj["episodes"] for obj in all_pools.objects} == {2}
     assert [obj["name"] for obj in all_pools.objects] == [obj.name for obj in OBJECTS]
     assert all_pools.episodes == 10
     assert all_pools.covered == 5
     assert all_pools.pool == 6
     assert all_pools.success == 1.0
-    assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
+    assert progress == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
     assert sum(row.episodes for row in by_size) == 10
     assert {row.success_all for row in by_size} == {1.0}
@@ -141,18 +141,18 @@ def test_a_stopped_evaluation_resumes_at_the_next_pool(simulated, tmp_path):
 
 
 def test_no_more_than_the_next_pool_is_made_ahead(simulated):
-    made = []
+    loaded = []
     ahead = []
 
     def make(i):
-        made.append(i)
+        loaded.append(i)
         return Loaded(OBJECTS[:1], [])
 
     pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
     evaluated(
-        pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated))
+        pools, 5, track=lambda label, total: lambda done: ahead.append(len(loaded) - len(simulated))
     )
-    assert made == [0, 1, 2, 3, 4]
+    assert loaded == [0, 1, 2, 3, 4]
     assert max(ahead) <= 1
 
 

@@ -594,8 +594,13 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     assert not (tmp_path / "cylinder-0.bvh").exists()
     (tmp_path / "taken.bvh").rename(tmp_path / "cylinder-0.bvh")
     assert run("mug.npz", "logs", "--to", "lerobot") == 0
-    made = {"cylinder-0.bvh", "cylinder-0.bvh.json", "cylinder-0-lerobot", "cylinder-0.glb"}
-    assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
+    expected_files = {
+        "cylinder-0.bvh",
+        "cylinder-0.bvh.json",
+        "cylinder-0-lerobot",
+        "cylinder-0.glb",
+    }
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *expected_files}
     capsys.readouterr()
     for arguments, words in (
         (["mug.npz", "logs", "--to", "glb"], "contains a single motion, but there are 2"),

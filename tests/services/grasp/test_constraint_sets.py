@@ -46,13 +46,13 @@ def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
 
 
 def test_a_set_equals_the_bank_of_training(constraint_sets):
-    made = bank()
+    trained = bank()
     for n, constraints in enumerate(constraint_sets):
         arrays = constraints.arrays
-        np.testing.assert_array_equal(arrays["heading/position"], made.heading_position[n])
-        np.testing.assert_array_equal(arrays["pose/q"], made.pose_q[n])
+        np.testing.assert_array_equal(arrays["heading/position"], trained.heading_position[n])
+        np.testing.assert_array_equal(arrays["pose/q"], trained.pose_q[n])
         rest = arrays["rest"]
-        assert len(np.unique(rest, axis=0)) == len(rest) <= made.rest.shape[1]
+        assert len(np.unique(rest, axis=0)) == len(rest) <= trained.rest.shape[1]
         headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
         all_cleared, reachable = within_reach(headings, OBJECTS[n], rest, outline(HAND))
         np.testing.assert_array_equal(arrays["heading/allowed"][0], reachable)
@@ -92,11 +92,11 @@ def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
 
 
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
-    made = []
+    names = []
     monkeypatch.setattr(
         sets,
         "make_sets",
-        lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or [],
+        lambda hand, task, objects, seed, bank: names.extend(obj.name for obj in objects) or [],
     )
     store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
@@ -104,7 +104,7 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     store.save(dataclasses.replace(BOX, name="crate"), file)
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
     assert load("constraints")(["generate", *arguments, *folder])() == 0
-    assert made == ["box_0", "mug_7", "crate", "ball_0"]
+    assert names == ["box_0", "mug_7", "crate", "ball_0"]
     with pytest.raises(CongraspError, match="no objects for which to generate constraints"):
         load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):

@@ -260,13 +260,13 @@ def fake_grasps(monkeypatch, quick_import):
             "held": float(fake_episode.success),
             "push_survival": float(obj.name == "a"),
         }
-        made = dataclasses.replace(
+        fake_result = dataclasses.replace(
             fake_episode,
             object=obj.name,
             metrics=metrics,
             about={**fake_episode.about, "phases": {"grasp": 0.0, "hold": 0.04}},
         )
-        return Grasp(made, 4, 3, 0, ("The heading guides the wrist.",))
+        return Grasp(fake_result, 4, 3, 0, ("The heading guides the wrist.",))
 
     def attempt(self, obj, request, progress):
         calls.append(obj.name)

@@ -35,8 +35,8 @@ BALL = 0.04  # m
 
 @pytest.fixture(scope="module")
 def ball():
-    made = procedural.generate(1, "ball")
-    return made.scaled(2 * BALL / np.ptp(made.visual_vertices, axis=0).max())
+    obj = procedural.generate(1, "ball")
+    return obj.scaled(2 * BALL / np.ptp(obj.visual_vertices, axis=0).max())
 
 
 def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
@@ -136,15 +136,15 @@ def test_an_unreachable_grasp_is_an_error(ball) -> None:
 
 
 def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
-    made = episode()
-    made.about["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
+    recorded = episode()
+    recorded.about["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
     hand = get_hand("human")
-    first = Rotation.from_quat(made.wrist_quaternion[0], scalar_first=True)
+    first = Rotation.from_quat(recorded.wrist_quaternion[0], scalar_first=True)
     turns = Rotation.concatenate(
         [first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)]
     )
-    place = made.wrist_position[0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
-    longer = with_reach(made, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
+    place = recorded.wrist_position[0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
+    longer = with_reach(recorded, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
     assert longer.phases == {
         "approach": 0.0,
         "grasp": pytest.approx(0.03),
@@ -155,7 +155,7 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     assert motion.table[:11].all()
     assert not motion.table[11:].any()
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
-    np.testing.assert_allclose(motion.link_position[3:], made.link_position)
+    np.testing.assert_allclose(motion.link_position[3:], recorded.link_position)
     assert (motion.object_position == motion.object_position[0]).all()
     assert not motion.link_force[:3].any()
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
@@ -164,7 +164,7 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
         rotation = first * Rotation.from_euler("XYZ", u[t, 3:])
         assert (rotation.inv() * turns[t]).magnitude() < 1e-5
         np.testing.assert_allclose(
-            first.apply(u[t, :3]) + made.wrist_position[0], place[t], atol=1e-6
+            first.apply(u[t, :3]) + recorded.wrist_position[0], place[t], atol=1e-6
         )
     # Used as a reference, such a motion is cut to its grasp.
     assert grasp_part(motion) == (3, 10)

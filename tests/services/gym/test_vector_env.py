@@ -29,9 +29,9 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def vector():
-    made = congrasp.make_vec(num_envs=COUNT, **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, **SHORT)
+    yield environments
+    environments.close()
 
 
 @pytest.mark.slow
@@ -88,12 +88,12 @@ def test_a_seed_decides_everything(vector):
 
 
 def test_gymnasium_makes_it_by_its_id():
-    made = gym.make_vec(
+    environments = gym.make_vec(
         "congrasp.services.gym:congrasp/Grasp-v0", COUNT, "vector_entry_point", **SHORT
     )
-    assert isinstance(made.unwrapped, GraspVectorEnv)
-    assert made.reset(seed=0)[0].shape == made.observation_space.shape
-    made.close()
+    assert isinstance(environments.unwrapped, GraspVectorEnv)
+    assert environments.reset(seed=0)[0].shape == environments.observation_space.shape
+    environments.close()
 
 
 @pytest.mark.parametrize(
@@ -118,16 +118,16 @@ LENGTH = SHORT["approach_steps"] + SHORT["hold_steps"]
 
 @pytest.fixture(scope="module")
 def next_step():
-    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode="NextStep", **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, autoreset_mode="NextStep", **SHORT)
+    yield environments
+    environments.close()
 
 
 @pytest.fixture(scope="module")
 def manual():
-    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
+    yield environments
+    environments.close()
 
 
 def still(envs):

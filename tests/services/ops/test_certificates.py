@@ -26,14 +26,14 @@ def folder(tmp_path):
 
 
 def test_a_certificate_contains_run_role_number_hosts_and_expiry(folder):
-    made = read(
+    certificate = read(
         issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt"
     )
-    assert made.name == "human.learner.0"
-    assert made.identity == ("human", "learner", 0)
-    assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
-    assert made.expires.utcoffset() == datetime.timedelta(0)
-    assert 29.99 < made.days <= 30
+    assert certificate.name == "human.learner.0"
+    assert certificate.identity == ("human", "learner", 0)
+    assert certificate.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
+    assert certificate.expires.utcoffset() == datetime.timedelta(0)
+    assert 29.99 < certificate.days <= 30
     assert read(issue(folder, "learner") / "tls.crt").name == "human.learner.1"
     other = issue(folder, "learner", run="a.b-c")
     assert (
@@ -82,8 +82,8 @@ def test_openssl_accepts_listeners_only(folder, tmp_path):
 
 
 def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
-    made = issue(folder, "actor")
-    for key in (folder / "ca.key", made / "tls.key"):
+    certificate = issue(folder, "actor")
+    for key in (folder / "ca.key", certificate / "tls.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(CongraspError, match=r"already contains a certificate authority.*--force"):
@@ -92,7 +92,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
         issue(folder, "actor", number=0)
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     issue(folder, "actor", number=0, force=True)
-    assert (made / "tls.key").read_bytes() != before[made / "tls.key"]
+    assert (certificate / "tls.key").read_bytes() != before[certificate / "tls.key"]
     create_authority(folder, force=True)
     assert (folder / "ca.key").read_bytes() != before[folder / "ca.key"]
 

@@ -52,7 +52,9 @@ def test_node_over_zenoh_exchanges_cdr_with_other_libraries(example, capsys):
         bare_session("peer", shared_memory=True, listen=endpoint) as robot,
         node_of(example, example.ZenohBus(endpoint), age=0.4) as (node, policy, obj),
     ):
-        heard = {t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in OUTPUTS}
+        subscribers = {
+            t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in OUTPUTS
+        }
         silent = []
         commands = []
 
@@ -76,7 +78,8 @@ def test_node_over_zenoh_exchanges_cdr_with_other_libraries(example, capsys):
         eventually(lambda: turn() and arrived(commands, policy))
         turn()
         newest = {
-            t: eventually(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()
+            t: eventually(lambda s=s: s.try_recv()).payload.to_bytes()
+            for t, s in subscribers.items()
         }
         check(policy, obj, [read[OUTPUTS[t]](payload) for t, payload in newest.items()])
         silent.append("object_pose")

@@ -67,9 +67,9 @@ def test_the_fake_grasp_meets_its_constraints() -> None:
 
 
 def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    about = {**made.about, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}
-    lifted = lanes(dataclasses.replace(made, table=np.ones(STEPS, bool), about=about))
+    recorded = episode(STEPS, removal=REMOVAL)
+    about = {**recorded.about, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}
+    lifted = lanes(dataclasses.replace(recorded, table=np.ones(STEPS, bool), about=about))
     assert lifted["contact"].counts.tolist() == [False] * 20 + [True] * (STEPS - 20)
     assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
 
@@ -77,34 +77,34 @@ def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
 @pytest.mark.parametrize("name", ["heading", "trajectory"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
 def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> None:
-    made = episode(STEPS, removal=REMOVAL)
+    recorded = episode(STEPS, removal=REMOVAL)
     most = TOLERANCES[name, unit]
-    lane = lanes(with_error(made, **{f"{name}_{unit}": most + 0.001}))[name]
+    lane = lanes(with_error(recorded, **{f"{name}_{unit}": most + 0.001}))[name]
     np.testing.assert_allclose(lane.errors[unit], most + 0.001, atol=1e-6)
     assert not lane.met.any()
-    assert lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
+    assert lanes(with_error(recorded, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
 
 
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    assert lanes(made)["affordance"].met.all()
-    touching = np.linalg.norm(made.link_force, axis=-1).max(-1) > 0.05
-    lane = lanes(with_error(made, affordance_ratio=np.where(touching, 0.2, 0.0)))["affordance"]
+    recorded = episode(STEPS, removal=REMOVAL)
+    assert lanes(recorded)["affordance"].met.all()
+    touching = np.linalg.norm(recorded.link_force, axis=-1).max(-1) > 0.05
+    lane = lanes(with_error(recorded, affordance_ratio=np.where(touching, 0.2, 0.0)))["affordance"]
     np.testing.assert_array_equal(lane.met, ~touching)
     assert lane.errors["share"][-1] == pytest.approx(0.2)
 
 
 def test_only_the_fingers_of_a_pose_count_under_a_wrist_path() -> None:
-    made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
-    pose = lanes(made)["pose"]
+    recorded = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
+    pose = lanes(recorded)["pose"]
     assert pose.met[-1]
     assert set(pose.errors) == {"rad"}
     assert "distance" not in pose.legend
 
 
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
-    made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
-    message = made.to_message()
+    recorded = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
+    message = recorded.to_message()
     arrays = {**message.arrays, "active/fingers": np.bool_(True)}
     lane = lanes(Episode.from_message(Message(arrays, message.meta)))["fingers"]
     assert not lane.met.any()
@@ -128,13 +128,13 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
 
 
 def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> None:
-    made = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
-    recorded = Episode.from_message(older(made.to_message()))
+    current = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
+    recorded = Episode.from_message(older(current.to_message()))
     shown_lanes = lanes(recorded)
     assert set(shown_lanes) == {"contact"}
-    np.testing.assert_array_equal(shown_lanes["contact"].met, lanes(made)["contact"].met)
+    np.testing.assert_array_equal(shown_lanes["contact"].met, lanes(current)["contact"].met)
     page = for_page(recorded)
-    now = for_page(made)
+    now = for_page(current)
     kinds = ("arrow/", "polyline/", "ghost/", "paint/")
     drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
     assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
@@ -174,8 +174,8 @@ def test_a_picture_has_the_camera_of_the_page() -> None:
 
 def test_a_video_has_a_frame_for_every_40_ms() -> None:
     shares: list[float] = []
-    made = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
-    assert made.name == "cylinder-0-3.mp4"
+    video = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
+    assert video.name == "cylinder-0-3.mp4"
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
     command = [
@@ -188,7 +188,7 @@ def test_a_video_has_a_frame_for_every_40_ms() -> None:
         "rgb24",
         "-",
     ]
-    frames = subprocess.run(command, input=made.data, capture_output=True, check=True).stdout
+    frames = subprocess.run(command, input=video.data, capture_output=True, check=True).stdout
     assert len(frames) == len(shares) * 854 * 480 * 3
     assert len(shares) == 2  # steps 0 and 4
 

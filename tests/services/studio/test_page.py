@@ -38,12 +38,12 @@ def grasp(page: Any, site: Site) -> str:
     """
     before = {motion["id"] for motion in site.session.state()["motions"]}
     page.click("#grasp")
-    (made,) = eventually(
+    (file,) = eventually(
         lambda: {motion["id"] for motion in site.session.state()["motions"]} - before
     )
-    page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
+    page.wait_for_selector(f"[data-motion='{file}'][data-shown]")
     page.wait_for_selector("#player:not([hidden])")
-    return str(made)
+    return str(file)
 
 
 def handle(page: Any, name: str) -> tuple[float, float]:

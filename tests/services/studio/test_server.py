@@ -125,11 +125,11 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
     idle one ends.
     """
     monkeypatch.setattr(server_module, "MOST", 2)
-    made: list[Session] = []
+    sessions_made: list[Session] = []
 
     def new() -> Session:
-        made.append(fake.session(fake.FakePolicy()))
-        return made[-1]
+        sessions_made.append(fake.session(fake.FakePolicy()))
+        return sessions_made[-1]
 
     sessions = server_module.Sessions(new)
     server = PageServer(sessions.routes, "127.0.0.1", 0)
@@ -153,20 +153,20 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
         body = json.dumps({"action": "fill", "avoid": True}).encode()
         assert page.ask("POST", "/api/do", body, Cookie=cookies[0])[0] == 200
         assert [undoable(cookie) for cookie in cookies[:2]] == [True, False]
-        assert len(made) == 2
+        assert len(sessions_made) == 2
         assert undoable(cookies[0])  # used more recently than the second
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
             refused = json.loads(
                 page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1]
             )
             assert "2 browsers, the maximum, use" in refused["error"]
-            assert len(made) == 2
+            assert len(sessions_made) == 2
         monkeypatch.setattr(server_module, "IDLE", 0.0)
         assert not undoable(cookies[2])
-        assert len(made) == 3
+        assert len(sessions_made) == 3
         assert undoable(cookies[0])
         assert not undoable(cookies[1])
-        assert len(made) == 4
+        assert len(sessions_made) == 4
     finally:
         server.close()
         sessions.close()

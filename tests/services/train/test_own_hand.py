@@ -178,10 +178,10 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     assert "thumb        opposing_lower - opposing_upper" in printed
     assert "congrasp grasp examples/mug.obj --hand claw" in printed
     file = tmp_path / "hands" / "claw.json"
-    made = file.read_text()
+    hand_text = file.read_text()
     assert main.run(command) == 0
     assert len(ran) == 3
-    assert file.read_text() == made
+    assert file.read_text() == hand_text
     assert f"Using the existing hand 'claw' ({file})" in capsys.readouterr().out
     assert main.run(["hands", "list"]) == 0
     (row,) = [

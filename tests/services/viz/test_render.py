@@ -350,9 +350,9 @@ def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
 def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> None:
     best, aside = views(episode(), [11])
     assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
-    made = episode()
+    recorded = episode()
     hand = get_hand("human")
-    capsules = capsule_shapes(hand, made.link_position[11], made.link_quaternion[11])
+    capsules = capsule_shapes(hand, recorded.link_position[11], recorded.link_quaternion[11])
     shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
     tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # in contact
 

@@ -338,11 +338,11 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
 
     hand = get_hand(name)
     scale = get_hand(name).object_scale
-    made = sets["box"]
-    arrays = made.arrays
-    assert made.meta["hand"] == name
-    assert made.meta["object_scale"] == scale
-    assert len(describe(made)["captured"].split(", ")) == 2
+    constraint_set = sets["box"]
+    arrays = constraint_set.arrays
+    assert constraint_set.meta["hand"] == name
+    assert constraint_set.meta["object_scale"] == scale
+    assert len(describe(constraint_set)["captured"].split(", ")) == 2
     for m, case in enumerate(cases):
         q = arrays["pose/q"][0, m]
         assert q.shape == hand.lower.shape
@@ -369,4 +369,4 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
             arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1]
         )
     assert arrays["heading/position"].shape[1] == HEADINGS
-    assert bank_of([made]).pose_q.shape[-1] == len(hand.joints)
+    assert bank_of([constraint_set]).pose_q.shape[-1] == len(hand.joints)

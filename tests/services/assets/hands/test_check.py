@@ -183,17 +183,17 @@ def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
 
 
 def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
-    _, made = verdicts(CLAW)
-    monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: made)
+    _, report = verdicts(CLAW)
+    monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: report)
     file = tmp_path / "claw.json"
     file.write_text(hand_text(CLAW))
     assert main.run(["hands", "check", str(file), "--png", str(tmp_path / "claw.png")]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(made.findings) + 1
+    assert len(lines) == len(report.findings) + 1
     assert lines[0].startswith("passed  palm")
     assert (tmp_path / "claw.png").stat().st_size > 20_000
-    failed = made._replace(
-        findings=[made.findings[0]._replace(verdict="failed", remedy="another palm")]
+    failed = report._replace(
+        findings=[report.findings[0]._replace(verdict="failed", remedy="another palm")]
     )
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: failed)
     # Drawn above

@@ -114,9 +114,9 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     def evaluate_part(part, entrant, settings, out, track):
         trained.append(part.name)
         constraint = "heading" if part.table == "single" else "pose+trajectory"
-        made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
+        result_row = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
         about = {"pictures": [], "seconds": 1.0, "heading_rules": "Half of the headings are kept."}
-        return PartResult(part, "hands", [made], about, True)
+        return PartResult(part, "hands", [result_row], about, True)
 
     monkeypatch.setattr(training, "train_all", train_all)
     monkeypatch.setattr(reproduction, "evaluate_part", evaluate_part)
