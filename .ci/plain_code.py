@@ -30,8 +30,8 @@ NAMED_TUPLE = {"_replace", "_asdict", "_fields", "_make", "_field_defaults"}
 """Public methods and attributes of a `typing.NamedTuple`."""
 OF_JAX = {"_cache_size"}
 """Number of programs of a function that JAX compiled, which has no public name."""
-BY_NAME = {"getattr", "setattr", "delattr", "hasattr"}
-"""Functions, and methods of `pytest.MonkeyPatch`, that take the name of an attribute."""
+BY_NAME = {"getattr", "setattr", "delattr", "hasattr", "patch", "object"}
+"""Functions that take the name of an attribute; also methods of `pytest.MonkeyPatch` and `mock`."""
 
 Finding = tuple[int, str]
 """Line and description."""
@@ -79,7 +79,7 @@ def nested_comprehensions(tree: ast.Module) -> Iterator[Finding]:
 
 def is_private(name: str) -> bool:
     """True for a name with one leading underscore that is not public all the same."""
-    if not name.startswith("_") or name.startswith("__") or name == "_":
+    if not name.startswith("_") or name.startswith("__"):
         return False
     return name not in NAMED_TUPLE | OF_JAX
 
@@ -142,6 +142,8 @@ def names_in_call(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
     if function not in BY_NAME:
         return
     for argument in node.args[:2]:
+        if isinstance(argument, ast.JoinedStr) and argument.values:
+            argument = argument.values[0]  # its text before the first replacement
         if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
             yield argument.value.rpartition(".")[2], node.args[0]
 

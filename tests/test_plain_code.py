@@ -54,6 +54,8 @@ def test_a_plain_comprehension_passes(linter):
         "monkeypatch.setattr(module, '_LIMIT', 3)",
         "monkeypatch.setattr('congrasp.learner.process._LIMIT', 3)",
         "getattr(made_elsewhere, '_rows')",
+        "mock.patch.object(module.Engine, '_step')",
+        "getattr(made_elsewhere, f'_{name}')",
     ],
 )
 def test_private_names_of_the_project_are_refused(linter, use):
