@@ -2,18 +2,27 @@
 
 `upload` assigns a rollout its identity (actor, incarnation, sequence), under which it is sent until
 the learner replies, across restarts of the learner (`actors.uploads`). Sending happens in the
-background, while the next rollout is produced; at most `window` rollouts are in transit, further
+background, while the next rollout is produced; a limited number of rollouts is in transit, further
 ones wait in `upload`.
+
+Over a slow network, tickets and weights are requested in the background, too, before they are
+needed (`actors.pace`). A rollout is then produced with a policy that is at least as new as its
+ticket requires. The learner promises that such a rollout is not too old when it is used, if it
+arrives before those of later tickets; the actor adds the updates that have passed meanwhile.
 """
 
+import collections
 import contextlib
+import functools
 import itertools
 import secrets
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from typing import Any, NamedTuple
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any, NamedTuple, TypeVar
 
+from congrasp.actors.pace import Pace, UploadWindow
 from congrasp.actors.patience import Patience, backoff
 from congrasp.actors.uploads import Outcome, Uploads
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
@@ -25,6 +34,13 @@ from congrasp.common.wire.codec import Message, SharedMessage, checksum
 _POLL_S = 0.2
 _CONFIG_TIMEOUT_S = 1.0
 """Deadline of a request for the configuration, after which a stop is noticed."""
+_TICKET_TIMEOUT_S = 60.0
+"""Deadline of a ticket that is requested in the background."""
+_MAX_TICKETS_AHEAD = 4
+"""Most tickets that are requested before they are needed."""
+_MEASURED_ROLLOUTS = 16
+"""Latest rollouts during which updates are counted."""
+_Result = TypeVar("_Result")
 OpenJournal = Callable[[str], Journal | None]
 """run id -> the journal of this actor's rollouts in that run; None for none."""
 
@@ -56,6 +72,16 @@ class Ticket(NamedTuple):
     id: str
     version: int
     """Policy version of the learner when it was granted."""
+    required_version: int = -1
+    """Oldest policy version with which the rollout is not too old when it is used."""
+
+
+class _Weights(NamedTuple):
+    """A policy bundle as it was received."""
+
+    bundle: Message
+    session: str
+    """Session of the learner before the request."""
 
 
 class ActorLink(Closing):
@@ -68,6 +94,7 @@ class ActorLink(Closing):
         actor: str,
         *,
         window: int = 1,
+        max_window: int = 8,
         max_refusals: int = 5,
         request_timeout: float = 10.0,
         patience: float = 300.0,
@@ -79,7 +106,8 @@ class ActorLink(Closing):
           transport: a connected transport.
           run: name of the run.
           actor: the actor's name, unique in the run.
-          window: most rollouts in transit.
+          window: rollouts in transit at first, and at least.
+          max_window: most rollouts in transit, over a slow network.
           max_refusals: consecutive refused rollouts after which the link fails.
           request_timeout: deadline of a request in seconds, extended by the size of a rollout.
           patience: seconds without a reply after which the link fails.
@@ -98,16 +126,24 @@ class ActorLink(Closing):
         self._held_session = ""
         self._finished = False
         self._answered = self._patience.now()
-        self._next_ticket = secrets.token_hex(8)  # its id, until it is granted
+        self._next_ticket = _new_ticket_id()
+        self._pace = Pace()
+        self._rollout_began = time.monotonic()
+        self._passed_updates = collections.deque[int](maxlen=_MEASURED_ROLLOUTS)
+        self._tickets_ahead: list[Future[Ticket | None]] = []
+        self._held_version = -1
+        self._weights_lock = threading.Lock()
+        self._weights_ahead: Future[_Weights | None] | None = None
         self._sequence = itertools.count()
         self._open_journal = journal
         self._journal: Journal | None = None
-        self._news = threading.Event()
+        self._news = threading.Condition()
+        self._announced = 0
         self._uploads = Uploads(
             transport,
             self.keys.rollout(actor),
             self._note,
-            window=window,
+            window=UploadWindow(window, max(window, max_window)),
             max_refusals=max_refusals,
             request_timeout=request_timeout,
             patience=self._patience,
@@ -136,6 +172,8 @@ class ActorLink(Closing):
             self._uploads.journal = self._journal
             self._write()
         self._uploads.start_over()
+        self._tickets_ahead.clear()
+        self._weights_ahead = None
         return self._info
 
     def wait_for_config(self, stop: threading.Event) -> RunInfo | None:
@@ -164,27 +202,76 @@ class ActorLink(Closing):
           RunRestarted, RunFinished: see these classes.
           CongraspError: the learner refused too many rollouts, or has been silent for too long.
         """
+        self._check()
+        if self._tickets_ahead:
+            ticket = self._ticket_ahead(timeout)
+        else:
+            ticket = self._request_ticket(self._next_ticket, timeout)
+            if ticket is not None:
+                self._next_ticket = _new_ticket_id()
+        if ticket is not None:
+            self._request_ahead()
+        self._rollout_began = time.monotonic()
+        return ticket
+
+    def _request_ahead(self) -> None:
+        """Requests tickets in the background, if waiting for them would delay the next rollouts."""
+        ahead = self._pace.overlapping("ticket", _MAX_TICKETS_AHEAD)
+        while len(self._tickets_ahead) < ahead:
+            request = functools.partial(self._request_ticket, _new_ticket_id(), _TICKET_TIMEOUT_S)
+            self._tickets_ahead.append(_in_background(request))
+
+    def _ticket_ahead(self, timeout: float) -> Ticket | None:
+        """Returns a ticket that was requested ahead; None if none is granted within `timeout`
+        seconds.
+
+        It need not be the one that was requested first: the learner may grant them in any order.
+        """
+        done, _ = wait(self._tickets_ahead, timeout, return_when=FIRST_COMPLETED)
+        self._check()
+        if not done:
+            return None
+        granted = done.pop()
+        self._tickets_ahead.remove(granted)
+        return granted.result()
+
+    def _request_ticket(self, ticket_id: str, timeout: float) -> Ticket | None:
+        """Requests a ticket until it is granted; None if that takes longer than `timeout` seconds,
+        or if the learner cannot be reached.
+        """
         deadline = self._patience.now() + timeout
         while True:
             self._check()
-            self._news.clear()
+            announced = self._announced
+            began = time.monotonic()
             try:
-                reply = self._ask(self._ticket_key, self._identity(self._next_ticket), deadline)
+                reply = self._ask(self._ticket_key, self._identity(ticket_id), deadline)
             except RefusedError:
                 raise
             except TransportError as error:
                 self._patience.check(self._answered, error)
                 return None
+            self._pace.record("ticket", time.monotonic() - began)
             self._note(reply.meta)
             self._check()
             if reply.meta["granted"]:
-                granted = Ticket(self._next_ticket, int(reply.meta["version"]))
-                self._next_ticket = secrets.token_hex(8)
-                return granted
+                return self._granted(ticket_id, reply)
             delay = min(float(reply.meta["retry_after"]), deadline - self._patience.now())
             if delay <= 0:
                 return None
-            self._news.wait(delay)
+            self._wait_for_news(announced, delay)
+
+    def _granted(self, ticket_id: str, reply: Message) -> Ticket:
+        """Returns a ticket, whose required version allows for the updates during a rollout."""
+        version = int(reply.meta["version"])
+        required = int(reply.meta.get("required_version", version))
+        passed = max(list(self._passed_updates), default=0)
+        return Ticket(ticket_id, version, min(version, required + passed))
+
+    def _wait_for_news(self, announced: int, timeout: float) -> None:
+        """Waits until the learner has made more announcements than `announced`."""
+        with self._news:
+            self._news.wait_for(lambda: self._announced != announced, timeout)
 
     def give_back(self, ticket: Ticket) -> None:
         """Returns a ticket that is not needed; if that fails, it expires."""
@@ -192,40 +279,88 @@ class ActorLink(Closing):
         with contextlib.suppress(TransportError):
             self._transport.query(self._ticket_key, request, timeout=self._timeout)
 
-    def weights(self, newer_than: int) -> Message | None:
-        """Returns the latest policy bundle, or None if the caller has it already or the learner is
-        unreachable.
+    def weights(self, newer_than: int, required: int | None = None) -> Message | None:
+        """Returns the latest policy bundle, or None if the caller need not change its policy: it
+        has the latest, or the learner is unreachable, or a later one is still on its way.
 
         Sends no request unless the learner has announced another version.
 
         Args:
           newer_than: the version that the caller has; -1 for none.
+          required: the oldest version that will do, as the ticket says: a policy on its way is
+            then waited for only if the caller's is older. None waits for the latest.
 
         Raises:
           RunRestarted, RunFinished: see these classes.
           CongraspError: see `acquire_ticket`.
         """
         self._check()
-        if newer_than >= 0 and (newer_than, self._held_session) == self._learner:
-            return None
+        self._held_version = newer_than
+        while not self._is_latest():
+            self._fetch_ahead()
+            fetching = self._weights_ahead
+            if fetching is None:  # it became the latest meanwhile
+                break
+            if not self._must_wait(required) and not fetching.done():
+                break
+            fetched = fetching.result()
+            self._weights_ahead = None
+            self._check()
+            if fetched is None:
+                break
+            self._held_version = int(fetched.bundle.meta["version"])
+            self._held_session = fetched.session
+            if required is None or self._held_version >= required:
+                self._rollout_began = time.monotonic()
+                return fetched.bundle
+        return None
+
+    def _is_latest(self) -> bool:
+        """True if the caller has the latest policy that the learner has announced."""
+        return self._held_version >= 0 and self._learner == (
+            self._held_version,
+            self._held_session,
+        )
+
+    def _must_wait(self, required: int | None) -> bool:
+        """True if the caller cannot or need not act with its policy while a later one is on its
+        way.
+        """
+        if self._held_session != self._learner[1]:
+            return True
+        if required is None or self._held_version < required:
+            return True
+        return not self._pace.overlapping("weights", 1)
+
+    def _fetch_ahead(self) -> None:
+        """Fetches the latest policy in the background, unless the caller has it or that is being
+        done.
+        """
+        with self._weights_lock:
+            if self._weights_ahead is not None or self._is_latest():
+                return
+            fetch = functools.partial(self._fetch_weights, self._held_version, self._held_session)
+            self._weights_ahead = _in_background(fetch)
+
+    def _fetch_weights(self, newer_than: int, held_session: str) -> "_Weights | None":
+        """Requests the latest policy bundle; None if it is that of version and session."""
         _, session = self._learner
-        request = Message(meta={"newer_than": newer_than, "session_id": self._held_session})
+        request = Message(meta={"newer_than": newer_than, "session_id": held_session})
+        began = time.monotonic()
         try:
             reply = self._transport.query(self._weights_key, request, timeout=self._timeout)
         except TransportError:
             return None
         if not reply.arrays:
             self._note(reply.meta)
-            self._check()
             return None
+        self._pace.record("weights", time.monotonic() - began)
         if self._info and reply.meta.get("run_id") != self._info.run_id:
             self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("run_id"))
-        self._check()
-        self._held_session = session
-        return reply
+        return _Weights(reply, session)
 
     def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
-        """Queues a rollout for sending in the background; waits while `window` others are in
+        """Queues a rollout for sending in the background; waits while too many others are in
         transit.
 
         Args:
@@ -243,8 +378,9 @@ class ActorLink(Closing):
         self._check()
         if self._info is None:
             raise CongraspError("The link has no configuration yet.", "Call 'config' first.")
-        while not self._uploads.free.acquire(timeout=_POLL_S):
+        while not self._uploads.window.enter(_POLL_S):
             self._check()
+        self._pace.record("rollout", time.monotonic() - self._rollout_began)
         self._check()
         meta = {
             **rollout.meta,
@@ -255,7 +391,14 @@ class ActorLink(Closing):
         message = SharedMessage(rollout.arrays, meta)
         if self._journal is not None:
             self._write(made=meta["sequence"], version=meta["version"], checksum=checksum(message))
-        return self._uploads.put(message)
+        outcome = self._uploads.put(message)
+        outcome.add_done_callback(functools.partial(self._count_updates, ticket))
+        return outcome
+
+    def _count_updates(self, ticket: Ticket, outcome: "Future[Outcome]") -> None:
+        """Counts the updates between a ticket and the outcome of its rollout."""
+        version, _ = self._learner
+        self._passed_updates.append(max(0, version - ticket.version))
 
     def flush(self, timeout: float) -> bool:
         """Waits until every rollout has its outcome; False if that takes longer than `timeout`
@@ -302,7 +445,11 @@ class ActorLink(Closing):
             _, message = received
             with contextlib.suppress(KeyError, TypeError, ValueError):  # invalid message
                 self._note(message.meta)
-                self._news.set()
+                with self._news:
+                    self._announced += 1
+                    self._news.notify_all()
+                if self._pace.overlapping("weights", 1):
+                    self._fetch_ahead()
 
     def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:
         """Sends a request until there is a reply, which may be a refusal."""
@@ -323,6 +470,25 @@ class ActorLink(Closing):
         """Writes an entry into the journal, if there is one."""
         if self._journal is not None:
             self._journal.write(actor=self.actor, incarnation=self.incarnation, **entry)
+
+
+def _in_background(request: Callable[[], _Result]) -> "Future[_Result]":
+    """Makes a request in a thread that does not delay the end of the process."""
+    future = Future[_Result]()
+
+    def run() -> None:
+        try:
+            future.set_result(request())
+        except Exception as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True, name="request").start()
+    return future
+
+
+def _new_ticket_id() -> str:
+    """Returns an id for a ticket that is to be requested."""
+    return secrets.token_hex(8)
 
 
 def _restarted(before: str, now: Any) -> RunRestarted:

@@ -235,7 +235,7 @@ class _Actor:
                 if ticket is None:
                     continue
                 granted_at = time.monotonic()
-                if not self._refresh():
+                if not self._refresh(ticket.required_version):
                     self._link.give_back(ticket)
                     stop.wait(_TICKET_TIMEOUT_S)
                     continue
@@ -296,10 +296,12 @@ class _Actor:
             stationary=config.curriculum.stationary(version),
         )
 
-    def _refresh(self) -> bool:
-        """Fetches the newest policy; returns True if there is any."""
+    def _refresh(self, required: int | None = None) -> bool:
+        """Fetches the newest policy, or one that is not older than a ticket requires if newer ones
+        take long; returns True if there is any.
+        """
         version = -1 if self._bundle is None else self._bundle.version
-        message = self._link.weights(version)
+        message = self._link.weights(version, required)
         if message is not None:
             bundle = PolicyBundle.from_message(message, "of the learner")
             self._spec.require(bundle.spec, "of the learner")

@@ -1,5 +1,6 @@
 """Background threads that send rollouts to the learner until each has its outcome."""
 
+import math
 import queue
 import threading
 import time
@@ -7,14 +8,17 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Literal, NamedTuple
 
+from congrasp.actors.pace import UploadWindow
 from congrasp.actors.patience import Patience, backoff
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.io.journal import Journal
 from congrasp.common.transport.base import Transport
-from congrasp.common.wire.codec import Message
+from congrasp.common.wire.codec import CompressedMessage, Message, encode
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout: `duplicate` if it had been accepted before, `stale` if it was too old."""
+_COMPRESSED_BELOW = 20e6
+"""Speed of a link below which rollouts are compressed, bytes/s: a tenth of the compression's."""
 _SLOWEST_LINK = 100e3
 """Speed of the slowest link that is waited for, bytes/s."""
 
@@ -32,8 +36,7 @@ class Uploads:
     Attributes:
       failure: the reason why sending has stopped, if it has; also set by the owner.
       journal: records the outcome of each rollout, if the owner sets it.
-      free: acquired by the owner for each queued rollout; released when that rollout has its
-        outcome.
+      window: entered by the owner for each queued rollout, which leaves it with its outcome.
       closed: set once sending has been stopped.
     """
 
@@ -43,7 +46,7 @@ class Uploads:
         key: str,
         on_reply: Callable[[Mapping[str, Any]], None],
         *,
-        window: int,
+        window: UploadWindow,
         max_refusals: int,
         request_timeout: float,
         patience: Patience,
@@ -54,14 +57,14 @@ class Uploads:
           transport: a connected transport.
           key: key to which rollouts are sent.
           on_reply: called with the state of the learner, which comes with every reply.
-          window: most rollouts in transit.
+          window: limits the rollouts in transit.
           max_refusals: consecutive refused rollouts after which sending stops.
           request_timeout: deadline of a query in seconds, extended by the rollout's size.
           patience: limit of the learner's silence.
         """
         self.failure: CongraspError | None = None
         self.journal: Journal | None = None
-        self.free = threading.Semaphore(window)
+        self.window = window
         self.closed = threading.Event()
         self._transport = transport
         self._key = key
@@ -70,9 +73,10 @@ class Uploads:
         self._timeout = request_timeout
         self._patience = patience
         self._refusals = 0
+        self._bytes_per_s = math.inf
         self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
-        for index in range(window):
+        for index in range(window.most):
             threading.Thread(target=self._send_all, daemon=True, name=f"upload-{index}").start()
 
     def put(self, message: Message) -> "Future[Outcome]":
@@ -106,7 +110,7 @@ class Uploads:
         self._queue.put(None)
 
     def _send_all(self) -> None:
-        """Sends rollouts from the queue until it is closed; one thread of `window`."""
+        """Sends rollouts from the queue until it is closed; one thread of `window.most`."""
         while (upload := self._queue.get()) is not None:
             message, outcome = upload
             try:
@@ -118,7 +122,7 @@ class Uploads:
                 self.failure = CongraspError(f"The learner's reply is not valid: {error!r}.")
                 outcome.set_exception(self.failure)
             finally:
-                self.free.release()
+                self.window.leave()
         self._queue.put(None)
 
     def _deliver(self, message: Message) -> Outcome:
@@ -127,8 +131,13 @@ class Uploads:
         damaged = 0
         timeout = self._timeout_of(message)
         delays = backoff()
+        size = sum(array.nbytes for array in message.arrays.values())
+        if self._bytes_per_s < _COMPRESSED_BELOW:
+            message = CompressedMessage(message.arrays, message.meta)
+            size = len(encode(message))
         while not self.closed.is_set():
             delay = next(delays)
+            began = time.monotonic()
             try:
                 reply = self._transport.query(self._key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
@@ -140,6 +149,9 @@ class Uploads:
                 self._patience.check(answered, error)
             else:
                 answered = self._patience.now()
+                seconds = time.monotonic() - began
+                self.window.record(seconds)
+                self._bytes_per_s = size / seconds
                 outcome = self._outcome(message, reply.meta)
                 if outcome is not None:
                     return outcome

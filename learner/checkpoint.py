@@ -17,14 +17,13 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.io.inputs import open_file
 from congrasp.common.io.opening import random_name
+from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.wire.codec import Message, decode, encode
 
 KEPT = 3

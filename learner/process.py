@@ -24,7 +24,7 @@ from congrasp.common.config import RunConfig, to_json
 from congrasp.common.errors import CongraspError, PhysicsError, TransportError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.bundle import PolicyBundle, without_critic
 from congrasp.common.runtime.stages import stage
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
@@ -505,7 +505,8 @@ class _Learner:
                 note_version(self._run_dir, self.version)
             except CongraspError as error:
                 self._event("error", str(error))
-        self._hub.publish_weights(self.bundle().to_message(), self.version)
+        policy = without_critic(self.bundle())  # actors need no more
+        self._hub.publish_weights(policy.to_message(), self.version)
         if self._ranks.rank:
             return
         meta = {"version": self.version, "run_id": self._run_id, "schema": self._spec.schema}

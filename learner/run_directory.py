@@ -19,7 +19,7 @@ import os
 import pathlib
 import shlex
 from collections.abc import Callable, Iterator
-from typing import BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from congrasp.common import named_inputs
 from congrasp.common.config import NamedInput, RunConfig, run_config_from_json, to_json
@@ -30,10 +30,15 @@ from congrasp.common.io.inputs import read_file
 from congrasp.common.io.locks import NoLocksError, try_lock
 from congrasp.common.io.opening import open_to_update
 from congrasp.common.io.spelling import check_spelling
-from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.runtime.lazy_module import LazyModule
 from congrasp.learner.checkpoint import Checkpoints, read_checkpoint, set_aside
 from congrasp.learner.hub.used_rollouts import journalled_version
+
+if TYPE_CHECKING:
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.common.policy.bundle import PolicyBundle
+else:
+    bundles = LazyModule("congrasp.common.policy.bundle")  # imports JAX
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"
@@ -71,7 +76,7 @@ _LAUNCH_LOCK = _LockFiles("launch.lock", "launch.claim")
 
 
 def create_run(
-    run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None
+    run_dir: pathlib.Path, config: RunConfig, initial: "PolicyBundle | None" = None
 ) -> None:
     """Creates a run directory.
 
@@ -107,7 +112,7 @@ def create_run(
     (run_dir / LOGS).mkdir(exist_ok=True)
 
 
-def initial_notes(initial: PolicyBundle, config: RunConfig, file: pathlib.Path) -> Iterator[str]:
+def initial_notes(initial: "PolicyBundle", config: RunConfig, file: pathlib.Path) -> Iterator[str]:
     """Yields a line on each part of a run's networks that the initial policy does not determine.
 
     Args:

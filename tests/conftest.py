@@ -23,8 +23,10 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
     os.environ.setdefault("XLA_FLAGS", flags)
     os.environ["CONGRASP_CHECKED_XLA_FLAGS"] = os.environ["XLA_FLAGS"]  # by every command, else
 
+import ctypes
 import gc
 import pathlib
+from typing import Any
 
 import psutil
 import pytest
@@ -65,12 +67,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place.get(str(item.path), len(place)))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Workers that get whole modules get those of one folder after the other."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from tests.scheduling import LoadFolderScheduling
+
+    return LoadFolderScheduling(config, log)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _bounded_memory():
     """Compiled programs stay for the modules that follow, until they fill the memory."""
     yield
     if "jax" in sys.modules and psutil.Process().memory_info().rss > _MOST_MEMORY:
         sys.modules["jax"].clear_caches()
+        return_freed_memory()
+
+
+def return_freed_memory() -> None:
+    """Returns memory that is no longer used to the system.
+
+    The C library keeps it otherwise: the process stays as large as before, and programs would be
+    dropped after every module that follows.
+    """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 @pytest.fixture(scope="session")

@@ -4,10 +4,11 @@ Modules that share hand, task, policy and batch share compiled programs, in one 
 the disk's cache.
 """
 
+import contextlib
 import functools
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 from unittest import mock
 
@@ -40,16 +41,21 @@ CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 """A run whose policy is tiny."""
 
 
-@functools.cache
-def bank() -> ConstraintBank:
-    """The constraint bank of `OBJECTS`; kept on disk like those of large pools, for the other
-    workers.
-    """
+@contextlib.contextmanager
+def kept_banks() -> Iterator[None]:
+    """Keeps banks on disk like those of large pools, for the other workers."""
     folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
     with (
         mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
         mock.patch.object(cache, "LEAST_OBJECTS", 1),
     ):
+        yield
+
+
+@functools.cache
+def bank() -> ConstraintBank:
+    """The constraint bank of `OBJECTS`."""
+    with kept_banks():
         return build_bank(HAND, TASK, OBJECTS, 0)
 
 

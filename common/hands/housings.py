@@ -4,9 +4,9 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 
 from congrasp.common.hands.flesh import Skeleton, Surface
+from congrasp.common.runtime.lazy_trimesh import trimesh
 
 _SECTIONS = 20
 """Sides of a housing."""

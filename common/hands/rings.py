@@ -1,9 +1,9 @@
 """Closed surfaces through rings of points, for the nails and the sleeve of a hand."""
 
 import numpy as np
-import trimesh
 
 from congrasp.common.hands.flesh import Surface
+from congrasp.common.runtime.lazy_trimesh import trimesh
 
 POINTS_PER_RING = 28
 

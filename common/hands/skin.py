@@ -8,7 +8,6 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 
 from congrasp.common import mirror
 from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of
@@ -18,6 +17,7 @@ from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.nails import nails
 from congrasp.common.hands.sleeve import sleeve
 from congrasp.common.hands.spec import Hand, Link, link_origin
+from congrasp.common.runtime.lazy_trimesh import trimesh
 
 HUMAN_HANDS = ("human", "mano")
 """Names of hands with flesh."""
@@ -180,7 +180,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     )
 
 
-def _unit_normals(mesh: trimesh.Trimesh) -> np.ndarray:
+def _unit_normals(mesh: "trimesh.Trimesh") -> np.ndarray:
     """Returns normals (V, 3) of a mesh's points.
 
     Where the faces around a point are back to back and cancel, it is the normal of one of them; of
@@ -196,7 +196,7 @@ def _unit_normals(mesh: trimesh.Trimesh) -> np.ndarray:
     return normals
 
 
-def _rounded(link: Link) -> trimesh.Trimesh:
+def _rounded(link: Link) -> "trimesh.Trimesh":
     """Returns a mesh of a link's capsules, in the wrist frame at zero."""
     parts = []
     for capsule in link.capsules:

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from congrasp.common.runtime.lazy_trimesh import trimesh
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message

@@ -8,10 +8,10 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull
 
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
+from congrasp.common.runtime.lazy_trimesh import trimesh
 from congrasp.common.runtime.physics_library import mujoco
 
 DENSE = 8192
@@ -57,7 +57,7 @@ def _hull(data: bytes) -> ConvexHull:
     return ConvexHull(np.frombuffer(data).reshape(-1, 3))
 
 
-def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
+def triangulate(vertices: np.ndarray) -> "trimesh.Trimesh":
     """Convex hull of points (V, 3) as a closed mesh with outward normals; it is cached and must not
     be modified.
     """
@@ -65,7 +65,7 @@ def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
 
 
 @functools.lru_cache(maxsize=32)
-def _triangulated(data: bytes) -> trimesh.Trimesh:
+def _triangulated(data: bytes) -> "trimesh.Trimesh":
     """Mesh of the hull of points given as bytes of float64."""
     hull = _hull(data)
     vertices = hull.points

@@ -4,10 +4,16 @@ custom hands.
 
 import os
 import pathlib
+from typing import TYPE_CHECKING
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
-from congrasp.common.policy import bundle as bundles
+from congrasp.common.runtime.lazy_module import LazyModule
+
+if TYPE_CHECKING:
+    from congrasp.common.policy import bundle as bundles
+else:
+    bundles = LazyModule("congrasp.common.policy.bundle")  # imports JAX
 
 FOLDER = pathlib.Path(__file__).with_name("data")
 """Folder of the policies of the package."""

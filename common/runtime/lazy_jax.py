@@ -5,26 +5,17 @@ The import takes most of a second. `congrasp COMMAND --help` needs constraints, 
 sensors and the configuration of a run, but computes nothing with them.
 """
 
-import importlib
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from congrasp.common.runtime.lazy_module import LazyModule
 
 if TYPE_CHECKING:
     import jax
     import jax.numpy as jnp
 else:
-
-    class _Module:
-        """A module that is imported when one of its names is first used."""
-
-        def __init__(self, name: str):
-            self._name = name
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(importlib.import_module(self._name), name)
-
-    jax = _Module("jax")
-    jnp = _Module("jax.numpy")
+    jax = LazyModule("jax")
+    jnp = LazyModule("jax.numpy")
 
 __all__ = ["jax", "jnp", "register_pytree"]
 

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 
 import numpy as np
-import trimesh
+
+from congrasp.common.runtime.lazy_trimesh import trimesh
 
 _CELL = 0.004
 """Spacing of points on a hand's meshes, m."""

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import math
 import secrets
 import struct
 import threading
@@ -17,9 +18,9 @@ _MIN_CHUNK_BYTES = 8 << 10
 _DEFAULT_CHUNK_BYTES = 32 << 10
 _MAX_CHUNK_BYTES = 4 << 20
 _FAST_S = 0.1
-"""Duration of a chunk below which the next one is longer."""
+"""Duration of a chunk beyond the round trip below which the next one is longer."""
 _SLOW_S = 0.4
-"""Duration of a chunk above which the next one is shorter."""
+"""Duration of a chunk beyond the round trip above which the next one is shorter."""
 CHUNK_TIMEOUT_S = 1.0
 """Time until a chunk counts as lost."""
 PAUSE_S = 0.05
@@ -41,6 +42,7 @@ class Pace:
 
     def __init__(self) -> None:
         self._chunk_bytes = _DEFAULT_CHUNK_BYTES
+        self._round_trip_s = math.inf
 
     def first_request(self) -> bytes | None:
         """Attachment of a query that requests a longer first chunk; None before the first long
@@ -61,10 +63,17 @@ class Pace:
     def record(self, seconds: float, *, arrived: bool) -> None:
         """Records the duration of a chunk and whether it arrived; a deferred one changes
         nothing.
+
+        The shortest duration counts as the round trip, which the length does not change.
         """
-        if seconds > _SLOW_S:
+        if arrived:
+            self._round_trip_s = min(self._round_trip_s, seconds)
+        transfer_s = seconds
+        if math.isfinite(self._round_trip_s):
+            transfer_s -= self._round_trip_s
+        if transfer_s > _SLOW_S:
             self._chunk_bytes = max(_MIN_CHUNK_BYTES, self._chunk_bytes // 2)
-        elif arrived and seconds < _FAST_S:
+        elif arrived and transfer_s < _FAST_S:
             self._chunk_bytes = min(_MAX_CHUNK_BYTES, 2 * self._chunk_bytes)
 
 

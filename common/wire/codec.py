@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.wire import compression
 
 try:  # the same checksum, seven times as fast if installed
     from isal.isal_zlib import crc32
@@ -75,6 +76,15 @@ class SharedMessage(Message):
         return _encode(self)
 
 
+class CompressedMessage(SharedMessage):
+    """A message whose encoded form is compressed; it arrives as a plain one."""
+
+    @functools.cached_property
+    def encoded(self) -> bytes:
+        """The encoded and compressed message."""
+        return compression.deflated(_encode(self))
+
+
 def encode(message: Message) -> bytes:
     """Encodes a message as safetensors bytes.
 
@@ -125,7 +135,7 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
 
     Args:
       data: the bytes; the arrays of the result are views of them, and `encode` of the result
-        returns the same bytes.
+        returns the same bytes, or those of the plain form if they are compressed.
       max_bytes: limit of the message's length.
 
     Raises:
@@ -133,6 +143,8 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     """
     if len(data) > max_bytes:
         raise CongraspError(f"The message has {len(data)} bytes; the limit is {max_bytes}.")
+    if data[: len(compression.FRAME_START)] == compression.FRAME_START:
+        data = compression.inflated(data, max_bytes)
     text, section = _split(data)
     _check_checksum(text, section)
     header = _parse_header(text)

@@ -8,14 +8,16 @@ time (`learner.hub.limits.PutOff`).
 import collections
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.limits import PutOff
-from congrasp.learner.hub.task_ranges import Ranges
+
+if TYPE_CHECKING:
+    from congrasp.learner.hub.task_ranges import Ranges
 
 _LOG_DENSITY = (-100.0, 10.0)
 """Bounds of the log probability of each action, nats: the lower is reached 14 standard deviations
@@ -41,7 +43,7 @@ _OBSERVATIONS = {
 class Admission:
     """Compares the values of rollouts with a task's ranges, and defers offenders; thread-safe."""
 
-    def __init__(self, ranges: Callable[[], Ranges] | None = None):
+    def __init__(self, ranges: "Callable[[], Ranges] | None" = None):
         """Gets the ranges from a function at the first rollout, whose reply waits for it; None
         accepts any values.
         """
@@ -102,7 +104,7 @@ class Admission:
             return {"refused": self._refused[actor]}
 
 
-def _check_metric(name: str, array: np.ndarray, ranges: Ranges) -> None:
+def _check_metric(name: str, array: np.ndarray, ranges: "Ranges") -> None:
     """Raises a `CongraspError` for a metric that the task lacks, or a value out of its range."""
     if name not in ranges.episodes:
         raise CongraspError(

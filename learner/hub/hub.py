@@ -196,7 +196,14 @@ class LearnerHub:
             self._staleness.give_back(owner, ticket_id)
             return Message(meta=self._state())
         granted = self._rollouts.grant(owner, ticket_id)
-        return Message(meta={**self._state(), "granted": granted, "retry_after": _RETRY_SECONDS})
+        return Message(
+            meta={
+                **self._state(),
+                "granted": granted,
+                "required_version": self._staleness.required_version,
+                "retry_after": _RETRY_SECONDS,
+            }
+        )
 
     def _on_weights(self, key: str, request: Message) -> Message:
         bundle = self._bundle

@@ -33,6 +33,8 @@ from congrasp.learner.hub.ticket_budget import TicketBudget
 Owner = tuple[str, str]
 """Actor and incarnation."""
 Verdict = Literal["accepted", "stale", "full"]
+_LEAST_PER_OWNER = 4
+"""Least limit of the tickets of one owner."""
 _MAX_EXPIRED = 256
 """Expired tickets that are remembered, to measure how long their rollouts take."""
 
@@ -95,7 +97,7 @@ class StalenessManager:
         rollouts_per_update: int,
         *,
         ticket_seconds: float = 120.0,
-        tickets_per_owner: int = 4,
+        tickets_per_owner: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Starts at version 0 without tickets.
@@ -104,14 +106,15 @@ class StalenessManager:
           max_staleness: eta, versions.
           rollouts_per_update: size of the batch.
           ticket_seconds: longest time until an unused ticket expires, s.
-          tickets_per_owner: most tickets of one owner, so that no owner takes all of them.
+          tickets_per_owner: most tickets of one owner, so that no owner takes all of them; by
+            default half of all, and at least four.
           clock: seconds, monotonic.
         """
         self.max_staleness = max_staleness
         self._batch = rollouts_per_update
         slots = (max_staleness + 1) * rollouts_per_update
         self._budget = TicketBudget(slots, rollouts_per_update, ticket_seconds, clock)
-        self._per_owner = tickets_per_owner
+        self._per_owner = tickets_per_owner or max(_LEAST_PER_OWNER, slots // 2)
         self._clock = clock
         self._lock = threading.RLock()
         self._tickets: dict[tuple[Owner, str], Ticket] = {}
@@ -133,12 +136,16 @@ class StalenessManager:
     def capacity(self) -> int:
         """Number of tickets that could be granted now."""
         with self._lock:
-            # Every version counts for one batch, so that a resumed run, or an update of another
-            # size, leaves no debt.
-            accepted = self.version * self._batch + self._in_update + self.queued
-            return (
-                (self.max_staleness + self.version + 1) * self._batch - accepted - self._awaited()
-            )
+            return (self.max_staleness + self.version + 1) * self._batch - self._promised()
+
+    @property
+    def required_version(self) -> int:
+        """Oldest policy with which the rollout of the latest ticket is fresh when it is used, if it
+        arrives before those of later tickets.
+        """
+        with self._lock:
+            used_at = max(0, self._promised() - 1) // self._batch
+            return min(self.version, used_at - self.max_staleness)
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
         """Grants a ticket, or returns None if there is none now; repeating the id returns the same
@@ -319,6 +326,15 @@ class StalenessManager:
         """Records the number of rollouts lost with updates of a killed learner."""
         with self._lock:
             self._counters.undone = count
+
+    def _promised(self) -> int:
+        """Number of rollouts that have been used, or are queued or awaited.
+
+        Every version counts for one batch, so that a resumed run, or an update of another size,
+        leaves no debt.
+        """
+        used = self.version * self._batch + self._in_update
+        return used + self.queued + self._awaited()
 
     def _awaited(self) -> int:
         """Number of tickets that hold a place."""

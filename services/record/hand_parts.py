@@ -5,12 +5,12 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
+from congrasp.common.runtime.lazy_trimesh import trimesh
 from congrasp.services.appearance.palette import MATERIALS as COLOURS
 from congrasp.services.appearance.palette import Colour
 
@@ -111,6 +111,6 @@ def _light(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     return points * _GRID_M, light_faces[has_area]
 
 
-def _mesh(part: Part) -> trimesh.Trimesh:
+def _mesh(part: Part) -> "trimesh.Trimesh":
     """Returns a part as a trimesh mesh."""
     return trimesh.Trimesh(part.points, part.faces, process=False)

@@ -52,8 +52,6 @@ from congrasp.services.train.start import (
     kept_log,
     removed_without_checkpoint,
 )
-from congrasp.services.viz.render import episode_sheet
-from congrasp.services.viz.sheets import save_png
 
 EPISODE = "episode.png"
 RUNS = "runs"
@@ -372,6 +370,9 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
     # The server starts while the episodes run.
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         (result,) = heading.run([Variation()], keep=True)
+        from congrasp.services.viz.render import episode_sheet  # seconds, for the end of a run
+        from congrasp.services.viz.sheets import save_png
+
         save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
         row = result.row
         console.print(

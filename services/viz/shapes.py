@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.episode.arm import MovedArm
 from congrasp.common.objects.spec import Colours
+from congrasp.common.runtime.lazy_trimesh import trimesh
 from congrasp.services.appearance.palette import OBJECT, TABLE, Colour
 
 Kind = Literal["sphere", "capsule", "table", "mesh"]

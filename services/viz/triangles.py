@@ -5,10 +5,10 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.objects.spec import Colours
+from congrasp.common.runtime.lazy_trimesh import trimesh
 from congrasp.services.appearance.subdivision import bisected
 from congrasp.services.viz.kernels import NOTHING, linear
 from congrasp.services.viz.shapes import Shape

@@ -11,7 +11,7 @@ from congrasp.actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.common.wire.codec import Message
+from congrasp.common.wire.codec import Message, encode
 from tests.waits import eventually
 
 KEYS = Keys("test")
@@ -33,7 +33,7 @@ class Learner:
         self.transport.serve(
             KEYS.config, lambda key, m: self.reply(config="{}", schema="s", arrays=["reward"])
         )
-        self.transport.serve(KEYS.tickets, self.on_ticket)
+        self.transport.serve(KEYS.tickets, lambda key, message: self.on_ticket(key, message))
         self.transport.serve(below(KEYS.weights), self.on_weights)
         self.transport.serve(KEYS.rollouts, self.on_rollout, workers=4)
 
@@ -325,3 +325,145 @@ def test_closing_drops_pending_uploads(joined):
     assert link.flush(1)
     with pytest.raises(CongraspError, match="closed"):
         link.upload(rollout(), TICKET)
+
+
+SLOW_S = 0.4
+"""Duration of a request over the slow network of the following tests."""
+
+
+class FarTransport(MemoryTransport):
+    """A transport over which every query takes `SLOW_S`, and several may be under way."""
+
+    def __init__(self, hub):
+        super().__init__(hub)
+        self.keys = []
+        """Keys of the queries that were begun."""
+
+    def query(self, key, message, *, timeout):
+        self.keys.append(key)
+        time.sleep(SLOW_S)
+        return super().query(key, message, timeout=timeout)
+
+
+@pytest.fixture
+def far():
+    """(learner, link, transport) over a slow network; one rollout that took no time has been
+    uploaded, so that the link knows its pace.
+    """
+    hub = MemoryHub()
+    learner = Learner(hub)
+    with FarTransport(hub) as transport, ActorLink(transport, "test", "a") as link:
+        link.config(60)
+        ticket = link.acquire_ticket(60)
+        assert link.weights(-1) is not None
+        link.upload(rollout(), ticket)
+        assert link.flush(60)
+        yield learner, link, transport
+
+
+def begin_pull(learner, transport, **state):
+    """Announces a state, and waits until the link begins to fetch the policy."""
+    pulls = transport.keys.count(KEYS.weights_for("actor", "a"))
+    learner.announce(**state)
+    eventually(lambda: transport.keys.count(KEYS.weights_for("actor", "a")) > pulls)
+
+
+def test_tickets_are_requested_ahead_over_a_slow_network(far):
+    learner, link, _ = far
+    assert link.acquire_ticket(60) is not None
+    eventually(lambda: len(learner.tickets) >= 4)
+    began = time.monotonic()
+    tickets = [link.acquire_ticket(60) for _ in range(3)]
+    assert time.monotonic() - began < SLOW_S, "the tickets were not there"
+    assert len({ticket.id for ticket in tickets}) == 3
+
+
+def test_a_ticket_ahead_that_is_not_granted_is_waited_for_as_long_as_asked(far):
+    learner, link, _ = far
+    learner.granted = False
+    while link.acquire_ticket(0.05) is not None:
+        pass
+    learner.granted = True
+    assert link.acquire_ticket(60) is not None
+
+
+def test_a_ticket_that_is_granted_before_an_earlier_one_is_used_first(far):
+    learner, link, _ = far
+    refused = []
+
+    def grant_all_but_the_first(key, message):
+        refused.append(message.meta["ticket"])
+        return learner.reply(granted=message.meta["ticket"] != refused[0])
+
+    assert link.acquire_ticket(60) is not None
+    eventually(lambda: len(learner.tickets) >= 6)
+    learner.on_ticket = grant_all_but_the_first
+    for _ in range(8):
+        assert link.acquire_ticket(20) is not None
+
+
+def test_a_policy_on_its_way_is_waited_for_only_if_the_ticket_requires_it(far):
+    learner, link, transport = far
+    begin_pull(learner, transport, version=1)
+    began = time.monotonic()
+    assert link.weights(0, required=0) is None
+    assert time.monotonic() - began < SLOW_S, "it waited for a policy that it did not need"
+    newer = link.weights(0, required=1)
+    assert newer.meta["version"] == 1
+    assert link.weights(1, required=1) is None
+
+
+def test_a_policy_is_fetched_when_it_is_announced(far):
+    learner, link, transport = far
+    pulls = learner.pulls
+    begin_pull(learner, transport, version=1)
+    eventually(lambda: link.weights(0, required=0) is not None)
+    assert learner.pulls == pulls + 1
+
+
+def test_a_policy_of_another_session_is_always_waited_for(far):
+    learner, link, transport = far
+    begin_pull(learner, transport, session_id="2")
+    assert link.weights(0, required=0) is not None
+
+
+def test_a_ticket_requires_a_newer_policy_if_updates_pass_during_rollouts(joined):
+    learner, link = joined()
+    reply = learner.reply
+    learner.reply = lambda **meta: reply(required_version=3, **meta)
+    learner.announce(version=5)
+    assert link.acquire_ticket(60).required_version == 3
+    ticket = link.acquire_ticket(60)
+    learner.state["version"] = 6
+    assert link.upload(rollout(), ticket).result(60) == "accepted"
+    learner.state["version"] = 8
+    assert link.acquire_ticket(60).required_version == 4
+
+
+class ThinTransport(MemoryTransport):
+    """A transport of 2 MB/s, which remembers the lengths of what it sent."""
+
+    def __init__(self, hub):
+        super().__init__(hub)
+        self.lengths = []
+
+    def query(self, key, message, *, timeout):
+        length = len(encode(message))
+        self.lengths.append(length)
+        time.sleep(length / 2e6)
+        return super().query(key, message, timeout=timeout)
+
+
+def test_rollouts_are_compressed_over_a_thin_link_and_arrive_equal():
+    hub = MemoryHub()
+    learner = Learner(hub)
+    content = np.repeat(np.random.default_rng(0).normal(size=1000), 40)
+    message = Message({"reward": content}, {"version": 0, "schema": "s", "steps": 3})
+    with ThinTransport(hub) as transport, ActorLink(transport, "test", "a") as link:
+        link.config(60)
+        for _ in range(2):
+            assert link.upload(message, TICKET).result(60) == "accepted"
+    first, second = transport.lengths[-2:]
+    assert first > content.nbytes
+    assert second < content.nbytes / 2
+    np.testing.assert_array_equal(learner.received[1].arrays["reward"], content)

@@ -10,7 +10,17 @@ from congrasp.services.cli.parser import of_group
 
 NAMES = (
     *("pieces", "shapes", "gallery", "screens", "speeds", "measures", "dexgraspbench"),
-    *("robot", "sensors", "attacks", "crowding", "transport", "faults", "replacements", "ceiling"),
+    *(
+        "robot",
+        "sensors",
+        "attacks",
+        "crowding",
+        "transport",
+        "faults",
+        "replacements",
+        "ceiling",
+        "wide_area",
+    ),
 )
 """Each is a module of this folder with a function of its name."""
 

@@ -9,10 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+import zstandard
 from hypothesis import given, settings
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.wire.codec import MAX_HEADER, Message, SharedMessage, decode, encode
+from congrasp.common.wire.codec import (
+    MAX_HEADER,
+    CompressedMessage,
+    Message,
+    SharedMessage,
+    decode,
+    encode,
+)
 
 DTYPES = ["f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "?"]
 arrays = st.dictionaries(
@@ -266,3 +274,46 @@ def _decode_or_refuse(data):
     except CongraspError:
         return
     assert sum(array.nbytes for array in message.arrays.values()) <= len(data)
+
+
+@given(arrays, metas)
+def test_a_compressed_message_arrives_as_a_plain_one(arrays, meta):
+    sent = encode(CompressedMessage(arrays, meta))
+    received = decode(sent)
+    assert encode(received) == encode(Message(arrays, meta))
+
+
+REPETITIVE = CompressedMessage({"a": np.repeat(np.arange(1000.0), 20)})
+
+
+def test_a_compressed_message_is_shorter():
+    assert len(encode(REPETITIVE)) < len(encode(Message(REPETITIVE.arrays))) / 2
+
+
+def test_a_message_that_would_cost_its_receiver_much_memory_is_sent_as_it_is():
+    zeros = {"a": np.zeros(1_000_000)}
+    assert encode(CompressedMessage(zeros)) == encode(Message(zeros))
+
+
+@pytest.mark.parametrize(
+    ("damage", "match"),
+    [
+        (lambda data: data[:-5], "compressed message is damaged"),
+        (lambda data: data + b"more", "compressed message is damaged"),
+        (lambda data: data[:40] + bytes([data[40] ^ 1]) + data[41:], "damaged|checksum|JSON"),
+        (lambda data: zstandard.compress(bytes(10_000_000)), "does not say that it has at most"),
+        (
+            lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(data),
+            "does not say that it has at most",
+        ),
+    ],
+    ids=["cut", "longer", "flipped", "bomb", "no size"],
+)
+def test_damage_of_a_compressed_message_is_named(damage, match):
+    with pytest.raises(CongraspError, match=match):
+        decode(damage(encode(REPETITIVE)))
+
+
+def test_the_length_of_a_compressed_message_is_limited_before_it_is_inflated():
+    with pytest.raises(CongraspError, match="at most 1000 bytes"):
+        decode(encode(REPETITIVE)[:1000], max_bytes=1000)

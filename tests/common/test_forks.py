@@ -65,11 +65,6 @@ if __name__ == "__main__":
 {body}
 """
 PORT = 17631
-OPEN = "transport = connect()\n"
-CLOSED = "connect().close()\n"
-CALLER = "import jax\njax.numpy.ones(3).block_until_ready()\n"
-LOAD = "lambda: congrasp.load_policy({policy!r})"
-LOADED = "policy = congrasp.load_policy({policy!r})\n"
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +86,13 @@ def lines_of(tmp_path, body: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+OPEN = "transport = connect()\n"
+CLOSED = "connect().close()\n"
+CALLER = "import jax\njax.numpy.ones(3).block_until_ready()\n"
+LOAD = "lambda: congrasp.load_policy({policy!r})"
+LOADED = "policy = congrasp.load_policy({policy!r})\n"
+
+
 @pytest.mark.parametrize(
     "before",
     [
@@ -102,19 +104,24 @@ def lines_of(tmp_path, body: str) -> list[str]:
         pytest.param(LOADED + "call = lambda: policy.act({{}})", id="act of an open policy"),
     ],
 )
-@pytest.mark.parametrize("how", ["in_child('fork', call)", "in_fork(call)"])
-def test_a_fork_is_refused(before, how, listener, tmp_path, paper_policy):
-    if "policy = " in before and how == "in_fork(call)":
-        pytest.skip("JAX crashes at the end of a forked interpreter that has compiled programs")
-    answer, end = lines_of(tmp_path, before.format(policy=str(paper_policy)) + f"\n{how}")
-    assert answer.startswith("ForkError: ")
-    assert "spawn" in answer
-    assert end == "ended"
+def test_a_fork_is_refused(before, listener, tmp_path, paper_policy):
+    """By a module of the standard library, and by the system's call from the same process."""
+    forks = ["in_child('fork', call)"]
+    # JAX crashes at the end of a forked interpreter that has compiled programs
+    if "policy = " not in before:
+        forks.append("in_fork(call)")
+    body = "\n".join([before.format(policy=str(paper_policy)), *forks])
+    lines = lines_of(tmp_path, body)
+    assert len(lines) == 2 * len(forks)
+    for answer in lines[::2]:
+        assert answer.startswith("ForkError: ")
+        assert "spawn" in answer
+    assert lines[1::2] == ["ended"] * len(forks)
 
 
-@pytest.mark.parametrize("how", ["in_child('fork', connect)", "in_fork(connect)"])
-def test_a_fork_after_the_import_alone_works(how, listener, tmp_path):
-    assert lines_of(tmp_path, f"congrasp.PolicyClient\n{how}") == ["works", "ended"]
+def test_a_fork_after_the_import_alone_works(listener, tmp_path):
+    body = "congrasp.PolicyClient\nin_child('fork', connect)\nin_fork(connect)"
+    assert lines_of(tmp_path, body) == ["works", "ended"] * 2
 
 
 def test_a_spawned_process_works(listener, tmp_path):

@@ -16,7 +16,6 @@ mujoco.mj_step(model, data)
 assert sum(warning.number for warning in data.warning)
 """
 ENTRIES = (
-    "common.hands.mjcf",
     "common.objects.resting",
     "common.objects.shapes",
     "actors.physics.native",
@@ -25,6 +24,9 @@ ENTRIES = (
     "services.grasp.grasper",
     "services.gym.vector_env",
 )
+"""Further modules that use MuJoCo. They get it from the module that the first one gets it from
+(`test_one_module_imports_mujoco`).
+"""
 
 
 def run(program, folder):
@@ -37,7 +39,10 @@ def test_unstable_physics_alone_writes_a_log(tmp_path):
     assert list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize(
+    "entry",
+    ["common.hands.mjcf", *(pytest.param(entry, marks=pytest.mark.slow) for entry in ENTRIES)],
+)
 def test_unstable_physics_leaves_no_file(entry, tmp_path):
     run(f"import congrasp.{entry}\n{UNSTABLE}", tmp_path)
     assert not list(tmp_path.iterdir())

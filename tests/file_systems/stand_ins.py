@@ -1,4 +1,4 @@
-"""File systems that lack something, put in front of the system's calls: code for a child process."""
+"""File systems that lack something, put in front of the system's calls of a process."""
 
 import errno
 import fcntl

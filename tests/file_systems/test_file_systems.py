@@ -2,20 +2,24 @@
 links.
 """
 
+import fcntl
 import os
 import pathlib
 import subprocess
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.journal import Journal
 from congrasp.common.io.opening import open_to_append, open_to_update
+from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.run_directory import exclusive, note_version
 from congrasp.services.ops.lifetime import Child
+from tests.file_systems import stand_ins
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 LACKS = [
@@ -23,25 +27,30 @@ LACKS = [
     *(("no_links", name) for name in ("EPERM", "ENOTSUP", "EINVAL", "EACCES")),
     *(("no_locks", name) for name in ("ENOLCK", "ENOTSUP", "EINVAL")),
 ]
-SAVE = """
-    import numpy as np
-    from congrasp.learner.checkpoint import Checkpoints
-    from congrasp.learner.run_directory import exclusive
-    notices = []
+
+
+@pytest.fixture
+def lacking(monkeypatch):
+    """Takes a feature from the file systems of this process until the test ends."""
+    for module, name in ((os, "fsync"), (os, "symlink"), (fcntl, "lockf"), (fcntl, "flock")):
+        monkeypatch.setattr(module, name, getattr(module, name))
+
+    def take(lack: str, number: str) -> None:
+        getattr(stand_ins, lack)(stand_ins.NUMBERS[number])
+
+    return take
+
+
+def save_and_load(folder: pathlib.Path) -> tuple[int, int]:
+    """Saves five checkpoints and loads the last; returns its version and the number of notices."""
+    notices: list[str] = []
+    checkpoints = Checkpoints(folder / "checkpoints")
     with exclusive(folder, notices.append) as check:
         for version in range(1, 6):
             check()
-            Checkpoints(folder / "checkpoints").save({"x": np.full(3, version)}, {}, version)
-    tree, _ = Checkpoints(folder / "checkpoints").load({"x": np.zeros(3, int)})
-    print(tree["x"][0], len(notices))
-"""
-HOLD = """
-    import os, time
-    from congrasp.learner.run_directory import exclusive
-    with exclusive(folder):
-        print(os.getpid(), flush=True)
-        time.sleep(END)
-"""
+            checkpoints.save({"x": np.full(3, version)}, {}, version)
+    tree, _ = checkpoints.load({"x": np.zeros(3, int)})
+    return int(tree["x"][0]), len(notices)
 
 
 def on(stand_in: str, program: str, folder: pathlib.Path) -> subprocess.CompletedProcess[str]:
@@ -64,13 +73,12 @@ def on(stand_in: str, program: str, folder: pathlib.Path) -> subprocess.Complete
 
 
 @pytest.mark.parametrize(("lack", "number"), LACKS)
-def test_checkpoints_without_a_feature(tmp_path, lack, number):
-    done = on(f"{lack}(stand_ins.NUMBERS['{number}'])", SAVE, tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_checkpoints_without_a_feature(tmp_path, lacking, lack, number):
+    lacking(lack, number)
     notices = 0
     if lack == "no_locks":
         notices = 1
-    assert done.stdout.split() == ["5", str(notices)]
+    assert save_and_load(tmp_path) == (5, notices)
     folder = tmp_path / "checkpoints"
     assert len(list(folder.glob("*.safetensors"))) == 3
     latest = folder / "latest"
@@ -81,15 +89,24 @@ def test_checkpoints_without_a_feature(tmp_path, lack, number):
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
 
 
-def test_the_link_of_an_old_run_becomes_a_file(tmp_path):
+def test_the_link_of_an_old_run_becomes_a_file(tmp_path, lacking):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     victim = folder / "checkpoint_000000000.safetensors"
     victim.write_bytes(b"old")
     (folder / "latest").symlink_to(victim.name)
-    done = on("no_links(stand_ins.NUMBERS['EPERM'])", SAVE, tmp_path)
-    assert done.returncode == 0, done.stderr
+    lacking("no_links", "EPERM")
+    save_and_load(tmp_path)
     assert not (folder / "latest").is_symlink()
+
+
+HOLD = """
+    import os, time
+    from congrasp.learner.run_directory import exclusive
+    with exclusive(folder):
+        print(os.getpid(), flush=True)
+        time.sleep(END)
+"""
 
 
 def test_two_learners_without_locks_are_refused(tmp_path):

@@ -1,11 +1,12 @@
 """Admission: the bound holds, capacity returns, and every rollout is accounted for."""
 
+import collections
 import itertools
 import math
 import statistics
 
 import hypothesis.strategies as st
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from congrasp.learner.hub.staleness import StalenessManager
@@ -52,6 +53,58 @@ def test_tickets_worked_out_by_hand():
         "queued": 0,
         "capacity": 2,
     }
+
+
+def test_required_versions_worked_out_by_hand():
+    """Batch 2, eta 1: version 0 uses two rollouts, version 1 the next two."""
+    staleness = manager()
+    required = []
+    for owner, ticket in itertools.product((A, B), "xy"):
+        assert staleness.grant(owner, ticket)
+        required.append(staleness.required_version)
+    assert required == [-1, -1, 0, 0]
+    for ticket in "xy":
+        staleness.arrive(A, ticket, 0)
+        staleness.take(0)
+    staleness.publish(1)
+    assert staleness.grant(A, "z")
+    assert staleness.required_version == 1
+
+
+@given(
+    eta=st.integers(0, 3),
+    batch=st.integers(1, 4),
+    waits=st.lists(st.integers(0, 6), min_size=1, max_size=60),
+)
+def test_rollouts_with_the_oldest_policy_that_their_tickets_require_are_never_too_old(
+    eta, batch, waits
+):
+    """Tickets are taken as early as possible, and rollouts arrive in the order of their tickets."""
+    staleness = manager(eta, batch, tickets_per_owner=100)
+    produced = collections.deque()
+    for number, wait in enumerate(waits):
+        while (ticket := staleness.grant(A, str(number))) is None:
+            assert produced, "no ticket although nothing is awaited"
+            _use(staleness, produced, 1, batch)
+        oldest = max(0, staleness.required_version)
+        assert oldest <= ticket.version
+        produced.append((ticket.id, oldest))
+        _use(staleness, produced, min(wait, len(produced)), batch)
+    _use(staleness, produced, len(produced), batch)
+    counters = staleness.counters()
+    assert counters["accepted"] == len(waits)
+    assert counters["stale"] == 0
+    assert counters["dropped"] == 0
+
+
+def _use(staleness, produced, count, batch):
+    """Lets some rollouts arrive, and the learner use every whole batch."""
+    for _ in range(count):
+        ticket_id, version = produced.popleft()
+        assert staleness.arrive(A, ticket_id, version) == "accepted"
+        assert staleness.take(version)
+        if staleness.counters()["consumed"] % batch == 0:
+            staleness.publish(staleness.version + 1)
 
 
 def test_without_staleness_nothing_starts_during_an_update():

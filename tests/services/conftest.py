@@ -1,11 +1,31 @@
 """Fixtures of the services' tests."""
 
 import contextlib
-from collections.abc import Iterator
+import logging
+import os
+from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+
+
+@pytest.fixture
+def exit_code_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], Any]:
+    """Runs the command line in this process, and returns the code with which it would end: starting
+    a process and importing JAX takes seconds.
+    """
+    from congrasp.services.cli import main as cli
+
+    def run(arguments: list[str]) -> Any:
+        # Roles add a handler that stays
+        monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
+        with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
+            cli.main(arguments)
+        return end.value.code
+
+    return run
 
 
 @pytest.fixture(scope="session")
@@ -20,17 +40,20 @@ def example() -> Any:
 def constraint_sets() -> Any:
     """Constraint sets of the suite's objects."""
     from congrasp.common.task.sampling.sets import make_sets
-    from tests.task import HAND, OBJECTS, TASK
+    from tests.task import HAND, OBJECTS, TASK, kept_banks
 
-    return make_sets(HAND, TASK, OBJECTS, 0)
+    with kept_banks():
+        return make_sets(HAND, TASK, OBJECTS, 0)
 
 
 @contextlib.contextmanager
 def quick_imports() -> Iterator[None]:
-    """Imports a mesh as its hull and two plain halves; the pieces' errors count as zero.
+    """Imports a mesh as its hull and two plain halves, whose errors count as zero, and a hand after
+    a shorter search for its poses.
 
-    Decomposition, errors and halves that a hand can hold take most of an import's time.
+    Decomposition, errors, halves that a hand can hold and poses take most of an import's time.
     """
+    from congrasp.services.assets.hands import poses
     from congrasp.services.assets.objects import assembly, collision
     from congrasp.services.assets.objects.decompose import Decomposition
     from congrasp.services.assets.objects.fidelity import Fidelity
@@ -42,6 +65,7 @@ def quick_imports() -> Iterator[None]:
         patch.setattr(collision, "decompose", hull)
         patch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
         patch.setattr(assembly, "cut_to_hold", lambda obj: obj)
+        patch.setattr(poses, "RANDOM_STARTS", 0)
         yield
 
 

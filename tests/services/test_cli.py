@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import functools
-import logging
 import os
 import re
 import signal
@@ -199,13 +198,9 @@ def test_help_names_every_command_and_every_command_exists():
         ),
     ],
 )
-def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch, capfd):
-    """In this process: starting one and importing JAX takes seconds each time."""
-    # Roles add one that stays
-    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
-    with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
-        cli.main(arguments)
-    is_one_line(end.value.code, capfd.readouterr().err, words)
+def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, exit_code_of, capfd):
+    code = exit_code_of(arguments)
+    is_one_line(code, capfd.readouterr().err, words)
 
 
 @pytest.mark.parametrize("out", ["link", "link/grasps"])
@@ -477,17 +472,14 @@ def test_a_command_runs_in_any_thread_of_a_program(capsys):
     assert "allegro" in capsys.readouterr().out
 
 
-def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
+def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, exit_code_of, capfd):
     port = free_port()
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", port))
         busy.listen()
-        with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
-            cli.main(
-                ["learner", "--run-dir", str(tmp_path / "run"), "--listen", f"tcp/127.0.0.1:{port}"]
-            )
-    is_one_line(end.value.code, capfd.readouterr().err, f"127.0.0.1:{port} is in use")
+        listen = f"tcp/127.0.0.1:{port}"
+        code = exit_code_of(["learner", "--run-dir", str(tmp_path / "run"), "--listen", listen])
+    is_one_line(code, capfd.readouterr().err, f"127.0.0.1:{port} is in use")
     assert not (tmp_path / "run").exists()
 
 

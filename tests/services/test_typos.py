@@ -1,6 +1,5 @@
 """Mistyped commands, options and numbers, and completion in a shell."""
 
-import functools
 import shlex
 import subprocess
 
@@ -9,11 +8,9 @@ import pytest
 from congrasp.common.shell import shell_command
 from congrasp.services.cli import completion
 from congrasp.services.cli.suggestions import command_remedy, nearest_option, plain_error
-from tests.children import python
 from tests.printed import errors
 
 COMMANDS = ["train", "learner", "evaluate", "objects"]
-congrasp = functools.partial(python, "-m", "congrasp")
 
 
 @pytest.mark.parametrize(
@@ -84,10 +81,9 @@ def test_plain_error(text, plain):
         ("grasp mug:0 --fps 30", ["--fps", "--video"]),
     ],
 )
-def test_typo_is_one_line(line, words):
-    done = congrasp(*line.split())
-    assert done.returncode == 2
-    (error,) = errors(done.stderr)
+def test_typo_is_one_line(line, words, exit_code_of, capfd):
+    assert exit_code_of(line.split()) == 2
+    (error,) = errors(capfd.readouterr().err)
     assert all(word in error for word in words)
     assert "literal" not in error
 

@@ -15,7 +15,6 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
-from congrasp.common.task.normals import estimated_normals
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
@@ -144,6 +143,8 @@ def _with_normals(message: Message) -> Message:
     points = message.arrays["surface/points"]
     if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_POINTS:
         return message
+    from congrasp.common.task.normals import estimated_normals  # imports JAX
+
     normals = np.array(estimated_normals(points[None])[0])
     return Message({**message.arrays, "surface/normals": normals}, message.meta)
 

@@ -49,7 +49,8 @@ _TOUCHING = 0.02
 """Distance at which tips count as touching, m."""
 _MIN_LISTED_ANGLE = 1e-4
 """Angle below which a joint is at zero in a pose, rad."""
-_RANDOM_STARTS = 4
+RANDOM_STARTS = 4
+"""Starts of a search for a pose in addition to the standard ones."""
 _CLOSING_STEPS = 40
 _MAX_EVALUATIONS = 40
 _DIFFERENCE = 0.02
@@ -107,7 +108,7 @@ def thumb_of(hand: Hand, thumb: str, notes: list[str]) -> str:
 def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     """Returns the hand with an open and a closed pose; doubts are added to `notes`."""
     body = _Body(hand)
-    open_hand = _open_hand(body, _RANDOM_STARTS)
+    open_hand = _open_hand(body, RANDOM_STARTS)
     tips_meet = open_hand.pinch_gap <= _TOUCHING
     if not tips_meet:
         notes.append(

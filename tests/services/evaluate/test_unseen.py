@@ -4,6 +4,7 @@ goes on.
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import types
 
@@ -24,7 +25,11 @@ from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, proced
 from tests.task import TASK, policy
 
 OBJECTS = procedural.generate_many(5, 1_000_000)
-EXPERIMENT = Experiment(policy(), [])
+
+
+@functools.cache
+def experiment_without_objects():
+    return Experiment(policy(), [])
 
 
 @pytest.fixture
@@ -69,7 +74,11 @@ def evaluated(
 ):
     """Rows of the test's policy."""
     return evaluate_pools(
-        dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, folder
+        dataclasses.replace(
+            experiment_without_objects(), episodes=episodes, seed=seed, track=track
+        ),
+        pools,
+        folder,
     )
 
 
@@ -83,16 +92,16 @@ def pools_of(*groups, left_out=()):
 
 
 def test_episodes_of_an_object_do_not_depend_on_its_pool(simulated):
-    progress = []
+    told = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
-    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: progress.append)
+    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
     assert {obj["episodes"] for obj in all_pools.objects} == {2}
     assert [obj["name"] for obj in all_pools.objects] == [obj.name for obj in OBJECTS]
     assert all_pools.episodes == 10
     assert all_pools.covered == 5
     assert all_pools.pool == 6
     assert all_pools.success == 1.0
-    assert progress == [6, 12]  # the second pool is filled up, and what fills it does not count
+    assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
     assert sum(row.episodes for row in by_size) == 10
     assert {row.success_all for row in by_size} == {1.0}

@@ -21,9 +21,17 @@ from congrasp.services.cli import main
 from congrasp.services.train.presets import recipe
 from congrasp.services.viz import hand_sheets
 
-CLAW = propose(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
-HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}
+HANDS = ("claw", "human", "allegro", "sharpa")
 SLOW = ("allegro", "sharpa")
+
+
+@functools.cache
+def claw():
+    return propose(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
+
+
+def hand_of(name):
+    return claw() if name == "claw" else get_hand(name)
 
 
 def with_joints(hand, change, only=""):
@@ -54,7 +62,7 @@ def verdicts(hand):
     "name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS]
 )
 def test_good_hands_pass_every_check(name):
-    lines, report = verdicts(HANDS[name])
+    lines, report = verdicts(hand_of(name))
     assert not report.failed
     assert {finding.verdict for finding in lines.values()} == {"passed"}
     assert [grip.obj.name for grip in report.grips] == ["ball", "cylinder", "box"]
@@ -66,7 +74,9 @@ def test_good_hands_pass_every_check(name):
 
 def test_a_reversed_axis_is_found_and_named():
     turned = with_joints(
-        CLAW, lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)), only="opposing_root"
+        claw(),
+        lambda j: dataclasses.replace(j, axis=tuple(-x for x in j.axis)),
+        only="opposing_root",
     )
     lines, report = verdicts(turned)
     assert report.failed
@@ -78,10 +88,10 @@ def test_a_reversed_axis_is_found_and_named():
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(-1.0, "doubt"), (-0.5, "failed")])
 def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, verdict):
-    pose = {name: angle for name, angle in CLAW.closed_pose.items() if name != "opposing_middle"}
-    opened = {name: angle for name, angle in CLAW.open_pose.items() if name != "opposing_middle"}
+    pose = {name: angle for name, angle in claw().closed_pose.items() if name != "opposing_middle"}
+    opened = {name: angle for name, angle in claw().open_pose.items() if name != "opposing_middle"}
     follows = (Coupling("opposing_middle", "opposing_root", ratio, 0.0),)
-    hand = dataclasses.replace(CLAW, couplings=follows, open_pose=opened, closed_pose=pose)
+    hand = dataclasses.replace(claw(), couplings=follows, open_pose=opened, closed_pose=pose)
     (finding,) = (one for one in geometry_checks.joint_findings(hand) if one.check == "joint")
     assert finding.verdict == verdict
     assert "'opposing_middle'" in finding.measured
@@ -116,7 +126,7 @@ def shifted(link, by):
 
 
 def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
-    palm = CLAW.links[0]
+    palm = claw().links[0]
     away = tuple(
         dataclasses.replace(
             one, start=moved(one.start, (0, 0, -0.2)), end=moved(one.end, (0, 0, -0.2))
@@ -124,7 +134,7 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
         for one in palm.capsules
     )
     hand = dataclasses.replace(
-        CLAW, links=(dataclasses.replace(palm, capsules=away), *CLAW.links[1:])
+        claw(), links=(dataclasses.replace(palm, capsules=away), *claw().links[1:])
     )
     finding = geometry_checks.palm_finding(hand)
     assert finding.verdict == "failed"
@@ -132,15 +142,15 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
     assert "--palm" in finding.remedy
     # All of the hand at the end of a forearm of 40 cm, whose wrist does not move.
     by = np.array([0, 0, 0.4])
-    links = tuple(shifted(link, by) for link in CLAW.links)
-    finding = geometry_checks.palm_finding(dataclasses.replace(CLAW, links=links))
+    links = tuple(shifted(link, by) for link in claw().links)
+    finding = geometry_checks.palm_finding(dataclasses.replace(claw(), links=links))
     assert finding.verdict == "failed"
     assert re.search(r" 5\.\d fingers' lengths from the wrist", finding.measured)
 
 
 def test_gains_that_shake_are_found_and_named():
     loose = with_joints(
-        CLAW,
+        claw(),
         lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0),
         only="left_middle",
     )
@@ -148,14 +158,14 @@ def test_gains_that_shake_are_found_and_named():
     assert [finding.verdict for finding in findings] == ["failed"]
     assert "'left_middle'" in findings[0].measured
     assert "raise kv" in findings[0].remedy
-    soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
+    soft = with_joints(claw(), lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
     findings = physics_checks.servo_findings(soft, trials.responses(soft, recipe(soft).task, 2))
     assert len(findings) == 6
     assert all("raise kp" in finding.remedy for finding in findings)
 
 
 def test_torques_that_are_too_weak_are_found_and_hold_nothing():
-    weak = with_joints(CLAW, lambda j: dataclasses.replace(j, torque_limit=0.01 * j.torque_limit))
+    weak = with_joints(claw(), lambda j: dataclasses.replace(j, torque_limit=0.01 * j.torque_limit))
     lines, _ = verdicts(weak)
     assert lines["strength"].verdict == "failed"
     assert "torque_limit" in lines["strength"].remedy
@@ -167,26 +177,26 @@ def test_torques_that_are_too_weak_are_found_and_hold_nothing():
 
 
 def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
-    finding = geometry_checks.opening_finding(dataclasses.replace(CLAW, object_scale=3.0))
+    finding = geometry_checks.opening_finding(dataclasses.replace(claw(), object_scale=3.0))
     assert finding.verdict == "failed"
     assert re.match(r"object_scale 1\.\d \(import", finding.remedy)
-    wide = dataclasses.replace(CLAW, open_pose={}, closed_pose={})  # never closes
+    wide = dataclasses.replace(claw(), open_pose={}, closed_pose={})  # never closes
     assert geometry_checks.joint_findings(wide)[0].verdict == "failed"
     assert "closed_pose" in geometry_checks.joint_findings(wide)[0].remedy
     by = np.array([0.0, 0.05, 0.0])
     links = tuple(
-        shifted(link, by) if link.name.startswith("right") else link for link in CLAW.links
+        shifted(link, by) if link.name.startswith("right") else link for link in claw().links
     )
-    crossed = dataclasses.replace(CLAW, links=links)
+    crossed = dataclasses.replace(claw(), links=links)
     assert geometry_checks.open_overlap_finding(crossed).verdict == "failed"
     assert "left_lower" in geometry_checks.open_overlap_finding(crossed).measured
 
 
 def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
-    _, report = verdicts(CLAW)
+    _, report = verdicts(claw())
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: report)
     file = tmp_path / "claw.json"
-    file.write_text(hand_text(CLAW))
+    file.write_text(hand_text(claw()))
     assert main.run(["hands", "check", str(file), "--png", str(tmp_path / "claw.png")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(report.findings) + 1
