@@ -148,7 +148,7 @@ class Attempts:
         """
         task = self._task
         hold = self._after
-        conditions, resolution = _requested(self._hand, task, request, hold, self.speed)
+        conditions, resolution = conditions_of(self._hand, task, request, hold, self.speed)
         worker = self._worker_of(obj, len(request.rest))
         worker.replace_objects([obj], None)
         worker.adjust(protocol=self._protocol(obj), probe_data=distance_field([obj]))
@@ -254,9 +254,13 @@ class Attempts:
         )
 
 
-def _requested(*request: Any) -> tuple[initial.InitialConditions, Resolution]:
+def conditions_of(
+    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float
+) -> tuple[initial.InitialConditions, Resolution]:
     """See `initial.requested_conditions`: one program for all attempts at a task."""
-    conditions: tuple[initial.InitialConditions, Resolution] = _requested_program()(*request)
+    conditions: tuple[initial.InitialConditions, Resolution] = _requested_program()(
+        hand, task, request, hold, speed
+    )
     return conditions
 
 

@@ -15,7 +15,7 @@ _LONGEST_DELAY_S = 0.5
 """Longest delay between two attempts."""
 _LONGEST_TICK_S = 1.0
 """Longest interval between two readings that counts in full."""
-_NOTICED_S = 2.0
+NOTICED_S = 2.0
 """Silence after which a line is logged."""
 _NOTICE_AGAIN_S = 60.0
 """Time between two lines."""
@@ -65,7 +65,7 @@ class Patience:
                 f"The learner has not answered for {self.limit:g} s: {error}",
                 "Start the actor again later.",
             ) from None
-        if silence > _NOTICED_S and now - self._noticed > _NOTICE_AGAIN_S:
+        if silence > NOTICED_S and now - self._noticed > _NOTICE_AGAIN_S:
             self._noticed = now
             limit = "" if math.isinf(self.limit) else f" for up to {self.limit:g} s"
             _log.warning("The learner does not answer; waiting%s: %s", limit, error)

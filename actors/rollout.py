@@ -40,7 +40,7 @@ _RENEWED_FRACTION = 64
 """A batch of new episodes is the environments over this number: about three times as many as end in
 a control step.
 """
-_LEAST_RENEWED = 8
+LEAST_RENEWED = 8
 """Least number of episodes in a batch of new ones."""
 _TRACED_ROWS: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
 
@@ -167,7 +167,7 @@ class Programs:
         self._batch = batch
         self._traced = _TRACED_ROWS[traced]
         self._taught = taught
-        self._together = min(batch, max(_LEAST_RENEWED, batch // _RENEWED_FRACTION))
+        self._together = min(batch, max(LEAST_RENEWED, batch // _RENEWED_FRACTION))
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self.sample = jax.jit(self._sample)
         self.begin = jax.jit(self._begin)

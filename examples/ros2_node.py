@@ -208,20 +208,26 @@ class Pictured:
 
 
 class PolicyNode:
-    """Commands of a guarded policy, from the measurements of the topics."""
+    """Commands of a guarded policy, from the measurements of the topics.
+
+    Attributes:
+      guard: the guarded policy.
+      sensors: the measurements.
+      plan: course of the episode.
+      followed: control steps that followed an answer.
+    """
 
     def __init__(
         self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"
     ):
-        self._bus, self._guard, self._sensors, self._target, self._plan = (
-            bus,
-            guard,
-            sensors,
-            target,
-            plan,
-        )
+        self.guard = guard
+        self.sensors = sensors
+        self.plan = plan
+        self.followed = 0
+        self._bus = bus
+        self._target = target
         self._base: Pose | None = None
-        self._followed, self._last = 0, time.monotonic()
+        self._last = time.monotonic()
 
     def wait(self, period: float) -> float:
         """Waits for the joints of the coming control step, at most half a period longer; returns
@@ -233,7 +239,7 @@ class PolicyNode:
         due = self._last + period
         while (now := time.monotonic()) < due + 0.5 * period:
             received = self._bus.receive()
-            self._sensors.take(received)
+            self.sensors.take(received)
             if now >= due - 0.5 * period and any(topic == "joint_states" for topic, _ in received):
                 time.sleep(_TOGETHER)
                 break
@@ -243,25 +249,25 @@ class PolicyNode:
 
     def step(self) -> congrasp.Command | None:
         """Reads the topics and commands; None until the episode has begun."""
-        sensors = self._sensors
+        sensors = self.sensors
         sensors.take(self._bus.receive())
         (q, velocity), palm = sensors.joints(), sensors.palm()
         # The policy rises with the hand
-        down = Pose(-self._plan.rise(self._followed), Rotation.identity())
+        down = Pose(-self.plan.rise(self.followed), Rotation.identity())
         seen = self._target.fields(down, palm, q)
         if self._base is None:
             if palm is None or not all(np.isfinite(x).all() for x in (q, *seen.values())):
                 return None
             self._base = palm
-            self._guard.reset(
+            self.guard.reset(
                 dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays())
             )
-        if self._plan.lifted(self._followed):
-            self._guard.freeze()
-        table = np.asarray(self._followed < self._plan.approach_steps)
+        if self.plan.lifted(self.followed):
+            self.guard.freeze()
+        table = np.asarray(self.followed < self.plan.approach_steps)
         state = {
             "q": q,
-            "time": np.asarray(self._plan.time(self._followed)),
+            "time": np.asarray(self.plan.time(self.followed)),
             "table": table,
             **seen,
         }
@@ -270,24 +276,24 @@ class PolicyNode:
         if palm is not None:
             moved = self._base.inverse() @ down @ palm
             state["u"] = np.append(moved.position, moved.rotation.as_euler("XYZ"))
-        command = self._guard.step(state)
-        if not self._plan.dry_run:
+        command = self.guard.step(state)
+        if not self.plan.dry_run:
             self._publish(command, down)
-        self._followed += command.mode == "follow"
+        self.followed += command.mode == "follow"
         return command
 
     def _publish(self, command: congrasp.Command, down: Pose) -> None:
         """Sends the targets."""
         assert self._base is not None
-        make, clock = self._bus.make, self._sensors.clock
+        make, clock = self._bus.make, self.sensors.clock
         stamp = time.time_ns() if clock is None else round(1e9 * clock)
         now = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-        header = make("std_msgs/msg/Header", stamp=now, frame_id=self._plan.world)
+        header = make("std_msgs/msg/Header", stamp=now, frame_id=self.plan.world)
         position, effort = command.q_target.tolist(), command.q_torque.tolist()
         joints = make(
             JOINTS,
             header=header,
-            name=self._sensors.names,
+            name=self.sensors.names,
             position=position,
             velocity=[],
             effort=effort,
@@ -295,7 +301,7 @@ class PolicyNode:
         palm = self._base @ Pose(
             command.u_target[:3], Rotation.from_euler("XYZ", command.u_target[3:])
         )
-        carrier = down.inverse() @ palm @ self._sensors.mount.inverse()
+        carrier = down.inverse() @ palm @ self.sensors.mount.inverse()
         place, turn = carrier.position.tolist(), carrier.rotation.as_quat().tolist()
         pose = make(
             "geometry_msgs/msg/Pose",

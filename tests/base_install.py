@@ -39,11 +39,9 @@ def run_in_base_install(code: str) -> subprocess.CompletedProcess[str]:
 @contextlib.contextmanager
 def steady_server(hand: str = "allegro") -> Iterator[int]:
     """Port of a server whose policy wants every joint at zero."""
-    port, keys, function = (
-        free_port(),
-        Keys("policy"),
-        PolicyFunction(get_hand(hand), TaskConfig(hand=hand)),
-    )
+    port = free_port()
+    keys = Keys("policy")
+    function = PolicyFunction(get_hand(hand), TaskConfig(hand=hand))
 
     def act(key: str, query: Message) -> Message:
         targets = np.zeros((1, 2 * (len(get_hand(hand).joints) + 6)), np.float32)  # and the action

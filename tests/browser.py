@@ -34,13 +34,13 @@ def chromium() -> Iterator[Any]:
             "The package playwright is not installed.", "Run 'make install'."
         ) from None
     with sync_playwright() as running:
-        own = pathlib.Path(running.chromium.executable_path)
-        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (
-            str(own) if own.exists() else None
+        bundled = pathlib.Path(running.chromium.executable_path)
+        installed = next(filter(None, map(shutil.which, BROWSERS)), None) or (
+            str(bundled) if bundled.exists() else None
         )
-        if found is None:
+        if installed is None:
             raise CongraspError("There is no browser here.", "Run tests/install_browser.sh.")
-        started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
+        started = running.chromium.launch(executable_path=installed, args=ARGUMENTS)
         yield started
         started.close()
 
@@ -65,8 +65,8 @@ def orange(image: np.ndarray) -> np.ndarray:
 
 def on_object(page: Any) -> tuple[float, float]:
     """A point of the page on the object, away from the arrow."""
-    found = orange(picture(page))
-    rows, columns = np.nonzero(found)
+    is_object = orange(picture(page))
+    rows, columns = np.nonzero(is_object)
     low = rows > np.percentile(rows, 70)
     box = page.locator("#scene").bounding_box()
     return box["x"] + float(np.median(columns[low])), box["y"] + float(np.median(rows[low]))

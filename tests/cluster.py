@@ -67,7 +67,8 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
         if path.exists()
         else {"durable": None, "history": [], "version": 0}
     )
-    history, version = saved["history"], saved["version"]
+    history = saved["history"]
+    version = saved["version"]
     published = folder / "version"
     if saved["durable"] is not None and int(published.read_text()) > version:
         version = int(published.read_text()) + 1
@@ -165,7 +166,8 @@ def outcome_of(future):
 
 def jump_about():
     """From now on, this process cannot trust its wall clock."""
-    honest, rng = time.time, random.Random(0)
+    honest = time.time
+    rng = random.Random(0)
     time.time = lambda: honest() + rng.uniform(-1, 1) * 30 * 86400
     time.time_ns = lambda: int(1e9 * time.time())
 
@@ -260,8 +262,10 @@ class Cluster:
         from congrasp.services.ops.audit import FAULTS, compare  # JAX, which no role needs
 
         report = compare(self.folder)
-        assert not report.faults and not any(report.counts[name] for name in FAULTS), report
-        assert report.lag_max <= report.max_staleness == 1 and report.lag_mean <= 1
+        assert not report.faults, report
+        assert not any(report.counts[name] for name in FAULTS), report
+        assert report.lag_max <= report.max_staleness == 1
+        assert report.lag_mean <= 1
         assert report.counts["used"] > 0
         return json.loads((self.folder / "final").read_text()), report.counts
 

@@ -1,5 +1,5 @@
-"""Functions of a module as one program each: alone, every operation in them would be compiled for
-itself.
+"""Programs that JAX compiles: functions of a module as one program each (alone, every operation in
+them would be compiled for itself), and their number.
 """
 
 import functools
@@ -18,9 +18,15 @@ class Compiled:
     """
 
     def __init__(self, module: types.ModuleType, *given: Any):
-        self._module, self._given = module, given
+        self._module = module
+        self._given = given
 
     def __getattr__(self, name: str) -> Any:
-        found = jax.jit(functools.partial(getattr(self._module, name), *self._given))
-        setattr(self, name, found)
-        return found
+        program = jax.jit(functools.partial(getattr(self._module, name), *self._given))
+        setattr(self, name, program)
+        return program
+
+
+def program_count(function: Any) -> int:
+    """Number of programs that JAX has compiled for a jitted function; it has no public count."""
+    return function._cache_size()

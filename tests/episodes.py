@@ -17,7 +17,9 @@ from congrasp.common.wire.codec import Message
 
 BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Blocks of the observation that a policy of the paper's constraints gates."""
-RADIUS, HEIGHT, CONTROL_DT = 0.03, 0.12, 0.01
+RADIUS = 0.03
+HEIGHT = 0.12
+CONTROL_DT = 0.01
 FORCE = 1.5  # N on each fingertip while it touches
 
 
@@ -39,7 +41,8 @@ def episode_message(
     wrist_turn = Rotation.align_vectors([direction, cross], [frame.heading, frame.cross])[0]
     center = np.array([0.0, 0.0, HEIGHT / 2])
     tips = list(hand.tip_links)
-    frames, shares = [], []
+    frames = []
+    shares = []
     for step in range(steps):
         share = min(step / (2 * removal / 3), 1.0)
         shares.append(share)

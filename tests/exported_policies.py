@@ -23,12 +23,14 @@ def difference(bundle: PolicyBundle, path: pathlib.Path) -> float:
     assert np.abs(expected).max() > 1e-3
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            found = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(observations)
+            outputs = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(
+                observations
+            )
     else:
-        (found,) = onnxruntime.InferenceSession(path.read_bytes()).run(
+        (outputs,) = onnxruntime.InferenceSession(path.read_bytes()).run(
             None, {"observation": observations}
         )
-    return float(np.abs(found - expected).max() / np.abs(expected).max())
+    return float(np.abs(outputs - expected).max() / np.abs(expected).max())
 
 
 def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:
@@ -36,12 +38,13 @@ def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:
     random masks.
     """
     rng = np.random.default_rng(9)
-    known = bundle.observation
-    spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3
+    statistics = bundle.observation
+    spread = np.sqrt(np.asarray(statistics.m2) / max(float(statistics.count), 1.0)) + 1e-3
     reach = np.repeat([3.0, 150.0], count // 2)[:, None]
-    drawn = np.asarray(known.mean) + reach * spread * rng.normal(size=(count, len(spread)))
+    drawn = np.asarray(statistics.mean) + reach * spread * rng.normal(size=(count, len(spread)))
     names = gated(bundle.spec.layout)
-    start, mask = 0, rng.integers(0, 2, (count, len(names)))
+    start = 0
+    mask = rng.integers(0, 2, (count, len(names)))
     for name, size in bundle.spec.layout:
         block = slice(start, start + size)
         start += size

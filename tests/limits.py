@@ -44,12 +44,12 @@ def _run(pipe: Any, memory: int, function: Callable[..., Any], arguments: tuple[
     resource.setrlimit(resource.RLIMIT_AS, (taken + memory, taken + memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
-        said = str(function(*arguments))
+        result = str(function(*arguments))
     except MemoryError as error:
-        said = f"MemoryError: {error}"
+        result = f"MemoryError: {error}"
     except BaseException as error:
         kind = type(error).__name__
-        said = (
+        result = (
             f"{kind}: {error}" if kind == "CongraspError" else f"{kind}: {traceback.format_exc()}"
         )
-    pipe.send(said)
+    pipe.send(result)

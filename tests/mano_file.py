@@ -24,7 +24,10 @@ class Reduced:
     """An object of a name, its arguments and its state."""
 
     def __init__(self, name: str, arguments: tuple = (), state: Any = None, *, new: bool = False):
-        self.name, self.arguments, self.state, self.new = Global(name), arguments, state, new
+        self.name = Global(name)
+        self.arguments = arguments
+        self.state = state
+        self.new = new
 
 
 def dumps(value: Any) -> bytes:
@@ -36,8 +39,8 @@ def _opcodes(value: Any) -> bytes:
     if isinstance(value, Global):
         return b"c" + value.replace(" ", "\n").encode() + b"\n"
     if isinstance(value, Reduced):
-        made = _opcodes(value.name) + _opcodes(value.arguments) + (b"\x81" if value.new else b"R")
-        return made if value.state is None else made + _opcodes(value.state) + b"b"
+        code = _opcodes(value.name) + _opcodes(value.arguments) + (b"\x81" if value.new else b"R")
+        return code if value.state is None else code + _opcodes(value.state) + b"b"
     if isinstance(value, np.ndarray):
         return _opcodes(_array(value))
     if isinstance(value, str | bytes):
@@ -75,13 +78,16 @@ def sparse(matrix: np.ndarray) -> Reduced:
     return Reduced("scipy.sparse.csc csc_matrix", (), state, new=True)
 
 
-def selection(chosen: np.ndarray, whole: np.ndarray) -> Reduced:
+def selection(chosen: np.ndarray, values: np.ndarray) -> Reduced:
     """The first columns of `whole` as chumpy keeps them: a variable, indices into it, and a
     shape.
     """
-    index = np.arange(whole.size).reshape(whole.shape)[..., : chosen.shape[-1]].ravel()
+    index = np.arange(values.size).reshape(values.shape)[..., : chosen.shape[-1]].ravel()
     inside = Reduced(
-        "chumpy.ch Ch", (), {"x": whole, "_dirty_vars": Reduced("__builtin__ set", ([],))}, new=True
+        "chumpy.ch Ch",
+        (),
+        {"x": values, "_dirty_vars": Reduced("__builtin__ set", ([],))},
+        new=True,
     )
     state = {"a": inside, "idxs": index, "preferred_shape": chosen.shape}
     return Reduced("chumpy.reordering Select", (), state, new=True)
@@ -93,7 +99,8 @@ def skeleton() -> tuple[np.ndarray, np.ndarray]:
     """
     hand = get_hand("human")
     links = {link.name: link for link in hand.links}
-    joints, tips = [np.zeros(3)], []
+    joints = [np.zeros(3)]
+    tips = []
     for finger in MANO_FINGERS:
         names = (
             ("metacarpal", "proximal", "distal")
@@ -114,7 +121,8 @@ def content(seed: int = 0) -> dict[str, Any]:
     vertices = rng.normal(0.0, 0.03, (778, 3))
     joints, tips = skeleton()
     free = [i for i in range(778) if i not in TIP_VERTICES.values()][:16]
-    vertices[free], vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]] = joints, tips
+    vertices[free] = joints
+    vertices[[TIP_VERTICES[finger] for finger in MANO_FINGERS]] = tips
     regressor = np.zeros((16, 778))
     regressor[np.arange(16), free] = 1.0
     directions = rng.normal(0.0, 1e-3, (778, 3, 20))
@@ -141,9 +149,9 @@ def content(seed: int = 0) -> dict[str, Any]:
 def mano_pickle(values: dict[str, Any] | None = None) -> bytes:
     """The file's bytes."""
     values = dict(values or content())
-    whole = values.pop("all_directions")
+    directions = values.pop("all_directions")
     if "shapedirs" in values:
-        values["shapedirs"] = selection(values["shapedirs"], whole)
+        values["shapedirs"] = selection(values["shapedirs"], directions)
     if "J_regressor" in values:
         values["J_regressor"] = sparse(values["J_regressor"])
     return dumps(values)

@@ -2,6 +2,7 @@
 motion.
 """
 
+import itertools
 import json
 import pathlib
 import xml.etree.ElementTree as ET
@@ -44,8 +45,10 @@ def read_glb(path: pathlib.Path) -> list[Track]:
     """
     content = path.read_bytes()
     size = int.from_bytes(content[12:16], "little")
-    document, blob = json.loads(content[20 : 20 + size]), content[28 + size :]
-    nodes, (animation,) = document["nodes"], document["animations"]
+    document = json.loads(content[20 : 20 + size])
+    blob = content[28 + size :]
+    nodes = document["nodes"]
+    (animation,) = document["animations"]
 
     def values(index: int) -> np.ndarray:
         accessor = document["accessors"][index]
@@ -87,10 +90,8 @@ def read_glb(path: pathlib.Path) -> list[Track]:
 def read_usd(path: pathlib.Path) -> list[Track]:
     """Transforms and meshes as Pixar's library composes them."""
     stage = Usd.Stage.Open(str(path))
-    assert (
-        UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-        and UsdGeom.GetStageMetersPerUnit(stage) == 1
-    )
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     codes = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
     caches = [UsdGeom.XformCache(code) for code in codes]
     poses: dict[str, np.ndarray] = {}
@@ -142,7 +143,9 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
             stream, decoder_factories=[DecoderFactory()]
         ).iter_decoded_messages():
             messages.setdefault(channel.topic, []).append(message)
-    trees = [{t.child_frame_id: t for t in message.transforms} for message in messages["/tf"]]
+    trees = []
+    for message in messages["/tf"]:
+        trees.append({transform.child_frame_id: transform for transform in message.transforms})
     tf: dict[str, np.ndarray] = {}
 
     def visit(name: str) -> np.ndarray:
@@ -154,7 +157,8 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
 
     for name in trees[0]:
         visit(name)
-    (trajectory,), (wrist,) = messages["/joint_trajectory"], messages["/wrist_trajectory"]
+    (trajectory,) = messages["/joint_trajectory"]
+    (wrist,) = messages["/wrist_trajectory"]
     angles = dict(
         zip(
             trajectory.joint_names,
@@ -162,10 +166,8 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
             strict=True,
         )
     )
-    palm, urdf = (
-        _transforms([p.transforms[0] for p in wrist.points]),
-        messages["/robot_description"][0].data,
-    )
+    palm = _transforms([p.transforms[0] for p in wrist.points])
+    urdf = messages["/robot_description"][0].data
     root = ET.fromstring(urdf)[0].attrib["name"]
     described = forward_kinematics(urdf, angles, palm, wrist.joint_names[0], tf[root])
     poses = {name: described.get(name, tf[name]) for name in tf}
@@ -174,10 +176,8 @@ def read_ros2(path: pathlib.Path) -> list[Track]:
         p.time_from_start.sec - 1 + 1e-9 * p.time_from_start.nanosec for p in trajectory.points
     ]
     triangles: dict[str, list[np.ndarray]] = {}
-    for marker in [
-        *messages["/object"],
-        *(m for array in messages.get("/arm", ()) for m in array.markers),
-    ]:
+    of_arm = itertools.chain.from_iterable(array.markers for array in messages.get("/arm", ()))
+    for marker in [*messages["/object"], *of_arm]:
         corners = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3, 3)
         triangles.setdefault(marker.header.frame_id, []).append(corners)
     return [
@@ -198,6 +198,12 @@ def _transforms(transforms: list[Any]) -> np.ndarray:
     return pose_matrices(position, turns)
 
 
+def _popped_pose(values: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """(T, 4, 4) of a body, whose columns are removed from the values."""
+    parts = [values.pop(f"{name}_{part}") for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    return _poses(np.stack(parts, -1))
+
+
 def read_lerobot(path: pathlib.Path) -> list[Track]:
     """Every episode by the description in the files: features by name, kinematics by the URDF."""
     info, about = (
@@ -211,35 +217,23 @@ def read_lerobot(path: pathlib.Path) -> list[Track]:
         rows = pq.read_table(path / info["data_path"].format(**place))
         rows = rows.slice(row["dataset_from_index"], row["length"])
         assert set(rows["episode_index"].to_pylist()) == {row["episode_index"]}
-        values = {
-            part: column
-            for feature in ("observation.state", "observation.environment_state")
-            for part, column in zip(
-                info["features"][feature]["names"],
-                np.array(rows[feature].to_pylist()).T,
-                strict=True,
-            )
-        }
-        palm, thing = (
-            _poses(
-                np.stack(
-                    [
-                        values.pop(f"{name}_{part}")
-                        for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
-                    ],
-                    -1,
-                )
-            )
-            for name in ("wrist", "object")
-        )
+        values: dict[str, np.ndarray] = {}
+        for feature in ("observation.state", "observation.environment_state"):
+            names = info["features"][feature]["names"]
+            columns = np.array(rows[feature].to_pylist()).T
+            values |= dict(zip(names, columns, strict=True))
+        palm = _popped_pose(values, "wrist")
+        thing = _popped_pose(values, "object")
         base = (
             _poses(np.array([about["arm_base"][row["episode_index"]]]))
             if "arm_base" in about
             else palm
         )
         poses = forward_kinematics(urdf, values, palm, links[0], base)
-        kept = {name: pose for name, pose in poses.items() if name in links} | {"object": thing}
-        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
+        link_poses = {name: pose for name, pose in poses.items() if name in links} | {
+            "object": thing
+        }
+        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], link_poses))
     return tracks
 
 
@@ -309,10 +303,8 @@ def error_mm(motion: Episode, track: Track) -> float:
     if track.triangles:
         vertices, faces, _ = object_mesh(motion)
         meshes = {"object": [vertices[faces]]}
-        meshes |= {
-            name: [part.vertices[part.faces] for part in parts]
-            for name, parts in arm_meshes(motion).items()
-        }
+        for name, parts in arm_meshes(motion).items():
+            meshes[name] = [part.vertices[part.faces] for part in parts]
         assert meshes.keys() == track.triangles.keys()
         apart += [
             np.linalg.norm(np.concatenate(parts) - track.triangles[name], axis=-1)

@@ -8,7 +8,10 @@ class Reader(html.parser.HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.cells, self.sources, self.links, self.open = [], [], [], []
+        self.cells = []
+        self.sources = []
+        self.links = []
+        self.open = []
         self.feed(text)
         assert not self.open
 

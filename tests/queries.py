@@ -18,12 +18,9 @@ def packed(
     """The query of one state, whose points and goals are those of its episode."""
     rest = {name: np.asarray(value) for name, value in fields.items()}
     episode = {name: rest.pop(name) for name in _POINTS if name in rest}
-    goals = {
-        name: {
-            field.removeprefix(f"{name}_"): rest.pop(field)
-            for field in list(rest)
-            if field.startswith(f"{name}_")
-        }
-        for name in constraints
-    }
+    goals: dict[str, dict[str, np.ndarray]] = {}
+    for name in constraints:
+        prefix = f"{name}_"
+        of_constraint = [field for field in rest if field.startswith(prefix)]
+        goals[name] = {field.removeprefix(prefix): rest.pop(field) for field in of_constraint}
     return Packer({**layout.description(), "digest": layout.digest}, episode, goals).pack([rest])

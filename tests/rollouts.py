@@ -1,5 +1,6 @@
 """A learner's end, and small valid messages for it."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +16,8 @@ from congrasp.learner.hub.queue import RolloutContract, RolloutQueue
 from congrasp.learner.hub.staleness import StalenessManager
 
 FORM = RolloutForm(steps=20, worlds=16, observation=32, action=4, half=True)
-RUN_ID, SCHEMA = "e", "s"
+RUN_ID = "e"
+SCHEMA = "s"
 
 
 def rollout(value: float = 0.0, form: RolloutForm = FORM, **meta: Any) -> Message:
@@ -36,8 +38,7 @@ def bundle(
     shapes = {"observation": (form.observation,), "value": ()}
     arrays = {
         f"{kind}/{name}": np.zeros(shape)
-        for kind, shape in shapes.items()
-        for name in ("mean", "m2")
+        for (kind, shape), name in itertools.product(shapes.items(), ("mean", "m2"))
     }
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     arrays["actor/w"] = np.full(parameters, version, np.float32)

@@ -1,12 +1,13 @@
 """Rows of an evaluation that no evaluation made, for what shows and compares them."""
 
+import itertools
+
 from congrasp.services.evaluate.paper.figures import paper_row
 from congrasp.services.evaluate.scores import ERRORS, Row, RowDescription, summarise
 
 FORCES = {
     f"{name}_{of}": 1.0
-    for name in ("link_force", "force_sum", "torque_share")
-    for of in ("mean", "p95")
+    for name, of in itertools.product(("link_force", "force_sum", "torque_share"), ("mean", "p95"))
 }
 FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
 
@@ -14,6 +15,14 @@ FORCES |= {"force_peak_n": 1.0, "force_mean_n": 1.0}
 def summarised(name, hand, sample, *, objects, held_2s=True, **facts):
     """The row of a sample's episodes."""
     return summarise(RowDescription(name, hand, objects, held_2s, **facts), sample)
+
+
+def _no_errors() -> dict[str, float]:
+    """Zero for every error of every constraint."""
+    errors: dict[str, float] = {}
+    for columns in ERRORS.values():
+        errors |= dict.fromkeys(columns.values(), 0.0)
+    return errors
 
 
 def row(  # noqa: PLR0913
@@ -49,7 +58,7 @@ def row(  # noqa: PLR0913
         held_2s_low=None,
         held_2s_high=None,
         held_all=None,
-        errors={name: 0.0 for names in ERRORS.values() for name in names.values()} | (errors or {}),
+        errors=_no_errors() | (errors or {}),
         forces=FORCES,
         episode_return=0.0,
         links_at_removal=5.0,

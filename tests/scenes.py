@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -27,7 +28,10 @@ from congrasp.common.task.scene import Scene
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")
-F, L, N, K = len(HAND.joints), len(HAND.links), 64, 15
+F = len(HAND.joints)
+L = len(HAND.links)
+N = 64
+K = 15
 
 
 def quaternions(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -45,9 +49,9 @@ def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def pointing(z: float) -> jax.Array:
     """(4,) orientation of a human wrist whose heading points up (1) or down (-1)."""
     frame = grasp_frame(HAND)
-    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
+    hand_frame = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
     target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
-    return rotations.multiply(target, rotations.conjugate(own))
+    return rotations.multiply(target, rotations.conjugate(hand_frame))
 
 
 def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
@@ -108,7 +112,7 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     return (
         state,
         surface,
-        Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch)),
+        Goal(values, active(*_all_blocks(), batch=batch)),
     )
 
 
@@ -126,7 +130,12 @@ def lone_scene(task: TaskConfig, *blocks: str, **goals: dict[str, np.ndarray]) -
 
 def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:
     """Which blocks are active: these, everywhere."""
-    return {block: np.full(batch, block in blocks) for c in CONSTRAINTS for block in c.blocks}
+    return {block: np.full(batch, block in blocks) for block in _all_blocks()}
+
+
+def _all_blocks():
+    """Names of the blocks of all constraints."""
+    return itertools.chain.from_iterable(constraint.blocks for constraint in CONSTRAINTS)
 
 
 def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
@@ -148,7 +157,8 @@ def near_targets(state: SceneState, goal: Goal, seed: int) -> Goal:
         quaternions = np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
         return points.astype(np.float32), quaternions.astype(np.float32)
 
-    (pose, pose_turn), (way, way_turn) = near(1), near(K)
+    pose, pose_turn = near(1)
+    way, way_turn = near(K)
     goal = goal.replace("heading", position=pose[:, 0])
     goal = goal.replace("pose", position=pose[:, 0], quaternion=pose_turn[:, 0])
     return goal.replace("trajectory", position=way, quaternion=way_turn)

@@ -8,6 +8,7 @@ The digests are of exact results; the last line says which settings of the proce
 import concurrent.futures
 import contextlib
 import hashlib
+import itertools
 import os
 import sys
 import warnings
@@ -117,7 +118,7 @@ def act(policy_file: str) -> str:
         "object_quaternion": level,
     }
     answers = [policy.act(state), policy.act(state)]
-    return digest(*[array for answer in answers for array in answer[:3]])
+    return digest(*itertools.chain(*(answer[:3] for answer in answers)))
 
 
 def act_in_thread(policy_file: str) -> str:

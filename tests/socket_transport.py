@@ -31,18 +31,14 @@ class Frames:
     """
 
     def __init__(self, connection, handle, on_end):
-        self._socket, self._file, self._handle, self._on_end = (
-            connection,
-            connection.makefile("rb"),
-            handle,
-            on_end,
-        )
-        self._numbers, self._answers, self._lock, self.ended = (
-            itertools.count(),
-            {},
-            threading.Lock(),
-            False,
-        )
+        self._socket = connection
+        self._file = connection.makefile("rb")
+        self._handle = handle
+        self._on_end = on_end
+        self._numbers = itertools.count()
+        self._answers = {}
+        self._lock = threading.Lock()
+        self.ended = False
         threading.Thread(target=self._read, daemon=True).start()
 
     def send(self, head, message=None):
@@ -71,7 +67,8 @@ class Frames:
     def _read(self):
         while len(start := self._part(LENGTH.size)) == LENGTH.size:
             line, _, body = self._part(*LENGTH.unpack(start)).partition(b"\n")
-            head, message = json.loads(line), decode(body) if body else None
+            head = json.loads(line)
+            message = decode(body) if body else None
             if "settles" in head:
                 self._settle(head, message)
             elif "number" in head:
@@ -108,13 +105,15 @@ class Connection:
     """The listener's side of one connection: carries out its frames on an endpoint of the hub."""
 
     def __init__(self, connection, hub):
-        self.endpoint, self._begun = MemoryTransport(hub), threading.Event()
+        self.endpoint = MemoryTransport(hub)
+        self._begun = threading.Event()
         self.frames = Frames(connection, self.handle, self.endpoint.close)
         self._begun.set()
 
     def handle(self, head, message):
         self._begun.wait()  # the first frame may come before `frames` has its name
-        key, name = head["key"], head.get("name")
+        key = head["key"]
+        name = head.get("name")
         if head["do"] == "query":
             return self.endpoint.query(key, message, timeout=head["timeout"])
         if head["do"] == "publish":
@@ -146,7 +145,8 @@ class SocketListener(MemoryTransport):
     """The end that others connect to."""
 
     def __init__(self, path):
-        hub, self._connections = MemoryHub(), []
+        hub = MemoryHub()
+        self._connections = []
         try:
             self._listener = socket.create_server(path, family=socket.AF_UNIX)
         except OSError:
@@ -177,7 +177,8 @@ class SocketTransport:
             if time.monotonic() > deadline:
                 raise TransportError(f"No response from socket/{path}.")
             time.sleep(0.01)
-        self._names, self._handlers = itertools.count(), {}
+        self._names = itertools.count()
+        self._handlers = {}
         self._frames = Frames(
             connection,
             lambda head, message: self._handlers[head["name"]](head, message),

@@ -1,5 +1,6 @@
 """Bodies of known measures, and mass properties of pieces as MuJoCo computes them."""
 
+import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -41,10 +42,12 @@ def ell() -> trimesh.Trimesh:
     """An L of two legs of 2 x 2 cm, 8 cm long, as one closed body of 56 cm^3."""
     outline = np.array([[0, 0], [0.08, 0], [0.08, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
     caps = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    faces = [face[::-1] for face in caps] + [[6 + i for i in face] for face in caps]
+    faces = [face[::-1] for face in caps]
+    for face in caps:
+        faces.append([6 + i for i in face])
     for i in range(6):
         j = (i + 1) % 6
         faces += [[i, j, 6 + j], [i, 6 + j, 6 + i]]
-    mesh = trimesh.Trimesh([[*xy, z] for z in (0.0, 0.02) for xy in outline], faces)
+    mesh = trimesh.Trimesh([[*xy, z] for z, xy in itertools.product((0.0, 0.02), outline)], faces)
     assert mesh.is_volume
     return mesh

@@ -28,7 +28,8 @@ from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode, episode_message
 
-STEPS, REMOVAL = 60, 40
+STEPS = 60
+REMOVAL = 40
 DIP = 30
 """The update at which the fake curve dips."""
 BEGIN = 1_700_000_000.0
@@ -39,7 +40,8 @@ class FakePolicy:
     """Answers every request with the fake episode, after a report of progress."""
 
     def __init__(self) -> None:
-        self.hand, self.task = get_hand("human"), TaskConfig()
+        self.hand = get_hand("human")
+        self.task = TaskConfig()
         self.asked: list[tuple[GraspObject, GraspRequest, Phases]] = []
         self.fails = ""
 
@@ -53,7 +55,7 @@ class FakePolicy:
         progress("grasping", 0.5)
         if self.fails:
             raise RuntimeError(self.fails)
-        found = episode(
+        drawn_episode = episode(
             STEPS,
             removal=REMOVAL,
             mask=tuple(
@@ -61,8 +63,10 @@ class FakePolicy:
                 for name in ("affordance", "pose", "pose", "trajectory")
             ),
         )
-        metrics = {**found.metrics, "held": 1.0}
-        return dataclasses.replace(found, metrics=metrics, about={**found.about, "note": ""})
+        metrics = {**drawn_episode.metrics, "held": 1.0}
+        return dataclasses.replace(
+            drawn_episode, metrics=metrics, about={**drawn_episode.about, "note": ""}
+        )
 
 
 def objects() -> Catalogue:
@@ -136,26 +140,31 @@ def metrics(update: int) -> Message:
 
 def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
     """Training window of a run with many actors after some updates."""
-    made, keys, now = TrainingWindow("fake"), Keys("fake"), time.time()
+    training = TrainingWindow("fake")
+    keys = Keys("fake")
+    now = time.time()
     for update in range(updates):
-        made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
-    made.take_status(status(actors), now)
+        training.take(keys.log("metrics", "learner", "0"), metrics(update), now)
+    training.take_status(status(actors), now)
     for number in range(actors):
-        made.take(
+        training.take(
             keys.log("episode", "actor", f"a{number:03d}"),
             actor_episode(number, number % 4 > 0),
             now,
         )
-    return made
+    return training
 
 
 def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     """Recordings of episodes: times (s since 1970) and numbers of actors."""
-    writer, channels = LogWriter(folder, "log", run="fake"), JsonChannels()
+    writer = LogWriter(folder, "log", run="fake")
+    channels = JsonChannels()
     for when, number in moments:
-        actor, message, start = f"a{number:03d}", actor_episode(number), int(1e9 * when)
-        shown = scene_entries(actor, Episode.from_message(message), start, 0, channels)
-        writer.write(raw_entry(actor, message, start), *shown)
+        actor = f"a{number:03d}"
+        message = actor_episode(number)
+        start = int(1e9 * when)
+        entries = scene_entries(actor, Episode.from_message(message), start, 0, channels)
+        writer.write(raw_entry(actor, message, start), *entries)
     writer.close()
 
 
@@ -179,8 +188,8 @@ class FakeImporter:
 
 
 def session(grasping: FakePolicy | None = None, **more: Any) -> Session:
-    made = grasping or FakePolicy()
-    return Session({"of the run": lambda: made}, objects(), FakeImporter(), **more)
+    policy = grasping or FakePolicy()
+    return Session({"of the run": lambda: policy}, objects(), FakeImporter(), **more)
 
 
 class Site:

@@ -33,7 +33,8 @@ from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import Array
 from congrasp.services.train.command import untrained
 
-HAND, TASK = get_hand("human"), TaskConfig()
+HAND = get_hand("human")
+TASK = TaskConfig()
 OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
 BATCH = 8
 CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
@@ -60,9 +61,9 @@ def bank() -> ConstraintBank:
 
 def bank_of(index: int, points: int) -> ConstraintBank:
     """The constraint bank of one of `OBJECTS`, with its first surface points."""
-    own = jax.tree.map(lambda rows: rows[index : index + 1], bank())
-    return own._replace(
-        **{name: getattr(own, name)[:, :points] for name in ("points", "avoid", "normals")}
+    row = jax.tree.map(lambda rows: rows[index : index + 1], bank())
+    return row._replace(
+        **{name: getattr(row, name)[:, :points] for name in ("points", "avoid", "normals")}
     )
 
 
@@ -85,7 +86,8 @@ def warp_engine(objects: Sequence[GraspObject], **options: Any) -> Physics:
 def start_of(**fields: Any) -> ResetState:
     """An environment that starts with what is given: else a free object of its own mass at the
     origin, and the open hand at the world's pose."""
-    level, place = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), np.zeros((1, 3), np.float32)
+    level = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
+    place = np.zeros((1, 3), np.float32)
     neutral = {
         **dict.fromkeys(("mass_scale", "friction", "gain_scale"), np.ones(1, np.float32)),
         **dict.fromkeys(("base_position", "object_position"), place),
@@ -109,7 +111,9 @@ def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.n
     the noise.
     """
     mean = np.zeros(len(HAND.motors) + 7, np.float32)
-    mean[: len(HAND.motors)], mean[len(HAND.motors) + 2], mean[-1] = fingers, lift, noise
+    mean[: len(HAND.motors)] = fingers
+    mean[len(HAND.motors) + 2] = lift
+    mean[-1] = noise
     return mean
 
 
@@ -161,10 +165,11 @@ def episodes(
       episode_bank: a bank with the shapes of that of the suite; by default, that.
       task: another task, which costs another program.
     """
-    given, keys = placed(
+    placed_bank, keys = placed(
         (episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH)))
     )
     drawn = [
-        jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys
+        jax.device_get(programs(task=task).sample(placed_bank, key, np.array(False)))
+        for key in keys
     ]
     return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

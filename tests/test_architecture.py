@@ -41,11 +41,8 @@ def imported(body: Sequence[ast.stmt]) -> Iterator[str]:
 @functools.cache
 def trees(*folders: str) -> dict[pathlib.Path, ast.Module]:
     """Syntax trees of all modules in some folders."""
-    return {
-        path: ast.parse(path.read_text())
-        for folder in folders
-        for path in (ROOT / folder).rglob("*.py")
-    }
+    paths = itertools.chain.from_iterable((ROOT / folder).rglob("*.py") for folder in folders)
+    return {path: ast.parse(path.read_text()) for path in paths}
 
 
 @functools.cache
@@ -56,7 +53,7 @@ def graph(everything: bool) -> dict[str, set[str]]:
         for path in trees(*FOLDERS)
     }
     names = {name.removesuffix(".__init__") for name in paths.values()}
-    found = {}
+    edges = {}
     for path, name in paths.items():
         tree = trees(*FOLDERS)[path]
         body = (
@@ -65,8 +62,8 @@ def graph(everything: bool) -> dict[str, set[str]]:
             else tree.body
         )
         targets = (t if t in names else t.rpartition(".")[0] for t in imported(body))
-        found[name.removesuffix(".__init__")] = {target for target in targets if target in names}
-    return found
+        edges[name.removesuffix(".__init__")] = {target for target in targets if target in names}
+    return edges
 
 
 def test_every_import_of_ours_exists():
@@ -97,12 +94,13 @@ def test_one_module_imports_mujoco():
 
 
 def test_no_two_services_import_each_other():
-    edges = {
-        (module.split(".")[2], target.split(".")[2])
-        for module, targets in graph(everything=False).items()
-        for target in targets
-        if module.startswith("congrasp.services.") and target.startswith("congrasp.services.")
-    }
+    services = "congrasp.services."
+    edges = set()
+    for module, targets in graph(everything=False).items():
+        if not module.startswith(services):
+            continue
+        used = [target for target in targets if target.startswith(services)]
+        edges |= {(module.split(".")[2], target.split(".")[2]) for target in used}
     assert not [(a, b) for a, b in edges if a < b and (b, a) in edges]
 
 
@@ -127,12 +125,10 @@ def test_constraints_are_used_by_their_hooks():
         folder,
         *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority", "specs")),
     }
-    used = {
-        t
-        for m, targets in graph(everything=True).items()
-        if not m.startswith(folder)
-        for t in targets
-    }
+    used = set()
+    for module, targets in graph(everything=True).items():
+        if not module.startswith(folder):
+            used |= targets
     assert {target for target in used if target.startswith(folder)} <= shared
 
 
@@ -142,14 +138,14 @@ RUNS_DATA = re.compile(
 )
 
 
-def test_one_module_imports_what_can_run_code_out_of_data():
+def test_one_module_alone_unpickles():
     """The child process with an allow-list."""
-    found = [
+    modules = [
         str(path.relative_to(ROOT))
         for path in trees(*FOLDERS)
         if RUNS_DATA.search(path.read_text())
     ]
-    assert found == ["common/io/unpickle.py"]
+    assert modules == ["common/io/unpickle.py"]
 
 
 OPENINGS = re.compile(r"(What|Whether|How|Who|Whoever|That|Where|When|Which|If|So)\b")
@@ -162,23 +158,23 @@ BANNED = re.compile(
 
 def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and text of every string of several words: docstrings, messages and help."""
-    for found in ast.walk(tree):
-        if isinstance(found, ast.Constant) and isinstance(found.value, str) and " " in found.value:
-            yield found.lineno, " ".join(found.value.split())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+            yield node.lineno, " ".join(node.value.split())
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and text of the docstrings of a module, its classes and functions, and of the strings
     under fields.
     """
-    for found in ast.walk(tree):
-        if isinstance(found, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            for statement in found.body:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            for statement in node.body:
                 if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
                     yield statement.lineno, str(statement.value.value).strip()
 
 
-def test_the_rules_find_what_they_ban():
+def test_the_rules_report_banned_words():
     tree = ast.parse(
         '"""Whether it is mended."""\nx = 1\n"""What x is."""\nraise ValueError("nobody came")\n'
     )
@@ -189,13 +185,12 @@ def test_the_rules_find_what_they_ban():
 @pytest.mark.parametrize(("read", "wrong"), [(docstrings, OPENINGS.match), (texts, BANNED.search)])
 def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
     modules = trees(*FOLDERS).items()
-    found = [
-        f"{path}:{line}: {text[:100]}"
-        for path, tree in modules
-        for line, text in read(tree)
-        if wrong(text)
-    ]
-    assert not found, "\n".join(found)
+    faults = []
+    for path, tree in modules:
+        for line, text in read(tree):
+            if wrong(text):
+                faults.append(f"{path}:{line}: {text[:100]}")
+    assert not faults, "\n".join(faults)
 
 
 def test_benchmarks_need_no_pytest():
@@ -211,4 +206,5 @@ def test_the_modules_of_make_check_exist():
     """xdist runs nothing, and says no reason, if one is missing."""
     listed = re.search(r"^FAST :=((?:.*\\\n)*.*)", (ROOT / "Makefile").read_text(), re.M)
     names = set(re.findall(r"\btest_\w+", listed[1]))
-    assert len(names) > 10 and names <= {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    assert len(names) > 10
+    assert names <= {path.stem for path in (ROOT / "tests").rglob("test_*.py")}

@@ -52,8 +52,9 @@ with congrasp.PolicyClient("tcp/127.0.0.1:{port}", hand="allegro", wait=30) as p
 def test_every_public_name_is_there_and_documented():
     assert dir(congrasp) == sorted(congrasp.__all__)
     for name in congrasp.__all__:
-        found = getattr(congrasp, name)
-        assert found.__name__ == name and inspect.getdoc(found)
+        member = getattr(congrasp, name)
+        assert member.__name__ == name
+        assert inspect.getdoc(member)
     with pytest.raises(AttributeError, match="no attribute 'grab'"):
         congrasp.grab  # noqa: B018
 
@@ -96,10 +97,12 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     mesh = tmp_path / "block.stl"
     trimesh.creation.box((0.05, 0.06, 0.14)).export(mesh)
-    found = congrasp.grasp(mesh, heading=(0, 0, -1), attempts=4)
-    assert isinstance(found, congrasp.Grasp) and 1 <= found.held <= found.attempts and found.success
-    np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
-    congrasp.save_motion(str(tmp_path / "block.npz"), found.motion)
+    grasp = congrasp.grasp(mesh, heading=(0, 0, -1), attempts=4)
+    assert isinstance(grasp, congrasp.Grasp)
+    assert 1 <= grasp.held <= grasp.attempts
+    assert grasp.success
+    np.testing.assert_allclose(grasp.motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
+    congrasp.save_motion(str(tmp_path / "block.npz"), grasp.motion)
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"
     with pytest.raises(
         congrasp.UnknownConstraintError, match="does not support the constraint 'fingers'"

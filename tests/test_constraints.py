@@ -63,4 +63,5 @@ def test_every_required_package_is_pinned():
 def test_pin_satisfies_a_requirement(requirement):
     pin = pins()[canonicalize_name(requirement.name)]
     (exact,) = pin.specifier
-    assert exact.operator == "==" and requirement.specifier.contains(exact.version)
+    assert exact.operator == "=="
+    assert requirement.specifier.contains(exact.version)

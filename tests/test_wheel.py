@@ -16,7 +16,8 @@ FOLDERS = ("common", "actors", "learner", "services")
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> pathlib.Path:
     """The wheel of the working tree."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    source = tmp_path_factory.mktemp("source")
+    target = tmp_path_factory.mktemp("wheel")
     for folder in ("congrasp", *FOLDERS):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / folder, source / folder, symlinks=True, ignore=ignored)
@@ -50,7 +51,8 @@ def test_a_wheel_installs_one_name_and_all_its_files(wheel):
 
 
 def test_a_program_may_have_folders_of_the_same_names(wheel, tmp_path):
-    installed, program = tmp_path / "installed", tmp_path / "program"
+    installed = tmp_path / "installed"
+    program = tmp_path / "program"
     zipfile.ZipFile(wheel).extractall(installed)
     for folder in FOLDERS:
         (program / folder).mkdir(parents=True)
@@ -69,4 +71,5 @@ def test_a_program_may_have_folders_of_the_same_names(wheel, tmp_path):
         (["-m", "congrasp", "--help"], "congrasp train"),
     ):
         done = subprocess.run([sys.executable, *command], cwd=program, **options)
-        assert done.returncode == 0 and printed in done.stdout, done.stderr
+        assert done.returncode == 0, done.stderr
+        assert printed in done.stdout, done.stderr

@@ -24,9 +24,9 @@ class Clock:
 
 def eventually(look: Callable[[], T], pause: float = 0.02) -> T:
     """What `look` returns, once that is something."""
-    while not (found := look()):
+    while not (result := look()):
         time.sleep(pause)
-    return found
+    return result
 
 
 def together(call: Callable[[A], T], arguments: Iterable[A], seconds: float = 60.0) -> list[T]:

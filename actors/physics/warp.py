@@ -192,7 +192,7 @@ class WarpPhysics:
         """Starts environments; see `Physics.start`."""
         batch = reset_state.object_index.shape[0]
         if batch not in self._buffers:
-            buffers = self._allocated(batch)
+            buffers = self.allocate(batch)
             buffers.fill(*self._loaded)
             self._buffers[batch] = register(buffers), buffers
         return self._fresh(reset_state)
@@ -267,19 +267,23 @@ class WarpPhysics:
             jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3)
         )
 
+    def buffers(self, batch: int) -> WarpBuffers:
+        """Returns the buffers of a batch of environments that was started."""
+        _, buffers = self._buffers[batch]
+        return buffers
+
     def repeat(self, batch: int, steps: int) -> None:
         """Repeats control steps of a batch from its last state and targets; no state observes them.
 
         Runs only MuJoCo Warp's kernels, without JAX, as a reference for benchmarks.
         """
-        _, buffers = self._buffers[batch]
-        buffers.repeat(steps)
+        self.buffers(batch).repeat(steps)
 
     def close(self) -> None:
         """Releases the memory of the environments."""
         self._buffers.clear()
 
-    def _allocated(self, batch: int) -> WarpBuffers:
+    def allocate(self, batch: int) -> WarpBuffers:
         """Returns buffers of a batch, without objects, and begins to build their kernels."""
         return WarpBuffers(
             self._object_rows.model,
@@ -322,4 +326,4 @@ def begin_kernels(hand: Hand, task: TaskConfig) -> None:
 
     Objects do not change them, and the number of environments only changes the broadphase.
     """
-    WarpPhysics(hand, task, [procedural.generate(0, "box")])._allocated(1)
+    WarpPhysics(hand, task, [procedural.generate(0, "box")]).allocate(1)

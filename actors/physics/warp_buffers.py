@@ -117,7 +117,7 @@ class WarpBuffers:
         """Steps all environments on the current stream; modifies the first three arrays and writes
         the last two.
         """
-        self._kernels.result()
+        self.wait_for_kernels()
         data = self._data
         for buffer, array in (
             (data.qpos, qpos),
@@ -138,6 +138,15 @@ class WarpBuffers:
         ):
             wp.copy(array, buffer)
 
+    def wait_for_kernels(self) -> None:
+        """Waits until the kernels are built, or raises the error at which that failed."""
+        self._kernels.result()
+
+    def positions(self) -> np.ndarray:
+        """Copies the generalised positions (B, nq) after the last control step."""
+        positions: np.ndarray = self._data.qpos.numpy()
+        return positions
+
     def repeat(self, steps: int) -> None:
         """Repeats control steps from the last state with Warp only, and waits for them; for
         benchmarks.
@@ -149,10 +158,12 @@ class WarpBuffers:
 
     def _load_kernels(self) -> None:
         """Builds the kernels of a control step, or reads them from Warp's cache."""
-        build_kernels(self._device, self._variants)
+        build_kernels(self._device, self.variants)
 
-    def _variants(self) -> list[Variant]:
-        """Kernels of a control step: only `mujoco_warp.step` knows which ones a model needs."""
+    def variants(self) -> list[Variant]:
+        """Kernels of a control step, without building them; only `mujoco_warp.step` knows which
+        ones a model needs.
+        """
         options = self._model.opt
         conditional = options.graph_conditional
         # A loop until the solver's kernels have converged would not end

@@ -25,7 +25,7 @@ from congrasp.common.runtime.stages import stage
 Variant = tuple[wp.Module, int]
 """A module of kernels, and the block size of their launch."""
 
-_PATIENCE_S = 300.0
+PATIENCE_S = 300.0
 """Time until a process builds what another one builds."""
 _SILENT_S = 2.0
 """Time until a waiting process logs that it waits."""
@@ -101,7 +101,7 @@ def one_builder(variants: Sequence[Variant]) -> Iterator[None]:
     """Context that one process of this machine enters first: the others then read from Warp's cache
     what it built.
 
-    They wait for `_PATIENCE_S` seconds at most, and then build, too.
+    They wait for `PATIENCE_S` seconds at most, and then build, too.
     """
     names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
     name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
@@ -117,7 +117,7 @@ def one_builder(variants: Sequence[Variant]) -> Iterator[None]:
 
 
 def _wait_for_lock(file: BinaryIO) -> bool:
-    """Takes the lock, or waits until the first builder is done, for `_PATIENCE_S` seconds.
+    """Takes the lock, or waits until the first builder is done, for `PATIENCE_S` seconds.
 
     Returns:
       True if this process is the first builder, which keeps the lock.
@@ -125,13 +125,13 @@ def _wait_for_lock(file: BinaryIO) -> bool:
     start = time.monotonic()
     is_reported = False
     waited = 0.0
-    while waited < _PATIENCE_S:
+    while waited < PATIENCE_S:
         if try_lock(file):
             return waited == 0.0
         if waited > _SILENT_S and not is_reported:
             is_reported = True
             _log.info(
-                "Waiting for the kernels that another process builds, at most %d s.", _PATIENCE_S
+                "Waiting for the kernels that another process builds, at most %d s.", PATIENCE_S
             )
         time.sleep(0.1)
         waited = time.monotonic() - start

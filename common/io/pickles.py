@@ -23,9 +23,9 @@ MAX_BYTES = 512 << 20
 """Limit in bytes of the pickles read by one process, and of their arrays."""
 MAX_ARRAYS = 100_000
 """Limit of the number of arrays."""
-_MAX_MEMORY_BYTES = 3 << 30
+MAX_MEMORY_BYTES = 3 << 30
 """Limit of the process's address space."""
-_MAX_PROCESSOR_S = 10
+MAX_PROCESSOR_S = 10
 """Limit of the process's processor time."""
 _TIMEOUT_S = 200.0
 """Limit of the process's duration, for a busy machine."""
@@ -122,10 +122,10 @@ def _write_pickles(source: pathlib.Path, pickles: Iterable[tuple[str, bytes]]) -
 
 def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> None:
     """Runs the child process; a CongraspError names the pickle at which it ended."""
-    words = (_CHILD, source, answer, _MAX_MEMORY_BYTES, _MAX_PROCESSOR_S, MAX_BYTES)
+    words = (_CHILD, source, answer, MAX_MEMORY_BYTES, MAX_PROCESSOR_S, MAX_BYTES)
     limits = Limits(
-        memory=_MAX_MEMORY_BYTES,
-        processor_s=_MAX_PROCESSOR_S,
+        memory=MAX_MEMORY_BYTES,
+        processor_s=MAX_PROCESSOR_S,
         patience_s=_TIMEOUT_S,
         file=answer,
         file_bytes=MAX_BYTES,
@@ -153,7 +153,7 @@ def _refusal(output: str, names: list[str]) -> CongraspError:
     name = names[int(number or 0)]
     if not reason:
         reason = (
-            f"needs more than {_MAX_PROCESSOR_S} s or {_MAX_MEMORY_BYTES >> 30} GB, or is damaged"
+            f"needs more than {MAX_PROCESSOR_S} s or {MAX_MEMORY_BYTES >> 30} GB, or is damaged"
         )
     remedy = _REMEDY
     if reason.startswith(("names", "has an array")):

@@ -6,7 +6,7 @@ least over the pieces; inside of several pieces at once the distance is understa
 up to the sampling that finds the nearest triangle. Between grid points values are interpolated
 linearly. Measured against exact queries 2 to 22 mm outside of the surface, where the axes of
 fingers are: mean error 0.01 to 0.05 mm, 99th percentile 0.05 to 0.4 mm, near edges up to 0.8 mm
-(`tests/common/test_surface.py`).
+(`tests/common/test_distance_field.py`).
 """
 
 import functools
@@ -115,6 +115,16 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
         shape=np.array([lattice.shape for lattice in lattices]),
     )
     return jax.device_put(field)
+
+
+def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:
+    """Exact signed distance (n,) in m of points (n, 3) of the object frame from the nearest
+    primitive piece, negative inside.
+
+    Inside several pieces at once it is understated.
+    """
+    distance: Array = _least(_slots(pieces), points)
+    return distance
 
 
 class _Lattice(NamedTuple):

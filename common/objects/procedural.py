@@ -70,7 +70,7 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
     rng = np.random.default_rng((seed, stream))
     for _ in range(_MAX_ATTEMPTS):
-        obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
+        obj = build_object(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
         if obj is not None:
             return obj
     raise RuntimeError(f"family {family} produced no valid object for seed {seed}")
@@ -112,8 +112,17 @@ def _check(seed: int, families: Sequence[str]) -> None:
             )
 
 
-def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
-    """Builds the object of a draft; returns None if its size or its parts are out of range."""
+def build_object(
+    name: str, family: str, draft: Draft, rng: np.random.Generator
+) -> GraspObject | None:
+    """Builds the object of a draft; returns None if its size or its parts are out of range.
+
+    Args:
+      name: name of the object.
+      family: name of its family, which determines the ranges of size and mass.
+      draft: pieces and parts.
+      rng: generator of densities, surface points and halves.
+    """
     mass, center, inertia = mass_properties(draft.pieces, _densities(draft, rng))
     pieces = tuple(moved(piece, -center) for piece in draft.pieces)
     points, normals, owner = _surface(draft, pieces, rng)

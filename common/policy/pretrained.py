@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 else:
     bundles = LazyModule("congrasp.common.policy.bundle")  # imports JAX
 
-_FOLDER = pathlib.Path(__file__).with_name("data")
+FOLDER = pathlib.Path(__file__).with_name("data")
+"""Folder of the policies of the package."""
 SUFFIX = ".safetensors"
 
 
@@ -38,7 +39,7 @@ def packaged_file(name: str) -> pathlib.Path:
     """Path of the package's policy of this name, such as `allegro-student`, whether or not it
     exists.
     """
-    return _FOLDER / f"{name}{SUFFIX}"
+    return FOLDER / f"{name}{SUFFIX}"
 
 
 def own_policy_file(name: str) -> pathlib.Path:

@@ -37,9 +37,10 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM
 core, for products so small that the threads cost several times the work."""
 _LENGTH_BYTES = 8
 """Size of the length before each message."""
-_GROUPS = pathlib.Path("/sys/fs/cgroup")
+CGROUPS = pathlib.Path("/sys/fs/cgroup")
 """Folder of the kernel's control groups."""
-_MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
+CGROUP_MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
+"""File with the control groups of this process."""
 
 
 def cores() -> int:
@@ -87,12 +88,12 @@ def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
       separate: its files in version 1, whose texts are joined.
     """
     with contextlib.suppress(OSError):
-        for line in _MEMBERSHIP.read_text(encoding="utf-8").splitlines():
+        for line in CGROUP_MEMBERSHIP.read_text(encoding="utf-8").splitlines():
             _, controllers, group = line.split(":", 2)
             if controllers and controller not in controllers.split(","):
                 continue
             is_version_1 = bool(controllers)
-            mount = _GROUPS / controller if is_version_1 else _GROUPS
+            mount = CGROUPS / controller if is_version_1 else CGROUPS
             files = separate if is_version_1 else (unified,)
             path = pathlib.PurePath(group.lstrip("/"))
             for folder in (path, *path.parents):

@@ -13,7 +13,7 @@ import psutil
 
 from congrasp.common.runtime.lazy_jax import jax
 
-_PROGRAM_SECONDS = 0.5
+PROGRAM_SECONDS = 0.5
 """Least duration of the work on a compiled program that is a stage."""
 _log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def _add(one: Stage) -> None:
 
 def _add_program(event: str, duration_secs: float, **about: str | int) -> None:
     """Records JAX's work on a program, by the program's name."""
-    if event in _PROGRAM_WORK and duration_secs >= _PROGRAM_SECONDS:
+    if event in _PROGRAM_WORK and duration_secs >= PROGRAM_SECONDS:
         name = str(about.get("fun_name")).removeprefix("jit(").removesuffix(")")
         ended = since_start()
         _add(Stage(f"{_PROGRAM_WORK[event]} {name}", ended - duration_secs, ended))

@@ -23,7 +23,8 @@ _SLOW_S = 0.4
 """Duration of a chunk beyond the round trip above which the next one is shorter."""
 CHUNK_TIMEOUT_S = 1.0
 """Time until a chunk counts as lost."""
-_PAUSE_S = 0.05  # after a chunk that was lost or deferred
+PAUSE_S = 0.05
+"""Pause after a chunk that was lost or deferred."""
 _TOKEN_BYTES = 8
 _HEAD = struct.Struct(f"<{_TOKEN_BYTES}sQ")
 """Attachment of a first chunk: token and length of the whole reply."""
@@ -142,6 +143,12 @@ class Outbox:
                 return token
         return None
 
+    @property
+    def busy_accounts(self) -> set[str]:
+        """Accounts to which chunks are being sent."""
+        with self._lock:
+            return set(self._sending)
+
     @contextlib.contextmanager
     def turn(self, account: str) -> Iterator[bool]:
         """Context of sending a chunk: yields True unless too many are being sent to the account."""
@@ -220,7 +227,7 @@ def fetch(
         end = time.monotonic()
         pace.record(end - start, arrived=chunk is not None)
         if chunk is None:
-            time.sleep(max(0.0, min(_PAUSE_S, deadline - end)))
+            time.sleep(max(0.0, min(PAUSE_S, deadline - end)))
             continue
         if not chunk or received + len(chunk) > size:
             raise TransportError(

@@ -65,14 +65,15 @@ _ACCEPT_TIMEOUT_MS = 5000  # of a connection's handshake
 _MAX_HANDSHAKES = 4096  # at a time, but at most a quarter of the open files
 _MAX_FILES = 16384
 """Limit of the process's open files, if the system allows it: each connection is one."""
-_CLOSERS = 64  # threads of a listener that accept and close connections and wait for their data
+CLOSERS = 64
+"""Threads of a listener that accept and close connections and wait for their data."""
 # Of the user; read at the first session
 _RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"
 if not re.search(
     r"\bacc\s*:", _RUNTIME
 ):  # other values than of the form (…) or Name(…) are the user's alone
     os.environ["ZENOH_RUNTIME"] = re.sub(
-        r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {_CLOSERS}), ", _RUNTIME
+        r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {CLOSERS}), ", _RUNTIME
     )
 _POOL = "(?:app|acc|tx|rx|net)"
 _THREADS = r"worker_threads:\+?\d[\d_]{0,3}|max_blocking_threads:\+?[1-9][\d_]{0,3}"

@@ -227,7 +227,7 @@ class ZenohTransport(Transport):
         refused: zenoh.ReplyError | None = None
         try:
             with self._sessions.inside():
-                session = self._session(key)
+                session = self.session(key)
                 replies = session.get(
                     key,
                     FifoChannel(4),
@@ -314,14 +314,24 @@ class ZenohTransport(Transport):
         """See `Transport.close`; takes at most two seconds."""
         self._finalizer()
 
-    def _session(self, key: str) -> zenoh.Session:
-        """Returns the session of a key's flow."""
+    @property
+    def closed(self) -> bool:
+        """True once the transport is closed, also by a revoked certificate."""
+        return self._sessions.closed.is_set()
+
+    def session(self, key: str) -> zenoh.Session:
+        """Returns Zenoh's session of a key's flow, for messages that are not encoded here.
+
+        Raises:
+          TransportError: the transport is closed, or has no such flow.
+          CongraspError: it was closed by a failure.
+        """
         session = self._sessions.get(flow(key))
         if self._sessions.failure:
             raise self._sessions.failure
         if session is not None:
             return session
-        if self._sessions.closed.is_set():
+        if self.closed:
             raise TransportError("The transport is closed.")
         raise TransportError(f"The transport has no flow for {key}.")
 

@@ -22,7 +22,7 @@ from congrasp.common.task.types import Array
 from congrasp.learner.algorithms import gae
 from congrasp.learner.distributed.collectives import Collectives
 
-_MAX_TOGETHER = 1 << 15
+MAX_TOGETHER = 1 << 15
 """Transitions that the networks evaluate together, if a step of all environments has no more."""
 
 
@@ -200,7 +200,7 @@ def evaluate(
 
     # Not all steps at once: the features of the points of 327,680 clouds are 40 GiB.
     steps = batch["observation"], batch.get("privileged")
-    together = max(_MAX_TOGETHER // action.shape[1], 1)
+    together = max(MAX_TOGETHER // action.shape[1], 1)
     exact, mean, value = jax.lax.map(lambda step: evaluated(*step), steps, batch_size=together)
     last_observation = normalizer.apply(inputs.observations, batch["last_observation"])
     last_value = values(last_observation, batch.get("last_privileged"))

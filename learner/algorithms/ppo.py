@@ -189,7 +189,7 @@ class PPO:
         )
         params, optimizer, key = shard(state[:_ON_DEVICE], mesh)
         passes = Passes(self._spec.layout, config.epochs, config.minibatches)
-        learnt, returns, failure, scalars = _optimise(
+        learnt, returns, failure, scalars = optimise(
             params, optimizer, key, inputs, passes=passes, mesh=mesh
         )
         learnt, moments, returns, failure, scalars = unreplicate(
@@ -265,7 +265,7 @@ def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> St
     static_argnames=("passes", "mesh"),
     donate_argnames="optimizer",
 )
-def _optimise(
+def optimise(
     params: Params,
     optimizer: Any,
     key: Array,
@@ -274,8 +274,19 @@ def _optimise(
     passes: Passes,
     mesh: Mesh | None,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
-    """Runs epochs over the batch; returns the learnt state, moments of the returns, the failed
-    term, and metrics.
+    """Runs the epochs of an update over a batch, as one program of all ranks.
+
+    Args:
+      params: parameters of actor and critic; those of the proximal policy.
+      optimizer: state of the optimiser, whose memory is reused.
+      key: random key.
+      inputs: batch, normalisation and hyperparameters; other values of these compile nothing.
+      passes: layout of the observation, and numbers of epochs and minibatches.
+      mesh: devices of the ranks, if there are several.
+
+    Returns:
+      The learnt state (unchanged after a failure), moments of the returns, index of the failed
+      term, and metrics.
     """
     program = functools.partial(_program, collectives=Collectives(mesh), passes=passes)
     specs = REPLICATED, losses.Inputs._make([_specs(inputs.batch), *[REPLICATED] * 4])
@@ -289,7 +300,7 @@ def _program(
     collectives: Collectives,
     passes: Passes,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
-    """Body of `_optimise` for one rank."""
+    """Body of `optimise` for one rank."""
     params, optimizer, key = learnt
     hyper = inputs.hyper
     evaluation = losses.evaluate(params, inputs, collectives, passes.layout)
@@ -316,7 +327,7 @@ def _program(
         "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
     }
     metrics |= losses.batch_metrics(inputs, evaluation, collectives)
-    moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
+    moved_optimizer = _with(moved_optimizer, learning_rate=adapted_rate(learning_rate, kl, hyper))
     params, optimizer = jax.tree.map(
         lambda new, old: jnp.where(failure == _FINE, new, old),
         (moved, moved_optimizer),
@@ -407,9 +418,14 @@ def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Par
     return {**params, "actor": {**params["actor"], "log_std": log_std}}
 
 
-def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
-    """Returns the next learning rate from the mean KL to the proximal policy over the last
-    epoch.
+def adapted_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
+    """Returns the next learning rate: 1.5 times smaller if the KL is above twice the target, as
+    much larger if it is below half the target, and clipped.
+
+    Args:
+      rate: learning rate of the update.
+      kl: mean KL to the proximal policy over the last epoch.
+      hyper: `kl_target` and `learning_rate_range`.
     """
     target = hyper["kl_target"]
     factor_upward = jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0)

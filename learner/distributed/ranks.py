@@ -34,10 +34,10 @@ JOIN_SECONDS = 300.0
 """Deadline for all ranks to join."""
 ROUND_SECONDS = 300.0
 """Deadline of an update, or of an exchange between live ranks."""
-_SILENCE_SECONDS = 20.0
+SILENCE_SECONDS = 20.0
 """Time without a message after which a rank counts as dead."""
 _HEARTBEAT_SECONDS = 2.0
-_RELAY_SECONDS = 2.0
+RELAY_SECONDS = 2.0
 """Time that rank 0 stays alive, so that JAX does not abort the others before they print the
 reason.
 """
@@ -56,17 +56,19 @@ def end_process(text: str, code: int = TransportError.exit_code) -> NoReturn:
     os._exit(code)
 
 
-class _Link:
+class Link:
     """Messages over a TCP connection; a silence beyond the limit raises `OSError`, like its end."""
 
     def __init__(self, connection: socket.socket):
-        connection.settimeout(_SILENCE_SECONDS)
+        """Wraps an open connection."""
+        connection.settimeout(SILENCE_SECONDS)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
         self._file = connection.makefile("rb")
         self._lock = threading.Lock()
 
     def send(self, message: Message) -> None:
+        """Sends a message; an `OSError` if the connection ended."""
         # Meta data as an array: a header's length is limited.
         meta = np.frombuffer(json.dumps(message.meta).encode(), np.uint8)
         data = encode(Message({**message.arrays, _META: meta}))
@@ -74,6 +76,12 @@ class _Link:
             self._socket.sendall(_LENGTH.pack(len(data)) + data)
 
     def receive(self) -> Message:
+        """Waits for the next message.
+
+        Raises:
+          OSError: the connection ended, is silent, or its message is too long.
+          CongraspError: the message is damaged.
+        """
         (length,) = _LENGTH.unpack(self._read(_LENGTH.size))
         if length > MAX_MESSAGE:
             raise ConnectionError(f"a message of {length} bytes")
@@ -81,6 +89,7 @@ class _Link:
         return Message(arrays, json.loads(arrays.pop(_META).tobytes()))
 
     def close(self) -> None:
+        """Closes the connection, also while another thread receives."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -109,7 +118,7 @@ class Ranks:
         self,
         rank: int = 0,
         count: int = 1,
-        links: Mapping[int, _Link] | None = None,
+        links: Mapping[int, Link] | None = None,
         on_lost: Callable[[str], object] = end_process,
     ):
         """Monitors the links: rank 0 to every other rank, any other to rank 0."""
@@ -166,9 +175,9 @@ class Ranks:
         bind = host if host in ("localhost", "127.0.0.1") else ""
         deadline = time.monotonic() + JOIN_SECONDS
         if rank == 0:
-            links = _gather(count, bind, int(port) + 1, deadline)
+            links = accept_links(count, bind, int(port) + 1, deadline)
         else:
-            links = {0: _reach(rank, count, host, int(port) + 1, deadline)}
+            links = {0: open_link(rank, count, host, int(port) + 1, deadline)}
         ranks = cls(rank, count, links, on_lost)
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.config.update("jax_enable_preemption_service", False)  # it would intercept SIGTERM
@@ -179,7 +188,7 @@ class Ranks:
             local_device_ids=[0],
             initialization_timeout=int(JOIN_SECONDS),
             coordinator_bind_address=f"{bind or '[::]'}:{port}",
-            shutdown_timeout_seconds=int(_SILENCE_SECONDS),
+            shutdown_timeout_seconds=int(SILENCE_SECONDS),
         )
         first = {device.process_index: device for device in reversed(jax.devices())}
         ranks.mesh = Mesh(np.array([first[number] for number in range(count)]), (AXIS,))
@@ -255,8 +264,12 @@ class Ranks:
         if self.count == 1 or self._leaving.is_set():
             return
         self.exchange({"bye": True})
-        self._leaving.set()
+        self.leave()
         jax.distributed.shutdown()
+
+    def leave(self) -> None:
+        """Leaves the run without a message; another rank's end is no failure from now on."""
+        self._leaving.set()
 
     def fail(self, error: BaseException) -> None:
         """Reports to the others why this rank ends, unless all leave cleanly or the cause is
@@ -264,11 +277,11 @@ class Ranks:
         """
         if self.count == 1 or self._leaving.is_set():
             return
-        if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
+        if not isinstance(error, CongraspError) and self._lost.wait(RELAY_SECONDS):
             # A collective broke because a peer is gone, which is being reported right
             # now
-            time.sleep(_SILENCE_SECONDS)
-        self._leaving.set()
+            time.sleep(SILENCE_SECONDS)
+        self.leave()
         reason = str(error) or type(error).__name__
         for link in self._links.values():
             with contextlib.suppress(OSError):
@@ -298,11 +311,11 @@ class Ranks:
     def _decide(self, decision: Message) -> None:
         with self._changed:
             if all(entry and entry.get("bye") for entry in decision.meta["entries"]):
-                self._leaving.set()
+                self.leave()
             self._decisions.append(decision)
             self._changed.notify_all()
 
-    def _listen(self, peer: int, link: _Link) -> None:
+    def _listen(self, peer: int, link: Link) -> None:
         """Receives messages of a peer until it is gone."""
         try:
             while True:
@@ -314,7 +327,7 @@ class Ranks:
                 elif "entries" in message.meta:
                     self._decide(message)
         except TimeoutError:
-            self._lose(f"Rank {peer} has been silent for {_SILENCE_SECONDS:.0f} s", peer)
+            self._lose(f"Rank {peer} has been silent for {SILENCE_SECONDS:.0f} s", peer)
         except (OSError, CongraspError, KeyError, ValueError):
             self._lose(f"Rank {peer} ended", peer)
 
@@ -327,7 +340,7 @@ class Ranks:
             with contextlib.suppress(OSError):
                 link.send(Message(meta={"lost": what}))
         if self.rank == 0:
-            time.sleep(_RELAY_SECONDS)
+            time.sleep(RELAY_SECONDS)
         self._on_lost(
             f"{what.rstrip('.')}. Rank {self.rank} cannot continue alone: start all ranks with "
             f"--resume."
@@ -340,18 +353,32 @@ class Ranks:
                     link.send(Message())
 
 
-def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Link]:
-    """On rank 0: accepts the links of all others."""
+def accept_links(count: int, bind: str, port: int, deadline: float) -> dict[int, Link]:
+    """Accepts the links of all other ranks, on rank 0.
+
+    Args:
+      count: number of ranks.
+      bind: address of the interface, "" for all.
+      port: port to listen at.
+      deadline: end of the wait, by `time.monotonic`.
+
+    Returns:
+      Links by rank.
+
+    Raises:
+      CongraspError: the port is in use.
+      TransportError: not all ranks joined before the deadline.
+    """
     with os_errors_as(
         f"Rank 0 cannot listen at port {port}", "Choose another --coordinator HOST:PORT."
     ):
         server = socket.create_server((bind, port))
-    links: dict[int, _Link] = {}
+    links: dict[int, Link] = {}
     with server:
         while len(links) < count - 1:
             server.settimeout(max(0.1, deadline - time.monotonic()))
             try:
-                link = _Link(server.accept()[0])
+                link = Link(server.accept()[0])
                 hello = link.receive().meta
             except TimeoutError:
                 if time.monotonic() < deadline:
@@ -375,11 +402,22 @@ def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Lin
     return links
 
 
-def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Link:
-    """On other ranks: opens the link to rank 0."""
+def open_link(rank: int, count: int, host: str, port: int, deadline: float) -> Link:
+    """Opens the link to rank 0, on other ranks.
+
+    Args:
+      rank: number of this process.
+      count: number of ranks.
+      host: address of rank 0.
+      port: port at which it accepts links.
+      deadline: end of the attempts, by `time.monotonic`.
+
+    Raises:
+      TransportError: rank 0 does not answer before the deadline.
+    """
     while True:
         try:
-            link = _Link(socket.create_connection((host, port), timeout=5.0))
+            link = Link(socket.create_connection((host, port), timeout=5.0))
             link.send(Message(meta={"rank": rank, "ranks": count}))
             return link
         except OSError as error:

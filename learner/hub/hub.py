@@ -63,7 +63,8 @@ class LearnerHub:
         self.trouble = ""
         """Reason why the run cannot be saved, and what its end would cost; part of the status."""
         self._rate_limit = RateLimit()
-        self._pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
+        self.pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
+        """Limit of the requests for weights."""
         self._serve()
 
     def publish_weights(self, bundle: Message, version: int) -> None:
@@ -271,9 +272,9 @@ class LearnerHub:
         """Returns the reply to a peer beyond the rate limit of weights; None for others, which are
         charged.
         """
-        if not self._pull_limit.admits(key):
+        if not self.pull_limit.admits(key):
             return Message(meta=self._state())
-        self._pull_limit.charge(key, 0)
+        self.pull_limit.charge(key, 0)
         return None
 
     def _on_damage(self, key: str, error: CongraspError) -> None:

@@ -1,7 +1,7 @@
 """The caches of compiled programs, kernels and constraint banks as one tar file for other machines.
 
 The first member, `caches.json`, holds the versions and the device for which the caches were filled.
-The names of the others are CACHE/PATH, with a cache of `_folders`.
+The names of the others are CACHE/PATH, with a cache of `cache_folders`.
 """
 
 import contextlib
@@ -31,11 +31,11 @@ def export_caches(path: pathlib.Path) -> None:
       CongraspError: the file cannot be written.
     """
     with replacement(path) as file, tarfile.open(fileobj=file, mode="w") as archive:
-        text = json.dumps(_machine()).encode()
+        text = json.dumps(machine_facts()).encode()
         manifest = tarfile.TarInfo(_MANIFEST)
         manifest.size = len(text)
         archive.addfile(manifest, io.BytesIO(text))
-        for name, folder in _folders().items():
+        for name, folder in cache_folders().items():
             _add_folder(archive, name, folder)
 
 
@@ -58,7 +58,7 @@ def import_caches(path: pathlib.Path) -> int:
       CongraspError: the file cannot be read, is not of this command, or was made for other versions
         or another device.
     """
-    folders = _folders()
+    folders = cache_folders()
     targets: dict[tarfile.TarInfo, pathlib.Path] = {}
     with _opened(path) as archive:
         # All names are checked before the first file is written
@@ -119,7 +119,7 @@ def _opened(path: pathlib.Path) -> Iterator[tarfile.TarFile]:
 
 def _check_machine(manifest: Mapping[str, Any], path: pathlib.Path) -> None:
     """Raises a CongraspError for caches of other versions or another device."""
-    for name, value in _machine().items():
+    for name, value in machine_facts().items():
         if manifest[name] != value:
             raise CongraspError(
                 f"{path} was made for {name} {manifest[name]!a:.80}, but this machine has {value}.",
@@ -135,7 +135,7 @@ def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     return file.read()
 
 
-def _machine() -> dict[str, Any]:
+def machine_facts() -> dict[str, Any]:
     """Versions and device for which programs and kernels are compiled."""
     import jax
 
@@ -149,7 +149,7 @@ def _machine() -> dict[str, Any]:
     }
 
 
-def _folders() -> dict[str, pathlib.Path]:
+def cache_folders() -> dict[str, pathlib.Path]:
     """Folders of this machine's caches by their names in a file."""
     folders = {"banks": cache_folder("banks")}
     programs = os.environ.get("JAX_COMPILATION_CACHE_DIR")

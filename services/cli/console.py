@@ -94,7 +94,7 @@ def bars() -> Iterator[Progress]:
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        _Counts(),
+        Counts(),
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
@@ -104,14 +104,14 @@ def bars() -> Iterator[Progress]:
         told = (
             contextlib.nullcontext()
             if console.is_terminal
-            else announced(functools.partial(_current, progress))
+            else announced(functools.partial(current_activity, progress))
         )
         with told:
             yield progress
 
 
-def _current(progress: Progress) -> str:
-    """The newest unfinished task and its counts."""
+def current_activity(progress: Progress) -> str:
+    """Returns the newest unfinished task and its counts, as a line for output without bars."""
     tasks = [
         task for task in progress.tasks if task.visible and not task.finished
     ] or progress.tasks
@@ -125,7 +125,7 @@ def _current(progress: Progress) -> str:
     return f"{task.description}, {task.completed:g} of {task.total:g}"
 
 
-class _Counts(MofNCompleteColumn):
+class Counts(MofNCompleteColumn):
     """Completed and total steps of a task; nothing before its first step."""
 
     def render(self, task: Task) -> Text:

@@ -139,7 +139,7 @@ def run(arguments: list[str]) -> int:
         raise CongraspError(f"There is no {kind} '{name}'.", remedy)
     check_inputs(rest)
     check_xla_flags()
-    _prepare_environment()
+    prepare_environment()
     interrupted = False
     result = None
     with on_signal(interrupt=True) as stop:
@@ -196,7 +196,7 @@ def usage() -> str:
     )
 
 
-def _prepare_environment() -> None:
+def prepare_environment() -> None:
     """Removes settings of other programs from the environment, and configures caches of compiled
     programs and compiler output, unless the user has.
     """

@@ -65,7 +65,7 @@ class View:
 
     def __call__(self) -> int:
         """Offers the page until a signal."""
-        view = self if self.run_dir is None else self._of_folder(self.run_dir)
+        view = self if self.run_dir is None else self.of_folder(self.run_dir)
         with contextlib.ExitStack() as starting:
             starting.enter_context(
                 announced("Loading the policies and compiling the studio's rules")
@@ -79,8 +79,12 @@ class View:
         print(f"The studio ends: {stop.reason}.", flush=True)
         return stop.exit_code
 
-    def _of_folder(self, run_dir: pathlib.Path) -> "View":
-        """Returns the page of a run's learner if that responds, else of its newest policy."""
+    def of_folder(self, run_dir: pathlib.Path) -> "View":
+        """Returns the page of a run's learner if that responds, else of its newest policy.
+
+        Raises:
+          CongraspError: the folder is not a run directory, or other options are set.
+        """
         from congrasp.learner.run_directory import POLICY_FILE, learner_url, open_run
 
         if self.connect or self.policy or self.recordings or self.run != _RUN:

@@ -42,6 +42,12 @@ class QueryThread:
         self._thread = threading.Thread(target=self._work, daemon=True, name="guard")
         self._thread.start()
 
+    @property
+    def is_busy(self) -> bool:
+        """True while a query is pending."""
+        with self._changed:
+            return self._busy
+
     def require_same_process(self) -> None:
         """Raises a ForkError in a fork of this process, where the thread does not run."""
         forks.require_same_process(self._opened, "guard")

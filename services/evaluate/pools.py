@@ -38,9 +38,9 @@ from congrasp.services.evaluate.experiment import (
 
 _MAX_OBJECTS_ON_DEVICE = 4096
 """Most objects of a pool for engines on a device."""
-_MAX_OBJECTS_ELSEWHERE = 128
+MAX_OBJECTS_ELSEWHERE = 128
 """Most objects of a pool for other engines, which compile a scene for each."""
-_MAX_OBJECTS_OF_FOLDER = 512
+MAX_OBJECTS_OF_FOLDER = 512
 """Most objects of a pool of a folder, whose surfaces may be large."""
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
@@ -87,14 +87,14 @@ def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
 
 def most_objects(physics: PhysicsName) -> int:
     """Most objects of a pool whose surfaces may be large."""
-    return min(_max_objects(physics), _MAX_OBJECTS_OF_FOLDER)
+    return min(_max_objects(physics), MAX_OBJECTS_OF_FOLDER)
 
 
 def _max_objects(physics: PhysicsName) -> int:
     """Most objects of a pool of procedural objects."""
     if ENGINES[physics].on_device:
         return _MAX_OBJECTS_ON_DEVICE
-    return _MAX_OBJECTS_ELSEWHERE
+    return MAX_OBJECTS_ELSEWHERE
 
 
 def listed_pools(

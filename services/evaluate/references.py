@@ -44,7 +44,7 @@ HELD_OUT = POSES // 5
 """References of an object and region that its constraint set holds out (`sampling.sets`), the last
 ones.
 """
-_MAX_ATTEMPTS = 3 * POSES
+MAX_ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
 _ATTEMPTS_PER_REFERENCE = 1.25
 """Episodes for each missing reference."""
@@ -149,7 +149,7 @@ class _GraspsOfRegion(NamedTuple):
         missing = np.array([POSES - len(grasps) for grasps in self.grasps])
         graspable = np.array([len(rests) > 0 for rests in self.rests])
         episodes = np.ceil(_ATTEMPTS_PER_REFERENCE * missing * graspable).astype(int)
-        return np.minimum(episodes, _MAX_ATTEMPTS - self.attempts)
+        return np.minimum(episodes, MAX_ATTEMPTS - self.attempts)
 
     def plan(self, episodes: np.ndarray, names: np.ndarray) -> RowPlan:
         """Plans episodes.
@@ -305,7 +305,7 @@ def _key(
     made_by = bundles.content_hash(encode(policy.to_message()))
     digests = [store.digest(obj) for obj in objects]
     geometry = [task.trajectory_points, task.surface_points, task.back_off, task.headings]
-    text = json.dumps([made_by, digests, geometry, physics, _SEED, POSES, _MAX_ATTEMPTS])
+    text = json.dumps([made_by, digests, geometry, physics, _SEED, POSES, MAX_ATTEMPTS])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

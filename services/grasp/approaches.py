@@ -169,7 +169,7 @@ def _sampled_headings(
     raise CongraspError(
         f"No approach reaches the graspable region of '{obj.name}' without touching its avoid "
         "region.",
-        _remedy(request, "make the graspable part larger"),
+        remedy_for(request, "make the graspable part larger"),
     )
 
 
@@ -240,8 +240,8 @@ def _balanced(obj: GraspObject) -> GraspObject:
     )
 
 
-def _remedy(request: GraspRequest, otherwise: str) -> str:
-    """Remedy for a request that no approach fits.
+def remedy_for(request: GraspRequest, otherwise: str) -> str:
+    """Returns the remedy for a request that no approach fits.
 
     Args:
       request: the request.
@@ -264,12 +264,12 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
         return (
             f"'{obj.name}' cannot be approached under these constraints in resting pose "
             f"{request.rest + 1}.",
-            _remedy(request, "set another --heading"),
+            remedy_for(request, "set another --heading"),
         )
     if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",
-            _remedy(request, "scale it"),
+            remedy_for(request, "scale it"),
         )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 
-_MAX_BYTES = 32 << 20
+MAX_BYTES = 32 << 20
+"""Limit of a file's size."""
 _MAX_DEPTH = 200
 """Largest number of joints in a chain."""
 
@@ -45,7 +46,7 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
       CongraspError: the file is damaged, or has no such joint; the message names the existing ones.
     """
     try:
-        text = read_file(path, _MAX_BYTES, "Cut it into shorter ones.").decode()
+        text = read_file(path, MAX_BYTES, "Cut it into shorter ones.").decode()
         return _joint_path(text, path, joint)
     except (ValueError, LookupError, StopIteration) as error:
         raise CongraspError(

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -92,6 +93,43 @@ class Attempted(NamedTuple):
         return sum(int(one_round.holds.sum()) for one_round in self.rounds)
 
 
+def limiting_cause(
+    obj: GraspObject,
+    request: GraspRequest,
+    attempt: Callable[[GraspObject, str], np.ndarray],
+) -> str:
+    """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller
+    object, else "".
+
+    The smaller object has the same mass. It is tried only if the request names no place in the
+    object frame.
+
+    Args:
+      obj: the object that no attempt holds.
+      request: the constraints.
+      attempt: (changed object, activity for the progress) -> (n,) bool, which attempts hold it; a
+        CongraspError skips the object.
+    """
+    lighter = dataclasses.replace(
+        obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia)
+    )
+    trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
+    if prescribed(request) is None and request.given("heading", "position") is None:
+        smaller = obj.scaled(_SMALLER, constant_mass=True)
+        trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
+    for changed, cause, change in trials:
+        try:
+            holds = attempt(changed, f"Checking whether its {cause} is the cause")
+        except CongraspError:
+            continue
+        if holds.mean() >= _ENOUGH_HOLDS:
+            return (
+                f"Its {cause} is the cause: with {change} {holds.sum()} of {len(holds)} "
+                f"attempts hold it."
+            )
+    return ""
+
+
 class Grasper:
     """Grasps one object after another with a policy; all of them share the compiled programs."""
 
@@ -129,7 +167,7 @@ class Grasper:
             raise CongraspError(f"The seed is {seed}.", "It must be at least 0.")
         self._arm = arm
         self._hand = get_hand(policy.spec.hand)
-        self._left = left
+        self.left = left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
         self.task = policy.task.evaluated()
         self._policy = policy
@@ -160,7 +198,7 @@ class Grasper:
             self._rounds,
             self._seed,
             *self._attempts.phases,
-            self._left,
+            self.left,
             arm,
             *engine,
         )
@@ -206,7 +244,7 @@ class Grasper:
           CongraspError: the table obstructs all attempts.
         """
         require_known(request.constraints, self.task)
-        if self._left:
+        if self.left:
             obj = obj.mirrored()
             request = mirrored_request(request)
         if request.avoid is not None:
@@ -293,31 +331,12 @@ class Grasper:
         return cost[: len(attempts.holds)]
 
     def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
-        """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller
-        object, else "".
+        """Returns a sentence on the cause of all failures; see `limiting_cause`."""
 
-        The smaller object has the same mass. It is tried only if the request names no place in the
-        object frame.
-        """
-        lighter = dataclasses.replace(
-            obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia)
-        )
-        trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
-        if prescribed(request) is None and request.given("heading", "position") is None:
-            smaller = obj.scaled(_SMALLER, constant_mass=True)
-            trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
-        for changed, cause, change in trials:
-            activity = f"Checking whether its {cause} is the cause"
-            try:
-                holds = self._attempt(changed, request, self._seed, activity, progress).holds
-            except CongraspError:
-                continue
-            if holds.mean() >= _ENOUGH_HOLDS:
-                return (
-                    f"Its {cause} is the cause: with {change} {holds.sum()} of {len(holds)} "
-                    f"attempts hold it."
-                )
-        return ""
+        def attempt(changed: GraspObject, activity: str) -> np.ndarray:
+            return self._attempt(changed, request, self._seed, activity, progress).holds
+
+        return limiting_cause(obj, request, attempt)
 
     def _motion_on_arm(self, arm: "ArmPlanner", attempted: Attempted, progress: Progress) -> Grasp:
         """Returns the best attempt that the arm can execute, of the first round that has one.
@@ -381,7 +400,7 @@ class Grasper:
             episode = with_planned_reach(
                 episode, self._hand, obj, seconds, self._attempts.speed, side
             )
-        if self._left:
+        if self.left:
             episode = mirrored_episode(episode, self.hand)
         return Grasp(
             episode=episode,

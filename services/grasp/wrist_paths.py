@@ -15,7 +15,8 @@ from congrasp.common.io.arrays import check_arrays, read_npz
 from congrasp.services.grasp.bvh import read_bvh
 from congrasp.services.grasp.csv_paths import HUGE, UNIT_LENGTH, read_csv
 
-_MAX_CSV_BYTES = 32 << 20
+MAX_CSV_BYTES = 32 << 20
+"""Limit of the size of a CSV file."""
 _FROM_Y_UP = Rotation.from_euler("X", 90, degrees=True)
 """From the frame of BVH files, whose y axis is up."""
 _BVH_UNIT = 0.01  # m
@@ -71,7 +72,7 @@ def _read(path: pathlib.Path, joint: str) -> WristPath:
         position, rotation, seconds = read_bvh(path, joint)
         return WristPath(_FROM_Y_UP.apply(position * _BVH_UNIT), _FROM_Y_UP * rotation, seconds)
     if kind == ".csv":
-        position, quaternion = read_csv(path, _MAX_CSV_BYTES)
+        position, quaternion = read_csv(path, MAX_CSV_BYTES)
     elif kind == ".npz":
         position, quaternion = _read_npz(path)
     else:

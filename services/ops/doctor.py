@@ -26,7 +26,8 @@ from congrasp.services.ops.status import ask
 _PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
 _PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
 """Packages whose versions must match."""
-_PORT = int(LEARNER_URL.rpartition(":")[2])
+PORT = int(LEARNER_URL.rpartition(":")[2])
+"""First of the default ports of a learner."""
 _LEAST_GIB = 2.0
 _LEAST_MB_S = 5.0
 _SAMPLE = 16 << 20
@@ -38,7 +39,8 @@ _DRIVER = 580
 _LEAST_DAYS = 14.0  # warning before a certificate expires, days
 _OFFSET = 1.0  # tolerated offset from the learner's clock, s
 _BETWEEN = 0.05  # seconds between two requests; a secured learner accepts a hundred per second
-_NVIDIA = "/dev/nvidia0"
+NVIDIA_DEVICE = "/dev/nvidia0"
+"""File that exists on a machine with an NVIDIA GPU."""
 
 
 class Finding(NamedTuple):
@@ -72,24 +74,31 @@ def examine(
       folder: folder for runs.
       certs: folder of certificates to check, and to use for the connection.
     """
-    checks: list[Callable[[], Iterator[Finding]]] = [_python, _packages, _gpu, _jax, _warp, _ports]
-    checks += [lambda: _disk(folder), _clock]
+    checks: list[Callable[[], Iterator[Finding]]] = [
+        check_python,
+        check_packages,
+        check_gpu,
+        check_jax,
+        check_warp,
+        check_ports,
+    ]
+    checks += [lambda: check_disk(folder), check_clock]
     if certs:
-        checks.append(lambda: _certificates(certs))
+        checks.append(lambda: check_certificates(certs))
     if connect:
-        checks.append(lambda: _learner(connect, run, certs))
+        checks.append(lambda: check_learner(connect, run, certs))
     findings: list[Finding] = []
     for check in checks:
-        findings += _tried(check)
+        findings += run_check(check)
     return findings
 
 
-def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """Runs a check; an exception is a failed finding."""
+def run_check(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """Yields the findings of a check; an exception is a failed finding."""
     try:
         yield from check()
     except Exception as error:
-        name = getattr(check, "__name__", "").strip("_<>") or "check"
+        name = getattr(check, "__name__", "check").strip("_<>").removeprefix("check_")
         yield Finding(
             name,
             False,
@@ -97,15 +106,15 @@ def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
         )
 
 
-def _python() -> Iterator[Finding]:
+def check_python() -> Iterator[Finding]:
     """Checks the version of Python."""
     fine = (3, 11) <= sys.version_info[:2] < (3, 14)
     yield Finding("python", fine, platform.python_version(), "3.11, 3.12 or 3.13 is needed")
 
 
-def _packages() -> Iterator[Finding]:
+def check_packages() -> Iterator[Finding]:
     """Checks versions required by the package's metadata, and those that must match."""
-    extra = "cuda" if os.path.exists(_NVIDIA) else "train"
+    extra = "cuda" if os.path.exists(NVIDIA_DEVICE) else "train"
     required = _required_versions(("", "train", extra))
     installed: dict[str, str] = {}
     for name in _PACKAGES:
@@ -140,9 +149,9 @@ def _required_versions(extras: Sequence[str]) -> dict[str, SpecifierSet]:
     return required
 
 
-def _gpu() -> Iterator[Finding]:
+def check_gpu() -> Iterator[Finding]:
     """Reports name, memory and driver of each NVIDIA GPU."""
-    if not os.path.exists(_NVIDIA):
+    if not os.path.exists(NVIDIA_DEVICE):
         yield Finding("gpu", True, "no NVIDIA GPU here; actors use the native engine")
         return
     query = [
@@ -166,7 +175,7 @@ def _gpu() -> Iterator[Finding]:
         yield Finding(f"gpu {number}", fine, text, f"{_DRIVER} or newer is needed; update it")
 
 
-def _jax() -> Iterator[Finding]:
+def check_jax() -> Iterator[Finding]:
     """Checks that JAX finds the machine's devices, and that a small program runs."""
     # A learner may be using this GPU
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -176,7 +185,7 @@ def _jax() -> Iterator[Finding]:
     devices = ", ".join(device.device_kind for device in jax.devices())
     backend = jax.default_backend()
     computed = float(jax.jit(lambda x: (x * x).sum())(jnp.arange(4.0)))
-    missing = backend == "cpu" and os.path.exists(_NVIDIA)
+    missing = backend == "cpu" and os.path.exists(NVIDIA_DEVICE)
     remedy = "an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'"
     if not missing:
         remedy = f"a small program gave {computed}, not 14; reinstall it"
@@ -184,9 +193,9 @@ def _jax() -> Iterator[Finding]:
     yield Finding("jax", not missing and computed == 14.0, text, remedy)
 
 
-def _warp() -> Iterator[Finding]:
+def check_warp() -> Iterator[Finding]:
     """Checks that Warp finds the GPU, and that a small kernel runs."""
-    if not os.path.exists(_NVIDIA):
+    if not os.path.exists(NVIDIA_DEVICE):
         return
     import warp as wp
 
@@ -208,10 +217,10 @@ def _warp() -> Iterator[Finding]:
     yield Finding("warp", total == 24.0, text, f"it gave {total}, not 24; reinstall it")
 
 
-def _ports() -> Iterator[Finding]:
+def check_ports() -> Iterator[Finding]:
     """Checks the default ports of a learner."""
-    last = _PORT + len(FLOWS) - 1
-    for port in range(_PORT, last + 1):
+    last = PORT + len(FLOWS) - 1
+    for port in range(PORT, last + 1):
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 yield Finding(
@@ -220,11 +229,11 @@ def _ports() -> Iterator[Finding]:
                     f"{port} is in use (by another learner?); pass others with --listen",
                 )
                 return
-    yield Finding("ports", True, f"{_PORT}-{last} are free")
+    yield Finding("ports", True, f"{PORT}-{last} are free")
 
 
-def _disk(folder: pathlib.Path) -> Iterator[Finding]:
-    """Checks free space, and the speed of a synchronous write."""
+def check_disk(folder: pathlib.Path) -> Iterator[Finding]:
+    """Checks free space of a folder's disk, and the speed of a synchronous write there."""
     free = shutil.disk_usage(folder).free / 2**30
     if free < _LEAST_GIB:
         remedy = f"a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
@@ -251,7 +260,7 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
     )
 
 
-def _clock() -> Iterator[Finding]:
+def check_clock() -> Iterator[Finding]:
     """Checks that the date is plausible, and that the monotonic clock runs at the same rate."""
     date = time.time()
     monotonic = time.monotonic()
@@ -265,8 +274,8 @@ def _clock() -> Iterator[Finding]:
     yield Finding("clock", fine, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy)
 
 
-def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
-    """Reports the expiry of each certificate."""
+def check_certificates(folder: pathlib.Path) -> Iterator[Finding]:
+    """Reports the expiry of each certificate in a folder."""
     try:
         listed = certificates(folder)
     except CongraspError as error:
@@ -284,8 +293,14 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
         yield Finding("certificate", one.days > _LEAST_DAYS, text, remedy)
 
 
-def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
-    """Checks that a learner responds, and the offset of its clock."""
+def check_learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
+    """Checks that a learner responds, and the offset of its clock.
+
+    Args:
+      connect: endpoint of the learner.
+      run: name of its run.
+      certs: folder of certificates for the connection.
+    """
     try:
         with urls.connect(connect, "observer", certs=certs, wait=5.0, run=run) as transport:
             ask(transport, run)

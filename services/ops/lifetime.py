@@ -34,7 +34,7 @@ SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
 _PARENT = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
-_POLL = 0.5
+POLL_S = 0.5
 """Time between two looks at a child, s."""
 _KILL_TIMEOUT_S = 0.5
 """Deadline for the end of all killed children."""
@@ -302,7 +302,7 @@ def run_child(
         child.start()
         while child.code is None and time.monotonic() - began < patience:
             progress(child.last_line())
-            time.sleep(_POLL)
+            time.sleep(POLL_S)
         code = child.code
     finally:
         end_all([child])

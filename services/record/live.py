@@ -18,7 +18,7 @@ from congrasp.services.record.writer import Channel, Entry
 
 _BACKLOG = 20000
 """Entries queued for their time; the newest beyond this are dropped."""
-_BYTES = 256 << 20
+MAX_QUEUED_BYTES = 256 << 20
 """Bytes of the entries queued for their time."""
 _TOPICS = 4096
 """Open channels; beyond this the one that was silent for longest is closed."""
@@ -87,7 +87,7 @@ class LiveServer(Closing):
         """Queues an entry until its time, or drops it if the queue is full."""
         with self._accounting:
             queued_bytes = self.queued_bytes + len(entry.data)
-            if queued_bytes > _BYTES or self._incoming.qsize() > _BACKLOG:
+            if queued_bytes > MAX_QUEUED_BYTES or self._incoming.qsize() > _BACKLOG:
                 self.left_out[entry.channel.topic] += 1
                 return
             self.queued_bytes = queued_bytes

@@ -23,7 +23,7 @@ _SOCKETS = 32
 """Connections at a time, shared by addresses."""
 _UNREAD_BYTES = 4 << 20
 """Bytes that wait for a client that does not read."""
-_UNREAD_S = 10.0
+UNREAD_S = 10.0
 """Time after which a client that does not read is dropped."""
 _CHUNK_BYTES = 1 << 16
 _CLOSING_S = 1.0
@@ -129,7 +129,7 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
     """Copies one direction of a connection until it ends, or its receiver does not read."""
     while data := await reader.read(_CHUNK_BYTES):
         writer.write(data)
-        await asyncio.wait_for(writer.drain(), _UNREAD_S)
+        await asyncio.wait_for(writer.drain(), UNREAD_S)
 
 
 def _fault(head: str) -> str:

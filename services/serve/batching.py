@@ -24,7 +24,8 @@ R = TypeVar("R")
 
 
 _ANYONE = Peer()
-_ALONE = 1.0  # seconds without a query of another peer until one counts as alone
+ALONE_S = 1.0
+"""Time without a query of another peer after which a peer counts as alone."""
 
 
 class Parts(NamedTuple, Generic[T, R]):
@@ -161,7 +162,7 @@ class Batcher(Generic[T, R]):
         if peer == self._latest:
             return
         if self._latest is not None:
-            self._several_until = now + _ALONE
+            self._several_until = now + ALONE_S
         self._latest = peer
 
     def _is_idle(self) -> bool:

@@ -44,7 +44,8 @@ SHARED = BATCH_SIZES[1:]
 _TIMEOUT_S = 1.0
 """Deadline of a query by default."""
 _MAX_TIMEOUT_S = 60.0
-_FOLLOW_SECONDS = 0.5
+FOLLOW_SECONDS = 0.5
+"""Time between two requests for newer weights."""
 
 
 class _Held(NamedTuple):
@@ -174,7 +175,7 @@ class PolicyServer:
         """Refuses queued queries, and stops following."""
         self._closed.set()
         self._batcher.close()
-        self._follower.join(2 * _FOLLOW_SECONDS)
+        self._follower.join(2 * FOLLOW_SECONDS)
 
     def _reject(self, key: str) -> None:
         """Refuses a query for which the queue has no room, before decoding it."""
@@ -191,7 +192,7 @@ class PolicyServer:
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            timeout = self._deadline(request.meta.get("timeout", _TIMEOUT_S))
+            timeout = checked_timeout(request.meta.get("timeout", _TIMEOUT_S))
             future = self._batcher.submit(query, timeout, peer=sender(key))
         except CongraspError as error:
             self._count(error, began)
@@ -220,16 +221,6 @@ class PolicyServer:
             outcome = "refused"
         self._on_answer(outcome, time.monotonic() - began)
 
-    @staticmethod
-    def _deadline(seconds: Any) -> float:
-        """Validates the deadline of a query in seconds."""
-        if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT_S:
-            raise CongraspError(
-                f"The query's 'timeout' is {ascii(seconds)[:40]}.",
-                f"It must be seconds, at most {_MAX_TIMEOUT_S:g}.",
-            )
-        return float(seconds)
-
     def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[Answer | Exception]:
         """Answers a batch."""
         held = self._held
@@ -249,22 +240,13 @@ class PolicyServer:
         """Joins the parts of a query; repeats it if the policy was swapped, so that one policy
         answers all.
         """
-        first = answers[0]
-        last = answers[-1]
-        if any(answer.policy is not last.policy for answer in answers):
-            return self._infer([query], [first.queue_s])[0]
-        vectors = np.concatenate([answer.inference.vectors for answer in answers])
-        active: list[list[str]] = []
-        for answer in answers:
-            active += answer.inference.active
-        infer_s = sum(answer.infer_s for answer in answers)
-        return Answer(Inference(vectors, active), last.policy, first.queue_s, infer_s)
+        return join_parts(answers, lambda: self._infer([query], [answers[0].queue_s])[0])
 
     def _follow(self) -> None:
         """Swaps in newer policies; one that does not match is refused, and the current one
         stays.
         """
-        while not self._closed.wait(_FOLLOW_SECONDS):
+        while not self._closed.wait(FOLLOW_SECONDS):
             try:
                 newer = self._source(self._held.bundle.version)
                 if newer is not None:
@@ -290,6 +272,41 @@ class PolicyServer:
             )
         self._held = _hold(newer)
         self._trouble = ""
+
+
+def checked_timeout(seconds: Any) -> float:
+    """Returns the deadline of a query in seconds.
+
+    Raises:
+      CongraspError: it is not a number above 0 and at most 60.
+    """
+    if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT_S:
+        raise CongraspError(
+            f"The query's 'timeout' is {ascii(seconds)[:40]}.",
+            f"It must be seconds, at most {_MAX_TIMEOUT_S:g}.",
+        )
+    return float(seconds)
+
+
+def join_parts(
+    answers: Sequence[Answer], repeat: Callable[[], Answer | Exception]
+) -> Answer | Exception:
+    """Joins the answers to the parts of a query, in their order.
+
+    Args:
+      answers: answers to the parts.
+      repeat: answers the whole query again, for parts that several policies answered.
+    """
+    first = answers[0]
+    last = answers[-1]
+    if any(answer.policy is not last.policy for answer in answers):
+        return repeat()
+    vectors = np.concatenate([answer.inference.vectors for answer in answers])
+    active: list[list[str]] = []
+    for answer in answers:
+        active += answer.inference.active
+    infer_s = sum(answer.infer_s for answer in answers)
+    return Answer(Inference(vectors, active), last.policy, first.queue_s, infer_s)
 
 
 def _message(answer: Answer, seconds: float) -> Message:

@@ -136,8 +136,8 @@ class PolicyGrasping:
         outcome, distances = self._attempt(obj, request, lambda share: progress("grasping", share))
         self._compiled = True
         removal = self.task.approach_steps - 1
-        index = _best(outcome, tuple(request.constraints), removal, phases.lift)
-        about = {"actor": "studio", "note": _note(outcome, index, distances)}
+        index = best_attempt(outcome, tuple(request.constraints), removal, phases.lift)
+        about = {"actor": "studio", "note": variation_note(outcome, index, distances)}
         episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
         if phases.approach:
             progress("reach", 1.0)
@@ -171,7 +171,7 @@ class PolicyGrasping:
         """Outcome of a request and its variations, and the distance (B,) of each from the request,
         m.
         """
-        episodes, distances = _episodes(self.hand, self.task, obj, request)
+        episodes, distances = varied_episodes(self.hand, self.task, obj, request)
         steps = self._attempts.simulated_steps
         outcome = self._attempts.run(obj, episodes, lambda step: progress(step / steps))
         return outcome, distances
@@ -197,10 +197,12 @@ def of_run(transport: Transport, run: str, name: str) -> Loaders:
     return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{run}'")}
 
 
-def _episodes(
+def varied_episodes(
     hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest
 ) -> tuple[RequestedEpisodes, np.ndarray]:
-    """`ATTEMPTS` episodes, the first as drawn, and the distance (B,) of each from it, m."""
+    """Returns `ATTEMPTS` episodes, the first as drawn and the others near it, and the distance (B,)
+    of each from the drawn grasp, m.
+    """
     rng = np.random.default_rng(0)
     drawn = repeated(hand, task, obj, request, ATTEMPTS)
     goal = drawn.goal
@@ -230,16 +232,28 @@ def _episodes(
     return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
-def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
-    """Index of the drawn grasp, or of a variation that clearly holds or meets the constraints
-    better.
+def best_attempt(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
+    """Returns the index of the drawn grasp, or of a variation that clearly holds or meets the
+    constraints better.
+
+    Args:
+      outcome: outcome of `ATTEMPTS` attempts, the drawn one first.
+      constraints: names of the requested constraints.
+      removal: control step of the table's removal.
+      lift: height of the lift, m.
     """
     penalty = _VARIATION_COST * (np.arange(ATTEMPTS) > 0)
     return int(np.argmin(costs(outcome, constraints, removal, lift) + penalty))
 
 
-def _note(outcome: Outcome, index: int, distances: np.ndarray) -> str:
-    """Reason why a variation is shown; empty if the drawn grasp is shown, or none held."""
+def variation_note(outcome: Outcome, index: int, distances: np.ndarray) -> str:
+    """Returns the reason why a variation is shown; empty if the drawn grasp is shown, or none held.
+
+    Args:
+      outcome: outcome of the attempts.
+      index: index of the shown attempt.
+      distances: (B,) distance of each attempt from the drawn grasp, m.
+    """
     held = outcome.metrics["held"] > 0
     if index == 0 or not held.any():
         return ""

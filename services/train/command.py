@@ -98,7 +98,7 @@ def run_training(
         stop = stack.enter_context(on_signal())
         _announce(config, run_dir, plan)
         began = time.monotonic()
-        with _Progress(config) as progress:
+        with TrainingProgress(config) as progress:
             _train(run_dir, config, plan, stop, progress)
         minutes = (time.monotonic() - began) / 60
         if stop.is_set():
@@ -107,13 +107,13 @@ def run_training(
         console.print(f"Trained for {minutes:.1f} min.")
         if evaluation:
             _show(run_dir, config, evaluation)
-        _next_steps(run_dir)
+        print_next_steps(run_dir)
         console.print(f"\nThe training ends: all {config.updates} updates are done.")
     return 0
 
 
 def _train(
-    run_dir: pathlib.Path, config: RunConfig, plan: Plan, stop: Stop, progress: "_Progress"
+    run_dir: pathlib.Path, config: RunConfig, plan: Plan, stop: Stop, progress: "TrainingProgress"
 ) -> None:
     """Trains in this process, or with one process for each role."""
     if plan.in_process:
@@ -255,10 +255,11 @@ def untrained(config: RunConfig) -> PolicyBundle:
     )
 
 
-class _Progress:
+class TrainingProgress:
     """One line that is updated on a terminal; elsewhere a line about every ten seconds."""
 
     def __init__(self, config: RunConfig):
+        """Shows nothing until the context is entered."""
         self._config = config
         self._began = time.monotonic()
         self._last = 0.0
@@ -387,7 +388,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
             console.print(one_answer(client, episode), markup=False)
 
 
-def _next_steps(run_dir: pathlib.Path) -> None:
+def print_next_steps(run_dir: pathlib.Path) -> None:
     """Prints the location of the results and commands to inspect them."""
     congrasp = _command()
     folder = str(run_dir)

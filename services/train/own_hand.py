@@ -95,7 +95,7 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     if policy is None:
         policy = _train(request, note)
     _install(request, policy, note)
-    _report(request, policy, note)
+    write_report(request, policy, note)
     return policy
 
 
@@ -184,8 +184,14 @@ def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]
     note(f"The policy of --hand {hand.name} is {installed_file}.")
 
 
-def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
-    """Runs evaluation and report, unless they exist for this policy."""
+def write_report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
+    """Evaluates a policy and writes its report, unless they exist for this policy.
+
+    Args:
+      request: folder, episodes and pool of the evaluation.
+      policy: file of the policy.
+      note: called with one line on the progress.
+    """
     rows = request.out / _ROWS
     page = request.out / REPORT
     measurement = {

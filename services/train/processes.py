@@ -24,7 +24,7 @@ MAX_RESTARTS = 5
 _BAD_INPUT_CODE = 2
 _START_TIMEOUT_S = 120.0
 _POLL_S = 0.25
-_MAX_PAUSE_S = 15.0
+MAX_PAUSE_S = 15.0
 """Longest time before a restart."""
 Report = Callable[[dict[str, Any]], None]
 """Called several times a second with the learner's newest metrics, if any, and the number of live
@@ -93,7 +93,7 @@ def train(
             view = shlex.join(command("congrasp", "view", run_dir, certs=certs))
             notify(f"Watch it in the browser with: {view}")
             with transport:
-                _supervise(learners, actors, transport, config.name, stop, report, notify)
+                supervise(learners, actors, transport, config.name, stop, report, notify)
     finally:
         end_all([*learners, *actors])
 
@@ -107,7 +107,7 @@ def _learners(
         arguments = command("learner", launch=launch_file, rank=rank)
         environment: dict[str, str] = {}
         if gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = _gpu(rank)
+            environment["CUDA_VISIBLE_DEVICES"] = gpu_of_rank(rank)
         learners.append(Child(name, arguments, logs / f"{name}.log", environment))
     return learners
 
@@ -121,8 +121,8 @@ def _actors(logs: pathlib.Path, record: LaunchRecord, launch_file: pathlib.Path)
     return actors
 
 
-def _gpu(rank: int) -> str:
-    """Identifier of a rank's GPU for CUDA, among those available to this process."""
+def gpu_of_rank(rank: int) -> str:
+    """Returns the identifier of a rank's GPU for CUDA, among those available to this process."""
     names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
     visible = [name for name in names if name]
     if not visible:
@@ -146,7 +146,7 @@ def _connect(
     raise ProcessDied(f"The learner did not start: {learner.cause()}", learner.log)
 
 
-def _supervise(
+def supervise(
     learners: Sequence[Child],
     actors: Sequence[Child],
     transport: Transport,
@@ -157,6 +157,18 @@ def _supervise(
 ) -> None:
     """Restarts processes that die and reports progress, until rank 0 has finished or the run is
     stopped.
+
+    Args:
+      learners: started processes of the learner, by rank.
+      actors: started processes of the actors.
+      transport: transport that receives the learner's metrics and events.
+      run: name of the run.
+      stop: ends the supervision.
+      report: called with the newest metrics and the number of live actors.
+      notify: called with one line for each restart and each error of the learner.
+
+    Raises:
+      ProcessDied: a process died too often without progress.
     """
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
     events = transport.subscribe(Keys(run).log("event", "learner", "0"), depth=16)
@@ -233,7 +245,7 @@ def _restart_learners(
 
 def _pause(child: Child) -> float:
     """Seconds before the next restart of a process: 0, 1, 3, 7, then 14."""
-    return min(2.0**child.deaths, _MAX_PAUSE_S) - 1.0
+    return min(2.0**child.deaths, MAX_PAUSE_S) - 1.0
 
 
 def _restart(child: Child) -> None:

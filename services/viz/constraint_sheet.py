@@ -25,7 +25,7 @@ _ARROW_GAP_M = 0.002
 _BEAD_RADIUS_M = 0.003
 _VIEW = (0.8, 0.6, 0.45)
 """Direction from the object to the camera."""
-_SIZE = (460, 360)
+SIZE = (460, 360)
 """Width and height of a picture, pixels."""
 
 
@@ -132,7 +132,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     }
     table = table_shape(placed.position)
     images = [
-        render_fitted([*shapes, placed.body], _VIEW, _SIZE, [table]) for shapes in panels.values()
+        render_fitted([*shapes, placed.body], _VIEW, SIZE, [table]) for shapes in panels.values()
     ]
     what = (
         f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"

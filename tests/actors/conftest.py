@@ -10,14 +10,14 @@ from tests.task import HAND, TASK
 @pytest.fixture
 def native():
     """Makes native engines of objects for the suite's hand, and closes them."""
-    made = []
+    engines = []
 
     def make(objects, task=TASK, threads=1):
-        made.append(NativePhysics(HAND, task, objects, threads))
-        return made[-1]
+        engines.append(NativePhysics(HAND, task, objects, threads))
+        return engines[-1]
 
     yield make
-    for engine in made:
+    for engine in engines:
         engine.close()
 
 

@@ -19,10 +19,8 @@ def main() -> None:
     state = physics.start(jax.tree.map(jnp.asarray, start_of()))
     state, after = physics.step(state, jnp.zeros((1, 6 + len(HAND.joints))), jnp.ones(1, bool))
     leaves = [leaf for leaf in jax.tree.leaves((state, after)) if isinstance(leaf, jax.Array)]
-    print(
-        sorted({device.process_index for leaf in leaves for device in leaf.devices()}),
-        len(leaves) > 20,
-    )
+    devices = set().union(*(leaf.devices() for leaf in leaves))
+    print(sorted({device.process_index for device in devices}), len(leaves) > 20)
     ranks.exchange({})
     ranks.close()
 

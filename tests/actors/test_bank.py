@@ -67,7 +67,8 @@ def test_normals_belong_to_the_points_of_their_object(bank):
 
 def test_references_with_fingers_in_the_table_are_not_valid():
     """From above, the lowest finger a centimetre over the table and a centimetre in it."""
-    q, down = jnp.zeros((1, F)), pointing(-1.0)
+    q = jnp.zeros((1, F))
+    down = pointing(-1.0)
     ends = ends_of(q)
     height = rotations.rotate(jnp.broadcast_to(down, (len(ends), 4)), ends)[:, 2]
     reach = float(jnp.max(np.repeat(HAND.capsule_radii, 2) - height))
@@ -80,7 +81,7 @@ def test_references_with_fingers_in_the_table_are_not_valid():
 
 
 @pytest.mark.parametrize("constraints", [TASK.constraints, ("heading",)])
-def test_the_form_of_a_bank_is_known_before_it(constraints):
+def test_bank_form_matches_the_built_bank(constraints):
     """Of a task with references and of one without."""
     task = dataclasses.replace(TASK, constraints=constraints)
     bank = suite.bank() if task == TASK else build_bank(HAND, task, suite.OBJECTS, 0)
@@ -97,20 +98,22 @@ def test_an_object_that_cannot_be_approached_is_named():
         build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_task_that_draws_no_references_gets_none_and_the_same_headings():
-    own = build_bank(
+def test_a_bank_without_references_keeps_the_headings():
+    without_references = build_bank(
         HAND, dataclasses.replace(TASK, constraints=("heading", "affordance")), suite.OBJECTS, 0
     )
-    assert not np.any(own.pose_valid)
+    assert not np.any(without_references.pose_valid)
     for name in SHARED:
-        got, whole = np.asarray(getattr(own, name)), np.asarray(getattr(suite.bank(), name))
-        assert (got.shape, got.dtype) == (whole.shape, whole.dtype), name
+        got = np.asarray(getattr(without_references, name))
+        with_references = np.asarray(getattr(suite.bank(), name))
+        assert got.shape == with_references.shape, name
+        assert got.dtype == with_references.dtype, name
         if not name.startswith(("pose", "trajectory")):
-            np.testing.assert_array_equal(got, whole, err_msg=name)
+            np.testing.assert_array_equal(got, with_references, err_msg=name)
 
 
 @pytest.fixture(scope="module")
-def lying(bank):
+def flat_bank(bank):
     """The bank with objects in no pose that forbids a grasp from straight above."""
     flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
     return flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
@@ -120,7 +123,8 @@ def _grasps(angle: float, count: int = 4) -> Grasps:
     """Grasps of the graspable region of the second object from straight above, of which `count`
     were found.
     """
-    second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
+    second = jnp.ones(4, int)
+    above = jnp.array([[0.0, 0.0, 0.2]] * 4)
     return Grasps(
         jnp.arange(4) < count,
         second,
@@ -131,39 +135,42 @@ def _grasps(angle: float, count: int = 4) -> Grasps:
     )
 
 
-def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
-    grasp, key = _grasps(0.123, 1), jax.random.key(1)
-    used = lying._replace(pose_valid=lying.pose_valid.at[1, 1, :, 7].set(False))
+def test_a_grasp_replaces_one_reference_of_its_object_and_region(flat_bank):
+    grasp = _grasps(0.123, 1)
+    key = jax.random.key(1)
+    used = flat_bank._replace(pose_valid=flat_bank.pose_valid.at[1, 1, :, 7].set(False))
     new = renew(HAND, TASK, used, grasp, key)
     # Where there was none to use
     assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]
-    new = renew(HAND, TASK, lying, grasp, key)
-    changed = np.asarray((new.pose_q != lying.pose_q).any(-1))
-    assert changed[1, 1].sum() == 1 and changed.sum() == 1
+    new = renew(HAND, TASK, flat_bank, grasp, key)
+    changed = np.asarray((new.pose_q != flat_bank.pose_q).any(-1))
+    assert changed[1, 1].sum() == 1
+    assert changed.sum() == 1
     (slot,) = np.flatnonzero(changed[1, 1])
     np.testing.assert_allclose(new.pose_q[1, 1, slot], 0.123)
     np.testing.assert_allclose(new.trajectory_position[1, 1, slot, -1], [0, 0, 0.2], atol=2e-3)
     others = np.delete(np.arange(POSES), slot)
     np.testing.assert_array_equal(
-        new.trajectory_position[1, 1, others], lying.trajectory_position[1, 1, others]
+        new.trajectory_position[1, 1, others], flat_bank.trajectory_position[1, 1, others]
     )
-    np.testing.assert_array_equal(new.pose_valid[0], lying.pose_valid[0])
-    nothing = renew(HAND, TASK, lying, _grasps(0.123, 0), key)
-    jax.tree.map(np.testing.assert_array_equal, nothing, lying)
+    np.testing.assert_array_equal(new.pose_valid[0], flat_bank.pose_valid[0])
+    nothing = renew(HAND, TASK, flat_bank, _grasps(0.123, 0), key)
+    jax.tree.map(np.testing.assert_array_equal, nothing, flat_bank)
 
 
-def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(lying):
+def test_policy_grasps_of_all_ages_replace_half_of_the_references(flat_bank):
     """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the
     places.
     """
-    now = lying
+    now = flat_bank
     for age in range(64):
         now = renew(HAND, TASK, now, _grasps(age / 100), jax.random.key(age))
-    changed = np.asarray((now.pose_q != lying.pose_q).any(-1))[1, 1]
+    changed = np.asarray((now.pose_q != flat_bank.pose_q).any(-1))[1, 1]
     np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
     assert np.asarray(now.grasps).tolist() == [[0, 0], [0, 256]]
     ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
-    assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
+    assert np.ptp(ages) > 24
+    assert 1 <= (ages < 32).sum() <= 9
 
 
 def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):
@@ -174,12 +181,14 @@ def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):
         pose_q=bank.pose_q.at[1, 1, 0].set(0.5), grasps=bank.grasps.at[1, 1].add(3)
     )
     save_references(path, grown)
-    kept = read(bank)
-    np.testing.assert_array_equal(kept.grasps, grown.grasps)
+    restored = read(bank)
+    np.testing.assert_array_equal(restored.grasps, grown.grasps)
     for name in ("pose_q", "pose_position", "pose_quaternion"):
-        np.testing.assert_allclose(getattr(kept, name), getattr(grown, name), atol=2e-3)
-    np.testing.assert_allclose(kept.trajectory_position[:, :, :, -1], kept.pose_position, atol=1e-4)
-    np.testing.assert_allclose(jnp.linalg.norm(kept.pose_quaternion, axis=-1), 1.0, atol=1e-6)
+        np.testing.assert_allclose(getattr(restored, name), getattr(grown, name), atol=2e-3)
+    np.testing.assert_allclose(
+        restored.trajectory_position[:, :, :, -1], restored.pose_position, atol=1e-4
+    )
+    np.testing.assert_allclose(jnp.linalg.norm(restored.pose_quaternion, axis=-1), 1.0, atol=1e-6)
     others = bank._replace(points=bank.points.at[0, 0, 0].add(1e-3))
     assert read(others) is others
     path.write_bytes(path.read_bytes()[:-1])

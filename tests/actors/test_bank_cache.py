@@ -44,7 +44,8 @@ def test_bank_is_built_once():
     again = cached_bank(HAND, TASK, OBJECTS, 0, build)
     assert build.built == 1
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
-        assert isinstance(b, jax.Array) and a.dtype == b.dtype
+        assert isinstance(b, jax.Array)
+        assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
 
 

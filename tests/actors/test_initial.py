@@ -31,7 +31,8 @@ from tests.task import HAND
 
 TASK = dataclasses.replace(suite.TASK, surface_points=16)
 """Surfaces of two points each, in which most of the time would go."""
-BATCH, M = 2000, 6
+BATCH = 2000
+M = 6
 
 
 def _bank(valid: np.ndarray) -> ConstraintBank:
@@ -85,11 +86,13 @@ def _sample(task: TaskConfig, bank: ConstraintBank, together: float) -> InitialC
 
 
 @jax.jit
-def _begun(surface: Surface, asked: Goal, constraints: dict[str, np.ndarray]) -> tuple[Any, ...]:
+def _begun(
+    surface: Surface, requested: Goal, constraints: dict[str, np.ndarray]
+) -> tuple[Any, ...]:
     """The goal after the priority rules, the fingers at the start, and the wrist that aligns them
     with the heading.
     """
-    goal = resolve(HAND, surface, asked, constraints).goal
+    goal = resolve(HAND, surface, requested, constraints).goal
     rest = jnp.tile(jnp.array([0, 0, 0.1, 1.0, 0, 0, 0]), (4, 1))
     q = initial_hand(HAND, TASK, goal, surface, rest)[0]
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, q)))
@@ -128,9 +131,10 @@ def _drawn(
     )
 
 
-def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside_an_affordance():
+def test_trajectories_ending_near_the_avoid_region_exclude_affordances():
     active, _, trajectory = _drawn(TASK)
-    both, alone = active["trajectory"] & active["region"], active["trajectory"] & ~active["region"]
+    both = active["trajectory"] & active["region"]
+    alone = active["trajectory"] & ~active["region"]
     assert set(trajectory[both]) == {3, 4, 5}
     assert set(trajectory[alone]) == set(range(M))
     assert 0.2 < both.mean() < 0.3
@@ -142,15 +146,18 @@ def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
     """
     task = dataclasses.replace(TASK, disturbed_references=1.0)
     drawn = jax.device_get(_sample(task, _bank(np.ones(M, bool)), 0.0))
-    region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
+    region = np.asarray(drawn.region) == 1
+    on = np.asarray(drawn.goal.active["trajectory"])
     end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
     both = region & on
     assert (end[both, 0] > 0).all()
     # Those that would have contradicted it are as they were; the rest, and those without
     # affordance, are disturbed.
     exact = np.isclose(end[:, 0], 0.005, atol=1e-6) & np.isclose(end[:, 1], 0.0, atol=1e-9)
-    assert 0.02 < exact[both].mean() < 0.2 and not exact[on & ~region].any()
-    assert end[both, 1].std() > 0.003 and (end[on & ~region, 0] < 0).any()
+    assert 0.02 < exact[both].mean() < 0.2
+    assert not exact[on & ~region].any()
+    assert end[both, 1].std() > 0.003
+    assert (end[on & ~region, 0] < 0).any()
 
 
 @pytest.mark.parametrize("share", [0.6, 1.0])
@@ -171,9 +178,10 @@ def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
 
 
 @pytest.mark.parametrize("together", [0.0, 1.0])
-def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn(together):
+def test_no_trajectory_is_drawn_if_all_contradict_the_affordance(together):
     active, pose, trajectory = _drawn(TASK, (0, 1, 2), together=together)
-    assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
+    assert not (active["trajectory"] & active["region"]).any()
+    assert active["affordance"].any()
     assert set(pose[active["pose_finger"] & active["region"]]) == {0, 1, 2}
     assert set(trajectory[active["trajectory"]]) == {0, 1, 2}
 
@@ -189,7 +197,7 @@ def test_pose_and_trajectory_are_drawn_independently():
 
 
 @pytest.mark.parametrize("few", [False, True])
-def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
+def test_aligned_pairs_are_drawn_on_request(few):
     active, pose, trajectory = _drawn(
         dataclasses.replace(TASK, aligned_references=True),
         (0, 1, 2, 3, 5) if few else tuple(range(M)),
@@ -204,7 +212,7 @@ def test_aligned_pairs_are_drawn_where_they_are_asked_for(few):
 
 @pytest.mark.parametrize("on", [{"pose"}, {"pose", "trajectory"}, {"trajectory"}, set()])
 @pytest.mark.parametrize("dynamic", [True, False])
-def test_heading_guidance_and_reward_know_one_center(dynamic, on):
+def test_heading_guidance_and_reward_share_the_hand_centre(dynamic, on):
     """Where the hand is at its target, the heading that the rules made is met to 0 m.
 
     With the fingers of its start, but under a trajectory alone with those of the partly closed

@@ -22,7 +22,8 @@ class Learner:
     """Answers as told, and remembers what it was asked."""
 
     def __init__(self, hub, *, run_id="e", session_id="1"):
-        self.hub, self.transport = hub, MemoryTransport(hub)
+        self.hub = hub
+        self.transport = MemoryTransport(hub)
         self.state = {"version": 0, "run_id": run_id, "session_id": session_id, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
@@ -78,16 +79,16 @@ class Learner:
 def ends():
     """(in-memory hub, function that makes a link)."""
     hub = MemoryHub()
-    made = []
+    links = []
 
     def make(**options):
         transport = MemoryTransport(hub)
         link = ActorLink(transport, "test", "a", **{"request_timeout": 20.0, **options})
-        made.append((transport, link))
+        links.append((transport, link))
         return link
 
     yield hub, make
-    for transport, link in made:
+    for transport, link in links:
         link.close()
         transport.close()
 
@@ -98,7 +99,8 @@ def joined(ends):
     hub, make = ends
 
     def join(**options):
-        learner, link = Learner(hub), make(**options)
+        learner = Learner(hub)
+        link = make(**options)
         link.config(60)
         return learner, link
 
@@ -120,7 +122,8 @@ def test_config_waits_for_a_learner(ends):
 
 def test_identity_is_added_and_counts(ends):
     hub, make = ends
-    learner, link = Learner(hub), make()
+    learner = Learner(hub)
+    link = make()
     with pytest.raises(CongraspError, match="no configuration"):
         link.upload(rollout(), TICKET)
     link.config(60)
@@ -139,15 +142,17 @@ def test_identity_is_added_and_counts(ends):
         assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
 
 
-def test_tickets_are_waited_for_and_asked_for_under_one_id(joined):
+def test_a_repeated_ticket_request_keeps_its_id(joined):
     learner, link = joined()
     learner.granted = False
     assert link.acquire_ticket(0.2) is None
     assert len(learner.tickets) >= 2
     learner.granted = True
     learner.state["version"] = 7
-    first, second = link.acquire_ticket(60), link.acquire_ticket(5)
-    assert first.version == 7 and first.id != second.id
+    first = link.acquire_ticket(60)
+    second = link.acquire_ticket(5)
+    assert first.version == 7
+    assert first.id != second.id
     assert {meta["ticket"] for meta in learner.tickets} == {first.id, second.id}
     link.give_back(second)
     assert learner.tickets[-1] == {
@@ -179,7 +184,8 @@ def test_weights_are_pulled_only_when_there_are_others(joined):
     assert learner.pulls == 1
     learner.announce(version=1)
     assert eventually(lambda: link.weights(0)).meta["version"] == 1
-    assert link.weights(1) is None and learner.pulls == 2
+    assert link.weights(1) is None
+    assert learner.pulls == 2
     learner.state["version"] = 2  # its announcement is lost; a ticket tells as well
     assert link.weights(1) is None
     link.acquire_ticket(60)
@@ -195,7 +201,8 @@ def test_rollout_is_sent_under_one_identity_until_it_is_answered(joined):
     learner, link = joined()
     learner.outcomes = ["retry", RuntimeError("bug"), "retry", "duplicate"]
     assert link.upload(rollout(), TICKET).result(60) == "duplicate"
-    assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
+    assert len({id(message) for message in learner.received}) == 1
+    assert len(learner.received) == 4
 
 
 @pytest.mark.parametrize("by", ["ticket", "weights", "announcement"])
@@ -208,7 +215,7 @@ def test_another_training_is_noticed_by_every_way(joined, by):
         link.acquire_ticket(1) if by == "ticket" else link.weights(-1)
 
 
-def test_finished_run_is_told_to_the_caller(joined):
+def test_finished_run_raises_run_finished(joined):
     learner, link = joined()
     learner.state["finished"] = True
     with pytest.raises(RunFinished):
@@ -225,7 +232,8 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(joined):
     )
     third.start()
     third.join(0.3)
-    assert third.is_alive() and len(learner.received) == 2
+    assert third.is_alive()
+    assert len(learner.received) == 2
     assert link.flush(0.05) is False
     gate.set()
     third.join(5)
@@ -250,7 +258,7 @@ def test_refusals_in_a_row_stop_the_actor_with_a_reason(joined):
     assert len(learner.received) == 6
 
 
-def test_message_that_always_arrives_damaged_is_not_sent_for_ever(joined):
+def test_a_message_always_damaged_is_given_up(joined):
     learner, link = joined(max_refusals=2)
     learner.outcomes = [CongraspError("The message's data do not match their checksum.")]
     assert link.upload(rollout(), TICKET).result(60) == "refused"
@@ -260,7 +268,7 @@ def test_message_that_always_arrives_damaged_is_not_sent_for_ever(joined):
         link.upload(rollout(), TICKET)
 
 
-def test_silent_learner_is_given_up(joined):
+def test_silent_learner_raises_after_the_patience(joined):
     learner, link = joined(patience=0.3)
     learner.transport.close()
     with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
@@ -270,19 +278,20 @@ def test_silent_learner_is_given_up(joined):
 
 
 def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch, caplog):
-    monkeypatch.setattr(patience_module, "_NOTICED_S", 0.2)
+    monkeypatch.setattr(patience_module, "NOTICED_S", 0.2)
     learner, link = joined(patience=20.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)
     for _ in range(3):
         assert link.acquire_ticket(0.3) is None
     Learner(learner.hub, session_id="2")
-    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
+    assert outcome.result(60) == "accepted"
+    assert link.acquire_ticket(60)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
 
 
-def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joined, monkeypatch):
+def test_a_suspended_actor_does_not_count_as_silence(joined, monkeypatch):
     learner, link = joined(patience=5.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)
@@ -293,7 +302,8 @@ def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joine
     assert link.acquire_ticket(0.2) is None
     assert not outcome.done()
     Learner(learner.hub, session_id="2")
-    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
+    assert outcome.result(60) == "accepted"
+    assert link.acquire_ticket(60)
 
 
 def test_learner_that_talks_nonsense_ends_the_link(joined):
@@ -305,7 +315,7 @@ def test_learner_that_talks_nonsense_ends_the_link(joined):
         link.acquire_ticket(1)
 
 
-def test_closing_gives_up_what_is_on_its_way(joined):
+def test_closing_drops_pending_uploads(joined):
     learner, link = joined()
     learner.outcomes = ["retry"]
     outcome = link.upload(rollout(), TICKET)

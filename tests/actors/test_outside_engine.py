@@ -38,12 +38,14 @@ def registered(monkeypatch):
 def test_rollouts_are_made_on_it():
     physics = make_physics("counting", HAND, TASK, OBJECTS, threads=1)
     rollout = suite.worker(physics=physics).collect(suite.command(noise=0.3), 3)
-    assert CountingPhysics.steps == 3 * BATCH and np.all(np.isfinite(rollout.reward))
+    assert CountingPhysics.steps == 3 * BATCH
+    assert np.all(np.isfinite(rollout.reward))
     physics.close()
 
 
 def test_it_is_prepared_once_and_in_the_background(monkeypatch):
-    begun, done = queue.SimpleQueue(), threading.Event()
+    begun = queue.SimpleQueue()
+    done = threading.Event()
 
     def prepare(hand, task):
         begun.put((hand, task))
@@ -60,10 +62,10 @@ def test_it_is_prepared_once_and_in_the_background(monkeypatch):
 
 @pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    own = Experiment(
+    experiment = Experiment(
         suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps
     )
-    (result,) = own.run([Variation()])
+    (result,) = experiment.run([Variation()])
     assert result.row.episodes == 2 * BATCH
     assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)
 
@@ -71,7 +73,8 @@ def test_an_evaluation_takes_its_batch_from_its_row():
 def test_a_run_and_errors_name_it():
     config = RunConfig(physics="counting")
     assert run_config_from_json(to_json(config)) == config
-    assert resolve_physics("counting") == "counting" and resolve_physics("auto", "cpu") == "native"
+    assert resolve_physics("counting") == "counting"
+    assert resolve_physics("auto", "cpu") == "native"
     with pytest.raises(
         CongraspError, match=r"no physics engine 'abacus'\. Choose from: auto, warp, .*, counting\."
     ):

@@ -3,6 +3,7 @@ inputs.
 """
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +59,8 @@ def running():
 
 def test_the_true_pose_changes_neither_observation_nor_targets(running):
     worker, _ = running
-    env, state = worker.env, worker.state
+    env = worker.env
+    state = worker.state
     physics_state = worker.physics.read(None)
     moved = physics_state._replace(
         object_position=physics_state.object_position + 0.3,
@@ -79,7 +81,8 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
             scene, TASK.control, jnp.ones((BATCH, len(HAND.motors) + 6))
         )
 
-    (before, targets), (after, others) = shown(state, physics_state), shown(away, moved)
+    before, targets = shown(state, physics_state)
+    after, others = shown(away, moved)
     np.testing.assert_array_equal(before, after)
     for one, other in zip(targets, others, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -91,11 +94,10 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
 
 def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     worker, rollout = running
-    state, trace = worker.state, rollout.trace
-    points, turn = (
-        np.asarray(state.sensing.sensor.cloud.points),
-        np.asarray(trace.object_quaternion),
-    )
+    state = worker.state
+    trace = rollout.trace
+    points = np.asarray(state.sensing.sensor.cloud.points)
+    turn = np.asarray(trace.object_quaternion)
     surface = np.asarray(state.surface.points)
     ages = []
     for age in range(5):  # an image is at most 5 control steps old
@@ -105,9 +107,9 @@ def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     np.testing.assert_allclose(np.min(ages, 0), 0.0, atol=1e-5)
     scene = worker.env.seen(state)
     np.testing.assert_array_equal(scene.state.object_position, 0.0)
-    own = evaluated(observation.observe, scene)
+    observation_vector = evaluated(observation.observe, scene)
     start = sum(size for name, size in observation.layout(HAND, TASK)[:1])
-    block = np.asarray(own[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
+    block = np.asarray(observation_vector[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
     features = scene.features
     expected = rotations.inverse_transform(
         features.wrist_position, features.wrist_quaternion, points
@@ -121,9 +123,11 @@ def test_teacher_and_critic_see_the_true_state(running):
     full = dataclasses.replace(TASK, observation="full")
     size = sum(size for _, size in observation.layout(HAND, full))
     names = [name for name, _ in observation.layout(HAND, full)]
-    assert "cloud" not in names and rollout.teacher_observation.shape[-1] > size
+    assert "cloud" not in names
+    assert rollout.teacher_observation.shape[-1] > size
     assert rollout.privileged.shape[-1] == sum(size for _, size in privileged.layout(HAND, TASK))
-    described = {field.name for block in observation.fields(HAND, TASK).values() for field in block}
+    fields = itertools.chain.from_iterable(observation.fields(HAND, TASK).values())
+    described = {field.name for field in fields}
     assert (
         not {"object_displacement", "object_rotation", "past object_position", "force"} & described
     )

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.actors.physics import slots
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.object_rows import ObjectRows
-from congrasp.actors.physics.scene import compile_scene
+from congrasp.actors.physics.scene import compile_scene, scene_spec
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
@@ -34,6 +35,7 @@ from tests.actors.test_physics import (
     servoed,
     side_by_side,
 )
+from tests.compiled import program_count
 from tests.conftest import ROOT
 from tests.solids import mujoco_mass_properties
 from tests.task import warp_engine
@@ -127,16 +129,19 @@ def test_scanned_objects_agree_with_native(native, shared_objects):
     _agrees_with_native(native(objects), objects, _starts(objects))
 
 
-def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(start):
+def test_repeated_steps_without_jax_equal_control_steps(start):
     """One control step by JAX and three repeats are four control steps with the same targets; and
     nobody notices.
     """
-    physics, batch = warp_engine(OBJECTS), len(OBJECTS)
-    target, table, step = jnp.asarray(grasp(start, 5)), jnp.ones(batch, bool), jax.jit(physics.step)
+    physics = warp_engine(OBJECTS)
+    batch = len(OBJECTS)
+    target = jnp.asarray(grasp(start, 5))
+    table = jnp.ones(batch, bool)
+    step = jax.jit(physics.step)
     first, _ = step(physics.start(start), target, table)
     before = jax.tree.map(np.array, first)
     physics.repeat(batch, 3)
-    repeated = physics._buffers[batch][1]._data.qpos.numpy()
+    repeated = physics.buffers(batch).positions()
     _same(before, first)
     after = first
     for _ in range(3):
@@ -146,11 +151,13 @@ def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(s
     physics.close()
 
 
-def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeypatch):
+def test_a_control_step_loads_no_further_kernel(start, monkeypatch):
     """Of those that MuJoCo Warp launches; JAX's call is a module without kernels."""
     import warp as wp  # takes seconds in every worker
 
-    physics, loaded, load = warp_engine(OBJECTS), set(), wp._src.context.Module.load
+    physics = warp_engine(OBJECTS)
+    loaded = set()
+    load = wp._src.context.Module.load
 
     def noted(module, device, block_dim=None, **options):
         loaded.add((module.name, block_dim))
@@ -158,7 +165,7 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
 
     monkeypatch.setattr(wp._src.context.Module, "load", noted)
     state = physics.start(start)
-    physics._buffers[len(OBJECTS)][1]._kernels.result()
+    physics.buffers(len(OBJECTS)).wait_for_kernels()
     ahead = set(loaded)
     physics.step(state, jnp.asarray(grasp(start, 5)), jnp.ones(len(OBJECTS), bool))
     assert len(ahead) > 40
@@ -166,27 +173,28 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
     physics.close()
 
 
-def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends_on_the_environments(
+def test_only_broadphase_kernels_depend_on_the_batch(
     monkeypatch,
 ):
     import warp as wp  # takes seconds in every worker
 
-    from congrasp.actors.physics.warp_buffers import WarpBuffers
+    from congrasp.actors.physics import warp_buffers
 
-    monkeypatch.setattr(WarpBuffers, "_load_kernels", lambda buffers: None)
+    monkeypatch.setattr(warp_buffers, "build_kernels", lambda device, variants: None)
     monkeypatch.setattr(
         wp, "get_suggested_block_size", lambda *query: pytest.fail("this would build a kernel")
     )
     monkeypatch.setattr(
         wp._src.context.Module, "load", lambda *module: pytest.fail("this builds a module")
     )
-    engines = warp_engine(OBJECTS), warp_engine(OBJECTS[:1], mesh_slots=9)
-    few, many = (
-        [module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1)
-    )
-    assert len(many) > 40 and many[0].startswith("_nxn_broadphase"), (
-        "the first are those that are queried"
-    )
+
+    def modules(engine, batch):
+        return [module.name for module, _ in engine.allocate(batch).variants()]
+
+    few = modules(warp_engine(OBJECTS), 1)
+    many = modules(warp_engine(OBJECTS[:1], mesh_slots=9), 2)
+    assert len(many) > 40, "the first are those that are queried"
+    assert many[0].startswith("_nxn_broadphase"), "the first are those that are queried"
     assert all(name.startswith("_nxn_broadphase") for name in {*few} ^ {*many})
 
 
@@ -224,7 +232,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
         [sys.executable, "-c", program, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
-        monkeypatch.setattr(warp_build, "_PATIENCE_S", 0.1)
+        monkeypatch.setattr(warp_build, "PATIENCE_S", 0.1)
         build()  # after a wait it builds, too
         other.kill()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
@@ -232,7 +240,7 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
         pass  # without a folder nothing is shared
 
 
-def test_rows_are_what_mujoco_compiles():
+def test_object_rows_equal_mujocos_compiled_fields():
     catalogue = ObjectRows(HAND, TASK, OBJECTS[0], 8)
     before = {
         name: getattr(catalogue.model, name).copy()
@@ -259,16 +267,17 @@ def test_rows_are_what_mujoco_compiles():
         filled = rows["geom_dataid"][n] >= 0 if meshed else rows["geom_rbound"][n] > 0.002
         assert filled.sum() == len(used)
         for name in ("geom_size", "geom_rbound", "geom_aabb"):
-            mine = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
+            row = np.sort(rows[name][n][filled].reshape(len(used), -1), 0)
             np.testing.assert_allclose(
-                mine, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6
+                row, np.sort(getattr(scene, name)[used].reshape(len(used), -1), 0), atol=1e-6
             )
     assert set(rows["geom_dataid"][rows["geom_dataid"] >= 0]) == set(range(meshes.nmesh))
 
 
-def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, start):
+def test_a_reset_changes_only_masked_environments(native, start):
     warp = warp_engine(OBJECTS)
-    step, table = jax.jit(warp.step), jnp.ones(4, bool)
+    step = jax.jit(warp.step)
+    table = jnp.ones(4, bool)
     state = warp.start(start)
     for i in range(5):
         state, _ = step(state, jnp.asarray(grasp(start, i)), table)
@@ -288,20 +297,23 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(native, st
     *_, (x, y, _) = side_by_side(native(OBJECTS), step, mixed, started, targets)
     assert x.contact_found[np.asarray(mask)].any((1, 2)).all()
     for name in ("contact_force", "object_position", "q"):
-        given, expected = getattr(y, name)[mask], getattr(x, name)[mask]
+        of_warp = getattr(y, name)[mask]
+        expected = getattr(x, name)[mask]
         np.testing.assert_allclose(
-            given, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
+            of_warp, expected, atol=0.5 if name == "contact_force" else 1e-4, err_msg=name
         )
-    assert step._cache_size() == 1
+    assert program_count(step) == 1
 
 
 @pytest.mark.slow
-def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
-    native, start, others
-):
-    warp, untouched = warp_engine(OBJECTS), warp_engine(OBJECTS)
-    step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
-    state, expected = warp.start(start), untouched.start(start)
+def test_replaced_objects_compile_nothing_and_keep_running_episodes(native, start, others):
+    warp = warp_engine(OBJECTS)
+    untouched = warp_engine(OBJECTS)
+    step = jax.jit(warp.step)
+    step_untouched = jax.jit(untouched.step)
+    table = jnp.ones(4, bool)
+    state = warp.start(start)
+    expected = untouched.start(start)
     for i in range(30):
         target = jnp.asarray(grasp(start, i))
         if i in (10, 20):
@@ -319,7 +331,7 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     assert x.contact_found.any((1, 2)).all()
     np.testing.assert_allclose(x.contact_force, y.contact_force, atol=0.5)
     np.testing.assert_allclose(x.object_position, y.object_position, atol=1e-4)
-    assert step._cache_size() == 1
+    assert program_count(step) == 1
 
 
 @pytest.mark.slow
@@ -327,7 +339,8 @@ def test_a_compiled_loop_is_the_same_as_single_steps(start):
     """Resets in a branch, two loops after one another, and states that are used twice."""
     warp = warp_engine(OBJECTS)
     targets = jnp.stack([jnp.asarray(grasp(start, i)) for i in range(8, 20)])
-    table, swapped = jnp.ones(4, bool), _picked(start, [2, 3, 0, 1])
+    table = jnp.ones(4, bool)
+    swapped = _picked(start, [2, 3, 0, 1])
 
     def advance(state, row):
         i, target = row
@@ -352,7 +365,8 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
     warp = warp_engine([sheet])
-    step, occupancy = jax.jit(warp.step), []
+    step = jax.jit(warp.step)
+    occupancy = []
     for batch in (1, 2):
         flat = _picked(start, [0] * batch)._replace(
             object_position=jnp.tile(jnp.array([0.0, 0.0, 0.0003]), (batch, 1)),
@@ -363,10 +377,11 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
     np.testing.assert_array_equal(*occupancy)
 
 
-def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(start):
+def test_a_diverged_environment_alone_is_flagged_and_reset(start):
     warp = warp_engine(OBJECTS)
     first = warp.start(start)
-    target, table = jnp.asarray(grasp(start, 0)), jnp.ones(4, bool)
+    target = jnp.asarray(grasp(start, 0))
+    table = jnp.ones(4, bool)
     state, _ = warp.step(first, target, table)
     _, expected = warp.step(state, target, table)
     state, after = warp.step(state._replace(qvel=state.qvel.at[1].set(jnp.nan)), target, table)
@@ -378,38 +393,48 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(st
     assert not after.diverged.any()
 
 
-def test_buffers_are_as_full_as_what_mujoco_finds(native, start):
+def test_occupancy_equals_mujocos_contact_counts(native, start):
     from congrasp.actors.physics.warp_buffers import (
         CONSTRAINTS_PER_ENVIRONMENT,
         CONTACTS_PER_ENVIRONMENT,
     )
 
-    warp, engine = warp_engine(OBJECTS), native(OBJECTS)
+    warp = warp_engine(OBJECTS)
+    engine = native(OBJECTS)
     targets = [grasp(start, i) for i in range(5)]
     for _, after, _ in side_by_side(engine, warp.step, start, warp.start(start), targets):
-        found = [
+        counts = [
             sum(instance.data.ncon for instance in engine.instances),
             max(instance.data.nefc for instance in engine.instances),
         ]
         room = [4 * CONTACTS_PER_ENVIRONMENT, CONSTRAINTS_PER_ENVIRONMENT]
-        np.testing.assert_allclose(after.occupancy[:2], np.divide(found, room), rtol=1e-5)
+        np.testing.assert_allclose(after.occupancy[:2], np.divide(counts, room), rtol=1e-5)
 
 
-def test_what_had_no_room_is_counted(start, monkeypatch):
+def test_overflowing_contacts_are_counted(start, monkeypatch):
     monkeypatch.setattr("congrasp.actors.physics.warp_buffers.CONTACTS_PER_ENVIRONMENT", 2)
     warp = warp_engine(OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]
 
 
-def test_steps_whose_solver_reached_its_limit_are_counted(start):
+def test_steps_whose_solver_reached_its_limit_are_counted(start, monkeypatch):
     """An iteration limit of 1 is reached in every physics step of these environments in contact
     with the table.
     """
+
+    def limit_iterations(iterations):
+        def spec(*arguments):
+            limited_spec = scene_spec(*arguments)
+            limited_spec.option.iterations = iterations
+            return limited_spec
+
+        monkeypatch.setattr(slots, "scene_spec", spec)
+
     limited = []
     for iterations in (1, 100):
+        limit_iterations(iterations)
         warp = warp_engine(OBJECTS)
-        warp._object_rows.model.opt.iterations = iterations
         _, after = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
         limited.append(float(after.occupancy[2]))
     assert limited == [1.0, 0.0]
@@ -434,7 +459,8 @@ def test_more_pieces_than_slots_are_one_clear_line(start):
 @pytest.mark.slow
 def test_an_engine_uses_its_own_ranks_device():
     """Two processes of one job: JAX counts the devices of both."""
-    port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    port = free_port()
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "tests.actors.rank_engine"]
     ranks = [
         subprocess.Popen(

@@ -36,7 +36,8 @@ from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.hub.staleness import StalenessManager
 from tests.rollouts import learner_hub
 
-T, B = 5, 3
+T = 5
+B = 3
 CONFIG = RunConfig(
     name="t",
     environments=B,
@@ -68,7 +69,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         "errors": (T, len(metrics.specs(CONFIG.task))),
     }
     flags = {"table": np.zeros(T, bool), "terminal": np.arange(T) == T - 1}
-    given = {
+    arrays = {
         **FORM.zeros(),
         "episodes": episodes,
         "occupancy": np.zeros((T, 3), np.float32),
@@ -78,7 +79,7 @@ def invented(episodes: np.ndarray) -> Rollout:
         ),
     }
     defaults = dict.fromkeys(Rollout._fields, np.zeros((T, B), np.float32))
-    return Rollout(**{**defaults, **given})
+    return Rollout(**{**defaults, **arrays})
 
 
 class InventedWorker:
@@ -128,15 +129,19 @@ def heard(monkeypatch):
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
         invented = types.SimpleNamespace(weight=np.ones(len(objects)))
-        found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
-        numbers, prepared = [], []
+        training = TrainingSet(
+            objects, lambda: pytest.fail("nothing is compiled"), lambda: invented
+        )
+        numbers = []
+        prepared = []
         monkeypatch.setattr(
             process, "prepare_physics", lambda *engine: prepared.append(len(numbers))
         )
         monkeypatch.setattr(
-            process, "training_set", lambda hand, config, number: numbers.append(number) or found
+            process, "training_set", lambda hand, config, number: numbers.append(number) or training
         )
-        broker, stop = MemoryHub(), threading.Event()
+        broker = MemoryHub()
+        stop = threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
             hub, rollouts = learner_hub(
@@ -176,28 +181,36 @@ def heard(monkeypatch):
     return run
 
 
-def started(info: RunInfo) -> None:
-    """Starts the parts of an actor for a learner that gives this information."""
-    link = types.SimpleNamespace(actor="a")
-    process._Actor(ActorOptions("t", "a", physics="native"), CONFIG, info, link, None)
+@pytest.fixture
+def run_for(monkeypatch):
+    """Runs an actor whose learner needs rollouts of these arrays and policies of this schema."""
+
+    def run(schema: str, arrays: tuple[str, ...]) -> None:
+        info = RunInfo(to_json(CONFIG), "e", schema, arrays)
+        monkeypatch.setattr(process.ActorLink, "wait_for_config", lambda link, stop: info)
+        options = ActorOptions(run="t", actor="a", physics="native")
+        with MemoryTransport(MemoryHub()) as transport:
+            process.run_actor(transport, options, threading.Event())
+
+    return run
 
 
-def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
+def test_arrays_that_actors_do_not_record_are_refused(run_for):
     with pytest.raises(
         CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"
     ):
-        started(RunInfo("{}", "e", SPEC.schema, ("reward", "torque")))
+        run_for(SPEC.schema, ("reward", "torque"))
 
 
-def test_an_actor_of_another_version_is_one_line_before_anything_is_built(monkeypatch):
+def test_another_policy_schema_is_refused_before_objects_are_built(run_for, monkeypatch):
     monkeypatch.setattr(process, "training_set", lambda *_: pytest.fail("its objects were built"))
     with pytest.raises(
         CongraspError, match=rf"schema 0; this actor's have {SPEC.schema}\. Start the actor with"
     ):
-        started(RunInfo("{}", "e", "0", ("reward",)))
+        run_for("0", ("reward",))
 
 
-def test_steps_in_which_the_physics_left_contacts_out_are_counted():
+def test_occupancy_metrics_by_hand():
     occupancy = np.array(
         [[0.5, 0.1, 0.0], [1.0, 0.2, 0.5], [1.25, 0.2, 0.25], [0.3, 1.5, 0.25]], np.float32
     )
@@ -205,7 +218,7 @@ def test_steps_in_which_the_physics_left_contacts_out_are_counted():
     assert process.buffer_occupancy(occupancy) == metrics
 
 
-def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):
+def test_nonfinite_episode_metrics_are_left_out(heard):
     episodes = np.tile(np.arange(len(FIELDS), dtype=np.float32), (B, 1))
     episodes[0, FIELDS.index("episode/heading_rad")] = np.nan
     episodes[2, FIELDS.index("term/contact")] = np.inf
@@ -216,16 +229,15 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
         np.testing.assert_array_equal(arrays[name], [i], err_msg=name)
     assert logs["metrics"].meta["values"]["episodes_left_out"] == 2
     episode = logs["episode"].meta["metrics"]
-    assert "heading_rad" not in episode and episode["heading_m"] == FIELDS.index(
-        "episode/heading_m"
-    )
+    assert "heading_rad" not in episode
+    assert episode["heading_m"] == FIELDS.index("episode/heading_m")
     for message in logs.values():
         # A number that JSON has not would be an error here, and the end of the actor
         encode(message)
     validate(logs["episode"], EPISODE)
 
 
-def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
+def test_objects_change_at_the_configured_interval(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "pools", [])
     episodes = invented(np.zeros((B, len(FIELDS)), np.float32))
     heard(episodes)
@@ -237,7 +249,7 @@ def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
     assert InventedWorker.pools[0] == ["box_0", "mug_0"]
 
 
-def test_objects_that_fall_sometimes_are_drawn_more_often_where_the_run_says_so(heard, monkeypatch):
+def test_objects_that_fall_are_drawn_more_often_with_by_failure(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "weights", [])
     episodes = np.zeros((B, len(FIELDS)), np.float32)
     episodes[:, FIELDS.index("episode/object_index")] = np.arange(B) % 2
@@ -250,7 +262,8 @@ def test_objects_that_fall_sometimes_are_drawn_more_often_where_the_run_says_so(
     )
     _, logs = heard(invented(episodes), config)
     box, mug = InventedWorker.weights[0]
-    assert 1.0 < box <= 2.0 and 0.5 <= mug < 1.0
+    assert 1.0 < box <= 2.0
+    assert 0.5 <= mug < 1.0
     values = logs["metrics"].meta["values"]
     # One of three fell, with the weight of five episodes beside those of each family.
     assert values["failure/box"] == pytest.approx((1 + 5 / 3) / 7)
@@ -277,23 +290,26 @@ def rollout(*times, ended=()):
     return Trace(**{**fields, "q": q, "terminal": np.isin(np.arange(len(times)), ended)})
 
 
-def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
+def test_episode_across_rollouts_is_followed_to_its_end():
     follower = Follower()
     # The first episode goes on from before, the next one begins with the third step.
     assert follower.add(rollout(8, 9, 0, ended=[1]), None, state("next", 3), due=True) is None
     assert follower.add(rollout(1, 2, 3), None, state("none"), due=False) is None
-    found = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
-    assert (found.goal, found.object_index) == ("next", 3)
-    assert found.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
+    traced = follower.add(rollout(4, 5, 0, ended=[1]), None, state("other"), due=False)
+    assert traced.goal == "next"
+    assert traced.object_index == 3
+    assert traced.trace.q.ravel().tolist() == [0, 1, 2, 3, 4, 5]
     # It follows nothing then, until one is due again.
     assert (
         follower.add(rollout(0, 1, 2, 3, 4, 5, ended=[5]), state("fresh"), state("none"), due=False)
         is None
     )
-    found = follower.add(
+    traced = follower.add(
         rollout(0, 1, 2, 3, 4, 5, 0, ended=[5]), state("fresh", 2), state("none"), due=True
     )
-    assert (found.goal, found.object_index, len(found.trace.q)) == ("fresh", 2, 6)
+    assert traced.goal == "fresh"
+    assert traced.object_index == 2
+    assert len(traced.trace.q) == 6
     # What a rollout says of its last episode is not said of another.
     assert (
         follower.add(rollout(0, 1, 0, 1, 2, ended=[1, 4]), state("fresh"), state("none"), due=True)
@@ -305,7 +321,7 @@ def test_an_episode_that_begins_within_a_rollout_is_followed_to_its_end():
     )
 
 
-def test_what_ends_with_a_rollout_begins_nothing_in_it_and_what_is_forgotten_is_not_joined():
+def test_follower_ignores_finished_and_forgotten_episodes():
     follower = Follower()
     assert follower.add(rollout(7, 8, ended=[1]), None, state("none"), due=True) is None
     assert follower.add(rollout(0, 1), state("fresh"), state("none"), due=True) is None

@@ -1,6 +1,7 @@
 """Episodes: sampling, protocol, success, and rollouts that continue."""
 
 import dataclasses
+import itertools
 import re
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from congrasp.actors import rollout as rollout_module
 from congrasp.actors.env import GraspEnv
 from congrasp.actors.episode import object_pieces
 from congrasp.actors.physics.engine import PhysicsState, where_environments
@@ -24,10 +26,12 @@ from congrasp.common.task.metrics import episode_fields, metric_names
 from congrasp.common.task.observation import layout
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import task as suite
+from tests.compiled import program_count
 from tests.task import BATCH, HAND, TASK
 
 STEPS = TASK.approach_steps + TASK.hold_steps
-NOISY, STILL = suite.command(noise=0.3), suite.command()
+NOISY = suite.command(noise=0.3)
+STILL = suite.command()
 
 
 @pytest.fixture(scope="module")
@@ -106,12 +110,15 @@ def test_rollouts_go_through_whole_episodes_and_on():
     worker = suite.worker()
     first = worker.collect(NOISY, STEPS)
     size = sum(size for _, size in layout(HAND, TASK))
-    assert first.observation.shape == (STEPS, BATCH, size) and first.observation.dtype == np.float16
+    assert first.observation.shape == (STEPS, BATCH, size)
+    assert first.observation.dtype == np.float16
     assert np.isfinite(np.asarray(first.observation, np.float32)).all()
     terminal = np.asarray(first.terminal)
-    assert terminal[-1].all() and not terminal[:-1].any()
+    assert terminal[-1].all()
+    assert not terminal[:-1].any()
     episodes = finished_episodes(first, TASK)
-    assert set(episodes) == set(episode_fields(TASK)) and len(episodes["episode/return"]) == BATCH
+    assert set(episodes) == set(episode_fields(TASK))
+    assert len(episodes["episode/return"]) == BATCH
     np.testing.assert_allclose(
         episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3
     )
@@ -121,9 +128,8 @@ def test_rollouts_go_through_whole_episodes_and_on():
     present = np.arange(1, STEPS + 1) < TASK.approach_steps
     np.testing.assert_array_equal(first.trace.table, np.tile(present[:, None], BATCH))
     second = worker.collect(NOISY, 30)
-    assert not np.asarray(second.terminal).any() and not len(
-        finished_episodes(second, TASK)["episode/return"]
-    )
+    assert not np.asarray(second.terminal).any()
+    assert not len(finished_episodes(second, TASK)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
     assert np.all(np.asarray(worker.state.time) == 30)
@@ -138,7 +144,8 @@ def test_rollouts_go_through_whole_episodes_and_on():
 
 
 def _replaced_objects_rest_where_they_were_placed(worker):
-    others, bank = suite.OBJECTS[::-1], jax.tree.map(lambda rows: rows[::-1], suite.bank())
+    others = suite.OBJECTS[::-1]
+    bank = jax.tree.map(lambda rows: rows[::-1], suite.bank())
     worker.replace_objects(others, bank)
     worker.restart()
     index = np.asarray(worker.state.reset_state.object_index)
@@ -157,13 +164,16 @@ def test_success_needs_the_object_to_stay_up():
     """Hands that go up from half a metre above the table touch nothing: every object falls, and
     none succeeds.
     """
-    worker, drawn = suite.worker(), suite.episodes(BATCH)
+    worker = suite.worker()
+    drawn = suite.episodes(BATCH)
     far = drawn.reset_state.base_position + np.array([0.0, 0.0, 0.5], np.float32)
     worker.begin(drawn._replace(reset_state=drawn.reset_state._replace(base_position=far)))
     rollout = worker.collect(suite.command(lift=20.0), STEPS)
     episodes = finished_episodes(rollout, TASK)
-    assert np.asarray(rollout.terminal)[-1].all() and not np.asarray(rollout.truncated).any()
-    assert not episodes["episode/links_at_removal"].any() and not episodes["episode/success"].any()
+    assert np.asarray(rollout.terminal)[-1].all()
+    assert not np.asarray(rollout.truncated).any()
+    assert not episodes["episode/links_at_removal"].any()
+    assert not episodes["episode/success"].any()
     assert (episodes["term/drop"] < 0).all()
     worker.physics.close()
 
@@ -180,9 +190,12 @@ def follow():
         long.
         """
         worker.begin(suite.episodes(BATCH)._replace(hold=np.full(BATCH, hold, np.int32)))
-        programs, key_data = worker.programs, np.asarray(jax.random.key_data(jax.random.key(0)))
+        programs = worker.programs
+        key_data = np.asarray(jax.random.key_data(jax.random.key(0)))
         parameters, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
-        first, state, transitions = jax.device_get(worker.physics.read(None)), worker.state, []
+        first = jax.device_get(worker.physics.read(None))
+        state = worker.state
+        transitions = []
         decision = programs.decide(parameters, settings, state, key)
         state = state._replace(views=None)
         for step in range(1, steps + 1):
@@ -203,11 +216,15 @@ def _touched(first, force, fallen, drop=0.06):
     """A readout in which one link presses with a force, and objects fell by more than the 5 cm that
     count.
     """
-    found, forces = np.zeros_like(first.contact_found), np.zeros_like(first.contact_force)
-    found[:, 0, 0], forces[:, 0, 0, 0] = True, force
+    contact_found = np.zeros_like(first.contact_found)
+    forces = np.zeros_like(first.contact_force)
+    contact_found[:, 0, 0] = True
+    forces[:, 0, 0, 0] = force
     position = first.object_position.copy()
     position[fallen, 2] -= drop
-    return first._replace(contact_found=found, contact_force=forces, object_position=position)
+    return first._replace(
+        contact_found=contact_found, contact_force=forces, object_position=position
+    )
 
 
 def test_a_lifted_object_that_stays_is_a_success(follow):
@@ -245,7 +262,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
     np.testing.assert_allclose(finished["episode/force_sum"], 3.0, rtol=1e-5)
 
 
-def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
+def test_a_fallen_object_ends_no_episode_without_end_when_fallen():
     """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no
     truncation.
     """
@@ -261,9 +278,8 @@ def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
     )
     for end in (False, True):
         state, transition = advance(state._replace(views=None), _touched(first, 1.0, slice(None)))
-        assert (np.asarray(transition.terminal) == end).all() and not np.asarray(
-            transition.truncated
-        ).any()
+        assert (np.asarray(transition.terminal) == end).all()
+        assert not np.asarray(transition.truncated).any()
     physics.close()
 
 
@@ -278,7 +294,8 @@ class _Touching:
     that of MJX.
     """
 
-    name, compiled = "touching", True
+    name = "touching"
+    compiled = True
 
     def start(self, start):
         return start
@@ -296,7 +313,8 @@ class _Touching:
         pass
 
     def _physics_state(self, start, touching):
-        batch, links = start.q.shape[0], len(HAND.links)
+        batch = start.q.shape[0]
+        links = len(HAND.links)
         none = jnp.zeros((batch, 6))
         return PhysicsState(
             q=start.q,
@@ -317,18 +335,19 @@ class _Touching:
 
 def _compiled(caplog):
     """Names of the programs that this thread lowered or compiled."""
-    found = [
+    compiled = [
         re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage())
         for record in caplog.records
     ]
-    return {match[2] for match in found if match}
+    return {match[2] for match in compiled if match}
 
 
 def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplog):
     """A compiled engine's program is one loop, which shares nothing with other tests': here of
     headings alone.
     """
-    physics, task = _Touching(), dataclasses.replace(TASK, constraints=("heading",))
+    physics = _Touching()
+    task = dataclasses.replace(TASK, constraints=("heading",))
     worker = RolloutWorker(
         HAND,
         task,
@@ -356,7 +375,8 @@ def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplo
             success=state.success._replace(links_at_removal=jnp.ones(2)),
         )
         rollout = worker.collect(NOISY, 7)
-    assert ahead == {"_scan", "_sample", "_begin", "renew"} and not ahead & _compiled(caplog)
+    assert ahead == {"_scan", "_sample", "_begin", "renew"}
+    assert not ahead & _compiled(caplog)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     assert np.argwhere(rollout.truncated).tolist() == [[4, 0]]
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
@@ -366,7 +386,7 @@ def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplo
     assert touching[:, 1].tolist() == [False] + [True] * 6
 
 
-def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
+def test_episodes_drawn_in_small_batches_equal_one_draw(monkeypatch):
     """A program of its own, of headings alone: five environments restart, two at a time."""
     task = dataclasses.replace(TASK, constraints=("heading",))
     settings = {
@@ -376,9 +396,10 @@ def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
         "traced": "none",
         "taught": False,
     }
+    monkeypatch.setattr(rollout_module, "LEAST_RENEWED", 2)
     programs = Programs(HAND, task, None, suite.commanded, **settings)
-    programs._together = 2
-    bank, (old, new) = suite.bank(), jax.random.split(jax.random.key(0))
+    bank = suite.bank()
+    old, new = jax.random.split(jax.random.key(0))
     ended = np.array([True, False, True, True, False, True, False, True])
     state = programs.begin(programs.sample(bank, old, np.array(False)), None)._replace(
         time=jnp.full(BATCH, 9)
@@ -397,17 +418,19 @@ def test_workers_of_one_task_share_programs_that_compile_once():
     """A worker's seed, the number of steps, and whether the parameters are committed to a device do
     not matter.
     """
-    programs, sizes = suite.programs(), set()
+    programs = suite.programs()
+    sizes = set()
     for steps, parameters in enumerate((NOISY, jnp.asarray(NOISY), suite.placed(NOISY)), 1):
         worker = suite.worker(seed=steps)
         worker.collect(parameters, steps)
         worker.restart()
-        before = programs.renew._cache_size()
+        before = program_count(programs.renew)
         worker.weigh_objects(np.asarray(worker.bank.weight))
         worker.restart()
-        assert worker.programs is programs and programs.renew._cache_size() == before
+        assert worker.programs is programs
+        assert program_count(programs.renew) == before
         compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
-        sizes.add(tuple(program._cache_size() for program in compiled))
+        sizes.add(tuple(map(program_count, compiled)))
         worker.physics.close()
     assert len(sizes) == 1
 
@@ -417,9 +440,11 @@ def test_programs_stay_small(name, most):
     """Compiling costs in proportion to a program's equations; a bound is a tenth above what there
     is.
     """
-    worker, programs = suite.worker(), suite.programs()
+    worker = suite.worker()
+    programs = suite.programs()
     still, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
-    readout, state = worker.physics.read(None), worker.state
+    readout = worker.physics.read(None)
+    state = worker.state
     decision = programs.decide(still, settings, state, key)
     arguments = {
         "sample": (suite.bank(), key, np.array(False)),
@@ -433,18 +458,18 @@ def test_programs_stay_small(name, most):
             jax.random.key_data(key),
         ),
     }
-    counted = _equations(jax.make_jaxpr(getattr(programs, f"_{name}"))(*arguments[name]).jaxpr)
+    counted = _equations(jax.make_jaxpr(getattr(programs, name))(*arguments[name]).jaxpr)
     assert 0.6 * most < counted <= most, counted
     worker.physics.close()
 
 
 def _equations(program) -> int:
     """Equations of a jaxpr and of those within it."""
-    inner = [
-        [part for value in equation.params.values() for part in _programs_in(value)]
-        for equation in program.eqns
-    ]
-    return sum(sum(map(_equations, parts)) if parts else 1 for parts in inner)
+    count = 0
+    for equation in program.eqns:
+        inner = list(itertools.chain(*map(_programs_in, equation.params.values())))
+        count += sum(map(_equations, inner)) if inner else 1
+    return count
 
 
 def _programs_in(value):

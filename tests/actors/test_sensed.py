@@ -19,7 +19,9 @@ from tests.scenes import evaluated
 from tests.task import HAND
 
 OBJECTS = suite.OBJECTS[1:2]
-BATCH, DELAY, LATENCY = 2, 3, 2
+BATCH = 2
+DELAY = 3
+LATENCY = 2
 # A policy that is shown a tracker's poses, in episodes of 20 control steps.
 TASK = TaskConfig(
     constraints=("heading",),
@@ -63,7 +65,8 @@ def late():
 
 def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
     running, rollout = late
-    readings, trace = running.state.sensing.readings, rollout.trace
+    readings = running.state.sensing.readings
+    trace = rollout.trace
     for age in range(TASK.history):
         now = 17 - age
         np.testing.assert_allclose(readings.q[:, age], trace.q[now], atol=1e-6)
@@ -77,7 +80,8 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
         np.testing.assert_allclose(
             readings.object_quaternion[:, age], trace.object_quaternion[now - DELAY], atol=1e-6
         )
-    seen, true = running.env.seen(running.state).state, running.env.scene_of(running.state).state
+    seen = running.env.seen(running.state).state
+    true = running.env.scene_of(running.state).state
     np.testing.assert_array_equal(true.object_position, trace.object_position[17])
     np.testing.assert_array_equal(seen.object_position, readings.object_position[:, 0])
     assert not np.array_equal(seen.object_position, true.object_position)
@@ -88,8 +92,10 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
 def test_servos_follow_the_target_of_so_many_steps_ago(late):
     """The teacher sees the targets that they follow, the student its newest ones."""
     running, rollout = late
-    env, state = running.env, running.state
-    readings, action = state.sensing.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
+    env = running.env
+    state = running.state
+    readings = state.sensing.readings
+    action = jnp.zeros((BATCH, len(HAND.motors) + 6))
     _, (command, _) = jax.jit(env.targets)(state, action, env.settings)
     np.testing.assert_allclose(command[:, :6], readings.u_target[:, LATENCY - 1], atol=1e-6)
     np.testing.assert_allclose(
@@ -99,15 +105,14 @@ def test_servos_follow_the_target_of_so_many_steps_ago(late):
     np.testing.assert_array_equal(env.seen(state).state.q_target, readings.q_target[:, 0])
     moving = np.abs(np.diff(rollout.trace.q_target, axis=0)).max((1, 2))
     # Nothing is followed before it arrives
-    assert moving.max() > 0.05 and moving[: LATENCY - 1].max() == 0.0
+    assert moving.max() > 0.05
+    assert moving[: LATENCY - 1].max() == 0.0
 
 
 def test_a_teacher_sees_all_beside_a_student(late):
     _, rollout = late
-    sizes = [
-        sum(size for _, size in layout)
-        for layout in (observation.layout(HAND, TASK), full_layout(TASK))
-    ]
+    layouts = (observation.layout(HAND, TASK), full_layout(TASK))
+    sizes = [sum(dict(layout).values()) for layout in layouts]
     assert [
         rollout.observation.shape[-1],
         rollout.teacher_observation.shape[-1] - extra(HAND),
@@ -127,7 +132,8 @@ def test_the_critic_sees_the_trackers_and_the_true_state(late):
     running, rollout = late
     names = [name for name, _ in privileged.layout(HAND, TASK)]
     size = sum(size for _, size in privileged.layout(HAND, TASK))
-    assert rollout.privileged.shape == (18, BATCH, size) and rollout.last_privileged.shape == (
+    assert rollout.privileged.shape == (18, BATCH, size)
+    assert rollout.last_privileged.shape == (
         BATCH,
         size,
     )
@@ -154,7 +160,8 @@ def test_a_fresh_episode_begins_with_fresh_readings(late):
     running, _ = late
     rollout = running.collect(suite.command(fingers=0.8), 2)
     assert rollout.terminal[-1].all()
-    readings, start = running.state.sensing.readings, running.state.reset_state
+    readings = running.state.sensing.readings
+    start = running.state.reset_state
     for age in range(TASK.history):
         np.testing.assert_array_equal(readings.object_position[:, age], start.object_position)
         np.testing.assert_array_equal(readings.q[:, age], start.q)

@@ -57,7 +57,8 @@ def sets():
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, sets):
     """A folder of the suite's objects, and one of the mug's constraint set."""
-    folder, constraints = tmp_path_factory.mktemp("objects"), tmp_path_factory.mktemp("sets")
+    folder = tmp_path_factory.mktemp("objects")
+    constraints = tmp_path_factory.mktemp("sets")
     for obj in OBJECTS:
         Catalogue(folder).add(obj)
     save(sets[MUG.name], constraints)
@@ -76,12 +77,13 @@ def scanned(folders):
 
 
 def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, scanned):
-    made = training_set(HAND, _run(), 0)
-    assert [obj.name for obj in made.objects] == [obj.name for obj in OBJECTS]
-    jax.tree.map(np.testing.assert_array_equal, made.bank, suite.bank())
+    training = training_set(HAND, _run(), 0)
+    assert [obj.name for obj in training.objects] == [obj.name for obj in OBJECTS]
+    jax.tree.map(np.testing.assert_array_equal, training.bank, suite.bank())
     assert [obj.name for obj in scanned.objects] == sorted(obj.name for obj in OBJECTS)
     mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
-    assert len(mixed.objects) == 8 and len(mixed.bank.points) == 8
+    assert len(mixed.objects) == 8
+    assert len(mixed.bank.points) == 8
     np.testing.assert_allclose(mixed.bank.weight, [0.75 / 4] * 4 + [0.25 / 4] * 4)
 
 
@@ -91,7 +93,8 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
     """
     objects, constraints = folders
     mixed = training_set(HAND, _run(folder=objects, constraints=constraints, procedural=4), 0)
-    assert mixed.objects[0].name == MUG.name and len(mixed.objects) == 5
+    assert mixed.objects[0].name == MUG.name
+    assert len(mixed.objects) == 5
     assert np.asarray(mixed.bank.renewable).tolist() == [False, True, True, True, True]
     apart = [
         np.asarray(
@@ -101,7 +104,8 @@ def test_constraint_sets_keep_their_split_and_their_references(folders):
         )
         for split in ("training", "held-out", "all")
     ]
-    assert not (apart[0] & apart[1]).any() and np.array_equal(apart[0] | apart[1], apart[2])
+    assert not (apart[0] & apart[1]).any()
+    assert np.array_equal(apart[0] | apart[1], apart[2])
     index = np.array([0, 1], np.int32)
     q, position, quaternion = (
         np.asarray(getattr(mixed.bank, f"pose_{name}"))[:2, 0, 0]
@@ -118,10 +122,10 @@ def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path, sets):
     allowed = mug["heading/allowed"] & mug["heading/training"][:, None]
     save(Message({**mug, "heading/allowed": allowed}, sets[MUG.name].meta), tmp_path)
     save(sets[BOX.name], tmp_path)
-    left = {
-        split: [obj.name for obj in load_for(tmp_path, [MUG, BOX], split)[0]]
-        for split in get_args(Split)
-    }
+    left = {}
+    for split in get_args(Split):
+        objects, _ = load_for(tmp_path, [MUG, BOX], split)
+        left[split] = [obj.name for obj in objects]
     every = [MUG.name, BOX.name]
     assert left == {"all": every, "training": every, "held-out": every[1:]}
 
@@ -131,7 +135,8 @@ def test_sets_without_normals_get_estimated_ones(tmp_path, sets):
     arrays = dict(sets[BOX.name].arrays)
     exact = arrays.pop("surface/normals")
     normals = load(save(Message(arrays, sets[BOX.name].meta), tmp_path)).arrays["surface/normals"]
-    assert normals.dtype == np.float32 and np.median(np.sum(normals * exact, -1)) > 0.99
+    assert normals.dtype == np.float32
+    assert np.median(np.sum(normals * exact, -1)) > 0.99
 
 
 @pytest.mark.parametrize(
@@ -154,10 +159,10 @@ def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
         ({"folder": 0, "constraints": 0}, "no constraint set"),
     ],
 )
-def test_what_cannot_be_trained_on_is_said(folders, objects, text):
-    given = {name: folders[0] if value == 0 else value for name, value in objects.items()}
+def test_unusable_training_objects_are_refused(folders, objects, text):
+    options = {name: folders[0] if value == 0 else value for name, value in objects.items()}
     with pytest.raises(CongraspError, match=text):
-        training_set(HAND, _run(**given), 0)
+        training_set(HAND, _run(**options), 0)
 
 
 def test_sets_of_another_hand_are_refused(folders):
@@ -175,7 +180,8 @@ def test_an_object_that_lies_too_flat_is_in_no_episode():
     board = procedural.generate(1_000_045, "board")
     assert np.ptp(board.points, axis=0).min() < 0.009
     row = headings_of(TASK, board, (0, 1), None, 1.0, outline(HAND))
-    assert row["weight"] == 0 and np.isfinite(row["heading_position"]).all()
+    assert row["weight"] == 0
+    assert np.isfinite(row["heading_position"]).all()
 
 
 def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
@@ -199,7 +205,7 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
     np.testing.assert_array_equal(both.pose_q[1], rows[1].pose_q)
 
 
-def test_objects_are_drawn_as_often_as_their_weights_say():
+def test_objects_are_drawn_in_proportion_to_their_weights():
     bank = suite.bank()._replace(weight=np.array([1.0, 3.0, 0.0, 4.0], np.float32))
     drawn = suite.episodes(2000, bank).reset_state.object_index
     assert np.bincount(drawn, minlength=4) / len(drawn) == pytest.approx(
@@ -209,36 +215,38 @@ def test_objects_are_drawn_as_often_as_their_weights_say():
 
 def test_weights_by_hand():
     """Two mugs and a box, four episodes each: 4, 0 and 0 failures."""
-    found = FailureWeights(np.array([1.0, 1.0, 3.0]), ["mug", "mug", "box"])
-    np.testing.assert_array_equal(found.weights, [1, 1, 3])
-    found.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
+    weights = FailureWeights(np.array([1.0, 1.0, 3.0]), ["mug", "mug", "box"])
+    np.testing.assert_array_equal(weights.weights, [1, 1, 3])
+    weights.add(np.repeat([0, 1, 2], 4), np.repeat([0.0, 1.0, 1.0], 4))
     # Nothing was counted before, so that nothing is forgotten. All: 4/12. Mugs: (4 + 5/3) / (8 +
     # 5), boxes: (5/3) / 9.
-    mugs, boxes = 17 / 39, 5 / 27
+    mugs = 17 / 39
+    boxes = 5 / 27
     rates = np.array([(4 + 5 * mugs) / 9, 5 * mugs / 9, 5 * boxes / 9])
     variance = rates * (1 - rates)
     factors = (variance + variance.mean()) / (2 * variance.mean())
-    np.testing.assert_allclose(found.weights, [1.0, 1.0, 3.0] * factors, rtol=1e-6)
-    assert found.metrics()["failure/mug"] == pytest.approx(mugs)
-    assert found.metrics()["failure/box"] == pytest.approx(boxes)
+    np.testing.assert_allclose(weights.weights, [1.0, 1.0, 3.0] * factors, rtol=1e-6)
+    assert weights.metrics()["failure/mug"] == pytest.approx(mugs)
+    assert weights.metrics()["failure/box"] == pytest.approx(boxes)
 
 
 def test_old_outcomes_are_forgotten():
     """After 50 episodes of each object what came before counts e times less."""
-    found = FailureWeights(np.ones(2), ["box", "mug"])
-    found.add(np.zeros(100, int), np.zeros(100))
-    assert found.metrics()["failure/box"] == pytest.approx(1.0)
-    found.add(np.zeros(100, int), np.ones(100))
+    weights = FailureWeights(np.ones(2), ["box", "mug"])
+    weights.add(np.zeros(100, int), np.zeros(100))
+    assert weights.metrics()["failure/box"] == pytest.approx(1.0)
+    weights.add(np.zeros(100, int), np.ones(100))
     old = 100 * np.exp(-1)
     mean = old / (100 + old)
-    assert found.metrics()["failure/box"] == pytest.approx((old + 5 * mean) / (100 + old + 5))
+    assert weights.metrics()["failure/box"] == pytest.approx((old + 5 * mean) / (100 + old + 5))
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.booleans()), max_size=200))
 def test_weights_stay_within_a_factor_of_four_and_follow_uncertainty(episodes):
-    found = FailureWeights(np.ones(5), ["a", "a", "a", "b", "b"])
+    failures = FailureWeights(np.ones(5), ["a", "a", "a", "b", "b"])
     index = np.array([i for i, _ in episodes], int)
     success = np.array([s for _, s in episodes], float)
-    found.add(index, success)
-    weights = found.weights
-    assert weights.min() >= 0.5 and weights.max() <= 2.0
+    failures.add(index, success)
+    weights = failures.weights
+    assert weights.min() >= 0.5
+    assert weights.max() <= 2.0

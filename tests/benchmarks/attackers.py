@@ -65,7 +65,8 @@ def throttled(endpoint: str, rate: float) -> Iterator[str]:
     """An endpoint through which another one, with all its flows, is reached at so many bytes a
     second each way.
     """
-    port, ended = free_port(), threading.Event()
+    port = free_port()
+    ended = threading.Event()
 
     def pump(source: socket.socket, target: socket.socket) -> None:
         with contextlib.suppress(OSError), source, target:
@@ -76,7 +77,8 @@ def throttled(endpoint: str, rate: float) -> Iterator[str]:
     def accept(listener: socket.socket, target: tuple[str, int]) -> None:
         with contextlib.suppress(OSError), listener:
             while True:
-                near, far = listener.accept()[0], socket.create_connection(target, 5.0)
+                near = listener.accept()[0]
+                far = socket.create_connection(target, 5.0)
                 for one in (near, far):
                     one.settimeout(None)
                     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
@@ -155,7 +157,8 @@ def silent(endpoint: str, run: str, query: bytes) -> None:
 
 def huge(endpoint: str, run: str, query: bytes) -> None:
     """Sends 60 MB to a policy server, or to the key that the file holds, four at a time."""
-    payload, key = bytes(_HUGE), query.decode() or Keys(run).act_for("huge")
+    payload = bytes(_HUGE)
+    key = query.decode() or Keys(run).act_for("huge")
     sessions = [bare_session("client", connect=endpoint) for _ in range(4)]
     print("began", flush=True)
 
@@ -176,7 +179,8 @@ KINDS: dict[str, Callable[[str, str, bytes], None]] = {
 
 def _whole(session: zenoh.Session, key: str, request: bytes) -> None:
     """Sends a query, and requests four mebibytes more at a time while the answer has more."""
-    offset, head = 0, b""
+    offset = 0
+    head = b""
     while True:
         attachment = (
             head[:8] + offset.to_bytes(8, "little") + (4 << 20).to_bytes(4, "little")

@@ -12,15 +12,17 @@ import pathlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import psutil
 from rich.console import Console
 from rich.table import Table
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.wire.codec import Message, encode
+from congrasp.services.client.episode_policy import EpisodePolicy
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.load import Example, example_episode, serving
 from congrasp.services.train.command import untrained
@@ -123,7 +125,8 @@ def _servers(
 def _latencies(client: PolicyClient, episode: Example, seconds: float) -> list[float]:
     """Seconds of the queries of a client that sends one in each `_PERIOD`."""
     client.reset(episode.request)
-    times, deadline = [], time.monotonic() + seconds
+    times = []
+    deadline = time.monotonic() + seconds
     while (began := time.monotonic()) < deadline:
         with contextlib.suppress(CongraspError):
             client.act(episode.state)
@@ -150,17 +153,27 @@ def single_query(client: PolicyClient, episode: Example) -> bytes:
     return _recorded(client, episode, 1)
 
 
+class _QueryRecorder(EpisodePolicy):
+    """Keeps the newest query instead of sending it."""
+
+    def __init__(self, metadata: dict[str, Any]):
+        super().__init__()
+        self._metadata = metadata
+        self.query = Message()
+
+    def _described(self) -> dict[str, Any]:
+        return self._metadata
+
+    def _query(self, query: Message) -> Message:
+        self.query = query
+        raise TransportError("The query is not sent.")
+
+
 def _recorded(client: PolicyClient, episode: Example, states: int) -> bytes:
     """The bytes of a client's query."""
-    queries: list[Message] = []
-    ask = client._query
-
-    def record(query: Message) -> Message:
-        queries.append(Message(query.arrays, {"timeout": 60.0, **query.meta}))
-        return ask(query)
-
-    client._query = record  # type: ignore[method-assign]
-    client.reset(episode.request)
-    client.act_each([episode.state] * states)
-    client._query = ask  # type: ignore[method-assign]
-    return encode(queries[-1])
+    recorder = _QueryRecorder(client.metadata())
+    recorder.reset(episode.request)
+    with contextlib.suppress(TransportError):
+        recorder.act_each([episode.state] * states)
+    query = recorder.query
+    return encode(Message(query.arrays, {"timeout": 60.0, **query.meta}))

@@ -166,5 +166,5 @@ def rows_of(conditions: InitialConditions, rows: np.ndarray) -> InitialCondition
 
 def joined(parts: list[InitialConditions]) -> InitialConditions:
     """Joins initial conditions of several batches."""
-    whole: InitialConditions = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
-    return whole
+    conditions: InitialConditions = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+    return conditions

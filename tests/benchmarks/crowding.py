@@ -4,6 +4,7 @@ ratio to the same clients alone.
 
 import concurrent.futures
 import contextlib
+import itertools
 import os
 import pathlib
 import tempfile
@@ -234,7 +235,7 @@ def _measured(setting: _Setting, seconds: float) -> _Outcome:
 
     with concurrent.futures.ThreadPoolExecutor(_HONEST) as pool:
         outcomes = list(pool.map(ask, setting.clients, _RATES))
-    times = [seconds for outcome in outcomes for seconds in outcome.times]
+    times = list(itertools.chain.from_iterable(outcome.times for outcome in outcomes))
     refused = sum(outcome.refused for outcome in outcomes)
     lost = sum(outcome.lost for outcome in outcomes)
     return _Outcome(times, refused, lost)

@@ -20,7 +20,8 @@ from congrasp.services.cli.console import tracked
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, read_grasps
 from tests.benchmarks.dexgraspbench_replay import replayed, save_replay, summary
 
-GRASPS, OBJECTS = "graspdata", "object"
+GRASPS = "graspdata"
+OBJECTS = "object"
 """Folders of the output."""
 
 
@@ -56,13 +57,13 @@ def dexgraspbench(
         grasps, left_out = read_grasps(paths, track("Reading", None))
         for grasp in grasps:
             write_grasp(grasp, out)
-        found = replayed(grasps, track("Replaying", len(grasps))) if replay else []
+        replays = replayed(grasps, track("Replaying", len(grasps))) if replay else []
     for reason in left_out:
         print(f"Left out: {reason}")
     print(f"{out}: {len(grasps)} grasps")
-    if found:
-        save_replay(out, found)
-        print(summary(found))
+    if replays:
+        save_replay(out, replays)
+        print(summary(replays))
     return 0
 
 
@@ -92,7 +93,10 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_atomically(folder / GRASPS / grasp.name / "congrasp" / "0.npz", buffer.getvalue())
-    obj, origin, scale, home = grasp.obj, grasp.origin, grasp.scale, folder / OBJECTS / grasp.name
+    obj = grasp.obj
+    origin = grasp.origin
+    scale = grasp.scale
+    home = folder / OBJECTS / grasp.name
     meshes = {"mesh/simplified.obj": (obj.visual_vertices, obj.visual_faces)}
     for number, piece in enumerate(obj.pieces):
         meshes[f"urdf/meshes/convex_piece_{number:03d}.obj"] = shapes.tessellate(piece)

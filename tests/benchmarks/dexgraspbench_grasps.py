@@ -135,7 +135,8 @@ def benchmark_grasp(name: str, motion: Episode) -> Grasp:
     Raises:
       CongraspError: the benchmark does not have the hand.
     """
-    match, hand = match_hand(motion), get_hand(motion.hand)
+    match = match_hand(motion)
+    hand = get_hand(motion.hand)
     obj = convex_object(motion)
     last = max(motion.grasp_span[1] - 1, 0)
     clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
@@ -163,10 +164,10 @@ def squeezed(hand: Hand, motion: Episode, t: int, kp: float) -> np.ndarray:
     of the hand's own servos, mean over ten frames up to this one. A motor of several joints turns
     them by their coefficients.
     """
-    own = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
+    motors = np.array([(motor.kp, motor.torque_limit) for motor in hand.motors])
     frames = slice(max(t + 1 - _STEADY, 0), t + 1)
     ahead = motor_positions(hand, motion.joint_target[frames] - motion.joint_position[frames])
-    further = np.clip(own[:, 0] * ahead, -own[:, 1], own[:, 1]).mean(0) / kp
+    further = np.clip(motors[:, 0] * ahead, -motors[:, 1], motors[:, 1]).mean(0) / kp
     q = motion.joint_position[t].astype(float)
     for motor, way in zip(hand.motors, further, strict=True):
         coefficients = np.array([*motor.joints.values()])
@@ -187,9 +188,8 @@ def convex_object(motion: Episode) -> GraspObject:
     bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
     if len(bodies) > MAX_MESH_PIECES:
         bodies = [trimesh.Trimesh(*shape)]
-    pieces = [
-        piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))
-    ]
+    most = max(1, MAX_MESH_PIECES // len(bodies))
+    pieces = list(itertools.chain.from_iterable(_pieces(body, most) for body in bodies))
     if not pieces:
         raise CongraspError(
             f"The mesh of '{motion.object}' has no volume.", "Generate the motion again."
@@ -200,10 +200,11 @@ def convex_object(motion: Episode) -> GraspObject:
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     """Convex pieces of one body; empty for a flat one."""
     volume = float(body.volume) if body.is_volume else None
-    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    vertices = np.asarray(body.vertices)
+    faces = np.asarray(body.faces)
     try:
-        found = decompose(vertices, faces, volume=volume, max_pieces=most)
-        hulls = [simplify(piece) for piece in found.pieces]
+        pieces = decompose(vertices, faces, volume=volume, max_pieces=most)
+        hulls = [simplify(piece) for piece in pieces.pieces]
     except QhullError:
         return []
     return [Piece("mesh", (0.0, 0.0, 0.0), vertices=hull.astype(float)) for hull in hulls]
@@ -216,7 +217,8 @@ def _rotation(quaternion: np.ndarray) -> Rotation:
 
 def _state(motion: Episode, t: int) -> State:
     """The hand in a frame."""
-    position, q = motion.wrist_position[t].astype(float), motion.joint_position[t].astype(float)
+    position = motion.wrist_position[t].astype(float)
+    q = motion.joint_position[t].astype(float)
     return State(position, _rotation(motion.wrist_quaternion[t]), q)
 
 
@@ -240,27 +242,26 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: Episode, last: int) -> tup
     fingers = [model.joint(joint.name).qposadr[0] for joint in hand.joints]
     body = model.body("object").id
     free = model.jnt_qposadr[model.body_jntadr[body]]
-    mine = np.flatnonzero(model.geom_bodyid == body)
+    geoms = np.flatnonzero(model.geom_bodyid == body)
     theirs = [
         g for g in range(model.ngeom) if model.geom_bodyid[g] != body and model.geom_contype[g]
     ]
     base = model.body("hand_base").id
-    best, farthest = 0, -np.inf
+    best = 0
+    farthest = -np.inf
     for t in range(last, -1, -1):
-        model.body_pos[base], model.body_quat[base] = (
-            motion.wrist_position[t],
-            motion.wrist_quaternion[t],
-        )
+        model.body_pos[base] = motion.wrist_position[t]
+        model.body_quat[base] = motion.wrist_quaternion[t]
         data.qpos[fingers] = motion.joint_position[t]
         data.qpos[free : free + 7] = *motion.object_position[t], *motion.object_quaternion[t]
         mujoco.mj_kinematics(model, data)
         gap = min(
             mujoco.mj_geomDistance(model, data, a, b, 2 * CLEARANCE, None)
-            for a in theirs
-            for b in mine
+            for a, b in itertools.product(theirs, geoms)
         )
         if gap > farthest:
-            best, farthest = t, gap
+            best = t
+            farthest = gap
         if gap >= CLEARANCE:
             break
     return best, float(farthest)

@@ -69,11 +69,12 @@ class BenchmarkHand:
     @property
     def joints(self) -> tuple[str, ...]:
         """F names."""
-        return tuple(
-            f"{finger}{len(rows) - i if self.from_tip else i}"
-            for finger, rows in self.fingers.items()
-            for i in range(len(rows))
-        )
+        names = []
+        for finger, rows in self.fingers.items():
+            for i in range(len(rows)):
+                number = len(rows) - i if self.from_tip else i
+                names.append(f"{finger}{number}")
+        return tuple(names)
 
     @property
     def rows(self) -> np.ndarray:
@@ -128,7 +129,7 @@ class Match(NamedTuple):
         palm = Rotation.from_quat(self.hand.quaternion, scalar_first=True)
         turn = self.rotation.inv() * palm  # from the palm's frame to the wrist's
         place = self.rotation.inv().apply(self.hand.position - self.position)
-        found: dict[int, tuple[Solid, ...]] = {}
+        solids_of: dict[int, tuple[Solid, ...]] = {}
         for shape in self.hand.shapes:
             link = (
                 int(link_of[self.order[self.hand.joints.index(shape.joint)]]) if shape.joint else 0
@@ -139,8 +140,8 @@ class Match(NamedTuple):
             solid = Solid(
                 shape.kind, shape.size, vector(turn.apply(shape.position) + place), (w, x, y, z)
             )
-            found[link] = (*found.get(link, ()), solid)
-        return found
+            solids_of[link] = (*solids_of.get(link, ()), solid)
+        return solids_of
 
 
 def match_hand(motion: Episode) -> Match:
@@ -160,9 +161,9 @@ def match_hand(motion: Episode) -> Match:
             if [len(chain) for chain in pairing] != lengths:
                 continue
             order = np.concatenate(pairing)
-            found = _laid_over(name, hand, order, motion)
-            if found[0] < best[0]:
-                best = found
+            laid_over = _laid_over(name, hand, order, motion)
+            if laid_over[0] < best[0]:
+                best = laid_over
     error, match = best
     if match is None or error > PLACES_MM:
         near = f"; the nearest, {match.name}, has a joint {error:.2g} mm off" if match else ""
@@ -204,30 +205,32 @@ def _chains(motion: Episode) -> list[np.ndarray]:
     """Joint indices of each finger, from the palm on; empty if the hand is not a palm with
     chains.
     """
-    parents, links = motion.link_parent, motion.joint_link
-    found = []
+    parents = motion.link_parent
+    links = motion.joint_link
+    chains = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
         chain: list[int] = []
         link = tip
         while parents[link] >= 0:
             chain = [*np.flatnonzero(links == link).tolist(), *chain]
             link = int(parents[link])
-        found.append(np.array(chain, int))
-    found = [chain for chain in found if len(chain)]
-    joints = np.concatenate(found) if found else np.zeros(0)
-    return found if len(np.unique(joints)) == len(joints) == len(links) and len(found) <= 5 else []
+        chains.append(np.array(chain, int))
+    chains = [chain for chain in chains if len(chain)]
+    joints = np.concatenate(chains) if chains else np.zeros(0)
+    return (
+        chains if len(np.unique(joints)) == len(joints) == len(links) and len(chains) <= 5 else []
+    )
 
 
 def _laid_over(
     name: str, hand: BenchmarkHand, order: np.ndarray, motion: Episode
 ) -> tuple[float, Match | None]:
     """Error in mm of the farthest joint for this assignment of joints, and the match."""
-    theirs, anchors, axes = (
-        hand.rows,
-        motion.joint_anchor[order].astype(float),
-        motion.joint_axis[order].astype(float),
-    )
-    middle, center = theirs[:, 0].mean(0), anchors.mean(0)
+    theirs = hand.rows
+    anchors = motion.joint_anchor[order].astype(float)
+    axes = motion.joint_axis[order].astype(float)
+    middle = theirs[:, 0].mean(0)
+    center = anchors.mean(0)
     turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]
     off = (
         1e3 * np.linalg.norm(turn.apply(anchors - center) - (theirs[:, 0] - middle), axis=-1).max()

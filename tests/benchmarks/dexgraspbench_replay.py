@@ -29,17 +29,18 @@ from congrasp.common.task.config import TaskConfig
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State
 from tests.benchmarks.dexgraspbench_hands import benchmarked
 
-MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
+MASS = 0.1
+FRICTION = 0.6
+TORSION = 0.02
 """kg, and sliding and torsional (m) friction of every object."""
-_HAND, _OBJECT = ((0.005, 1.0), (0.5, 0.99, 1e-4)), ((0.02, 1.0), (0.9, 0.95, 1e-3))
+_HAND = ((0.005, 1.0), (0.5, 0.99, 1e-4))
+_OBJECT = ((0.02, 1.0), (0.9, 0.95, 1e-3))
 """`solref` and the first of `solimp`, of which a contact has the mean."""
 STARTS = ("grasp", "pregrasp")
 # Control steps: of a stage, of a push, and between two measurements of contacts
-_STAGE, _PUSH, _LOOK = (
-    40,
-    200,
-    10,
-)
+_STAGE = 40
+_PUSH = 200
+_LOOK = 10
 _TOGETHER = 32  # grasps in parallel
 _TASK = TaskConfig()
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -68,32 +69,36 @@ def replayed(
 ) -> list[Replayed]:
     """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
-    found: list[Replayed] = []
+    replays: list[Replayed] = []
     for first in range(0, len(grasps), _TOGETHER):
-        found += _replay(hand, grasps[first : first + _TOGETHER])
-        progress(len(found))
-    return found
+        replays += _replay(hand, grasps[first : first + _TOGETHER])
+        progress(len(replays))
+    return replays
 
 
-def summary(found: Sequence[Replayed]) -> str:
+def summary(replays: Sequence[Replayed]) -> str:
     """Summary of replayed grasps in one line."""
-    held, closed = (
-        100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS
-    )
-    depth, own, pushed = np.array([(one.depth_mm, one.self_mm, one.pushed_mm) for one in found]).T
+
+    def share(start: str) -> float:
+        return 100 * float(np.mean([getattr(replay, f"from_{start}") for replay in replays]))
+
+    held, closed = map(share, STARTS)
+    depth, self_depth, pushed = np.array(
+        [(one.depth_mm, one.self_mm, one.pushed_mm) for one in replays]
+    ).T
     return (
         f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from "
         f"the pregrasp; "
         f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm "
         f"(most) in the object and "
-        f"{own.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
+        f"{self_depth.max():.1f} mm in itself; pushed, {pushed.max():.1f} mm in the object"
     )
 
 
-def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
+def save_replay(folder: pathlib.Path, replays: Sequence[Replayed]) -> None:
     """Writes the result of each grasp to `replay.json`."""
     write_atomically(
-        folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode()
+        folder / "replay.json", json.dumps([one._asdict() for one in replays], indent=2).encode()
     )
 
 
@@ -121,15 +126,15 @@ def _pushed(
     """
     _begin(physics, grasps, start)
     origin = physics.read(physics)
-    kept: np.ndarray = np.ones(6 * len(grasps), bool)
+    in_place: np.ndarray = np.ones(6 * len(grasps), bool)
     deepest = np.zeros(6 * len(grasps))
     script = _script(hand, grasps, STATES[STATES.index(start) :])
     for step, (target, force) in enumerate(script):
-        _, state = physics.step(physics, target, np.zeros(len(kept), bool), force)
-        kept &= _near(origin, state)
+        _, state = physics.step(physics, target, np.zeros(len(in_place), bool), force)
+        in_place &= _near(origin, state)
         if force.any() and step % _LOOK == 0:
             deepest = np.maximum(deepest, [_depths(instance)[0] for instance in physics.instances])
-    return np.all(kept.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
+    return np.all(in_place.reshape(-1, 6), 1), np.max(deepest.reshape(-1, 6), 1)
 
 
 def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
@@ -168,10 +173,13 @@ def _harden(model: mujoco.MjModel) -> None:
     """Removes gravity, and sets the benchmark's contact parameters."""
     model.opt.gravity[:] = 0.0
     model.opt.noslip_iterations = 2
-    mine = model.geom_bodyid == model.body("object").id
-    model.geom_condim[mine], model.geom_friction[mine, 1], model.geom_solmix[:] = 4, TORSION, 1.0
-    for geoms, (solref, solimp) in ((~mine, _HAND), (mine, _OBJECT)):
-        model.geom_solref[geoms], model.geom_solimp[geoms, :3] = solref, solimp
+    of_object = model.geom_bodyid == model.body("object").id
+    model.geom_condim[of_object] = 4
+    model.geom_friction[of_object, 1] = TORSION
+    model.geom_solmix[:] = 1.0
+    for geoms, (solref, solimp) in ((~of_object, _HAND), (of_object, _OBJECT)):
+        model.geom_solref[geoms] = solref
+        model.geom_solimp[geoms, :3] = solimp
 
 
 def _script(
@@ -223,7 +231,8 @@ def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
 
 def _depths(instance: EnvInstance) -> tuple[float, float]:
     """Deepest contact of hand and object, and of two links, mm."""
-    contact, model = instance.data.contact, instance.model
+    contact = instance.data.contact
+    model = instance.model
     touches = (model.geom_bodyid[contact.geom] == model.body("object").id).any(-1)
     depth = 1e3 * np.maximum(-contact.dist, 0.0)
     return float(depth[touches].max(initial=0.0)), float(depth[~touches].max(initial=0.0))

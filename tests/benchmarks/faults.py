@@ -81,7 +81,10 @@ class Run:
         output: int = subprocess.DEVNULL,
     ):
         """Starts nothing yet; `output` takes what it prints."""
-        self.run_dir, self._count, self._options, self._output = run_dir, actors, options, output
+        self.run_dir = run_dir
+        self._count = actors
+        self._options = options
+        self._output = output
         self._transport: Transport | None = None
         self.process: psutil.Popen | None = None
 
@@ -151,8 +154,8 @@ class Run:
 
     def child(self, role: str) -> psutil.Process:
         """The oldest process of a role, once there is one."""
-        found: list[psutil.Process] = self.until(lambda: self.children(role))
-        return found[0]
+        children: list[psutil.Process] = self.until(lambda: self.children(role))
+        return children[0]
 
     def until(self, look: Callable[[], Any]) -> Any:
         """As the function `until`; a CongraspError with the run's output if that ends before."""
@@ -346,8 +349,8 @@ def _damage(pattern: str, newest: int) -> Fault:
     def damage(run: Run, rng: random.Random) -> None:
         until(lambda: list(run.run_dir.glob(pattern)))
         run.kill()
-        if found := sorted(run.run_dir.glob(pattern))[-newest:]:
-            path = rng.choice(found)
+        if files := sorted(run.run_dir.glob(pattern))[-newest:]:
+            path = rng.choice(files)
             data = bytearray(path.read_bytes())
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
             path.write_bytes(data)

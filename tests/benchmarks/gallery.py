@@ -25,7 +25,8 @@ from congrasp.services.viz.film import Film, film_frames
 from congrasp.services.viz.render import render_episode_frames
 from tests.pictures import provenance
 
-_SIZE, _QUALITY = (480, 360), 88  # pixels, of JPEG
+_SIZE = (480, 360)  # pixels
+_QUALITY = 88  # of JPEG
 _FILM_SIZE = (400, 300)  # pixels
 _FILM_FPS = 12.5
 _COLOURS = 256  # of a film
@@ -142,42 +143,42 @@ def _results(
     graspers: dict[str, Grasper] = {}
     out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for shown in SHOWN:
-        file = policy_file(None, shown.hand)
-        if shown.hand not in graspers:
-            graspers[shown.hand] = Grasper(bundles.load(file), attempts=attempts, phases=_PHASES)
-        path = scans / shown.object
-        (at,), errors = find_objects([str(path) if path.exists() else shown.object])
+    for entry in SHOWN:
+        file = policy_file(None, entry.hand)
+        if entry.hand not in graspers:
+            graspers[entry.hand] = Grasper(bundles.load(file), attempts=attempts, phases=_PHASES)
+        path = scans / entry.object
+        (at,), errors = find_objects([str(path) if path.exists() else entry.object])
         if errors:
             raise CongraspError(errors[0].error)
         settings = Settings(
-            out=work / shown.name,
+            out=work / entry.name,
             options=ImportOptions("guess"),
-            constraints={name: _given(value, work) for name, value in shown.options.items()},
+            constraints={name: _given(value, work) for name, value in entry.options.items()},
             film=None,
             view=None,
             pictures=False,
             again=False,
-            rest=shown.rest,
+            rest=entry.rest,
         )
-        result = grasp_object(at, graspers[shown.hand], settings, ignore_progress)
-        yield result._replace(name=shown.name)
+        result = grasp_object(at, graspers[entry.hand], settings, ignore_progress)
+        yield result._replace(name=entry.name)
         if result.error:
             continue
         episode = pick_episode(settings.out / at.name / RECORDING, -1, success=False)
-        portrait = out / f"{shown.name}.jpg"
+        portrait = out / f"{entry.name}.jpg"
         save_portrait(portrait, episode)
-        origin = provenance.current(command_of(shown), (shown.hand,), rendered=True)
+        origin = provenance.current(command_of(entry), (entry.hand,), rendered=True)
         provenance.write(portrait, origin)
-        if shown.film:
-            film = out / f"{shown.name}.gif"
+        if entry.film:
+            film = out / f"{entry.name}.gif"
             save_film(film, episode)
             provenance.write(film, origin)
         claim = (
             f"{result.facts['attempts_held']} of {result.facts['attempts']}, "
             f"resting pose {result.facts['rest']}"
         )
-        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{command_of(shown)}`<br>{claim} |\n")
+        rows.append(f"| ![{entry.name}]({entry.name}.jpg) | `{command_of(entry)}`<br>{claim} |\n")
     (out / "index.md").write_text(_HEAD.format(policies=_policies()) + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
@@ -185,7 +186,7 @@ def _results(
 
 def _policies() -> str:
     """Hands and hashes of the policies that ship, for the page."""
-    hands = dict.fromkeys(shown.hand for shown in SHOWN)
+    hands = dict.fromkeys(entry.hand for entry in SHOWN)
     hashes = {hand: bundles.load(policy_file(None, hand)).actor_sha256 for hand in hands}
     return ", ".join(f"`{hand}` {digest[:_DIGITS]}" for hand, digest in hashes.items())
 
@@ -195,11 +196,11 @@ def _given(value: Any, work: pathlib.Path) -> Any:
     return value.format(out=work) if isinstance(value, str) else value
 
 
-def command_of(shown: Shown) -> str:
+def command_of(entry: Shown) -> str:
     """The command that makes the grasp."""
-    is_scan = ":" not in shown.object and "/" not in shown.object
-    words = ["congrasp grasp", f"object_sim/{shown.object}" if is_scan else shown.object]
-    options = {"hand": shown.hand, "rest": shown.rest, **shown.options}
+    is_scan = ":" not in entry.object and "/" not in entry.object
+    words = ["congrasp grasp", f"object_sim/{entry.object}" if is_scan else entry.object]
+    options = {"hand": entry.hand, "rest": entry.rest, **entry.options}
     for name, value in options.items():
         if not value or (name, value) == ("hand", "human"):
             continue

@@ -53,11 +53,12 @@ def measures(
     steps = task.approach_steps + two_seconds(task)
     began = time.perf_counter()
     field = jax.block_until_ready(distance_field(objects))
-    seconds, size = time.perf_counter() - began, field.values.nbytes / 1e6
+    seconds = time.perf_counter() - began
+    size = field.values.nbytes / 1e6
     console.print(f"Grids of {len(objects)} objects: {seconds:.1f} s, {size:.0f} MB")
 
     def worker(probe: Probe) -> RolloutWorker:
-        made = RolloutWorker(
+        rollout_worker = RolloutWorker(
             hand,
             task,
             make_physics(physics, hand, task, objects, threads=threads),
@@ -68,8 +69,8 @@ def measures(
             half_precision=False,
             probe=probe,
         )
-        made.adjust(probe_data=field)
-        return made
+        rollout_worker.adjust(probe_data=field)
+        return rollout_worker
 
     def run(worker: RolloutWorker) -> None:
         worker.restart()
@@ -81,9 +82,10 @@ def measures(
     workers = [worker(lambda scene, index, data: None), worker(plausibility.sample)]
     for one in workers:
         run(one)
-    timed = np.array(
-        [[_timed(functools.partial(run, one)) for one in workers] for _ in range(repeats)]
-    )
+    rounds = []
+    for _ in range(repeats):
+        rounds.append([_timed(functools.partial(run, one)) for one in workers])
+    timed = np.array(rounds)
     table = Table(
         title=f"{physics}: {environments} episodes of {steps} control steps, medians of {repeats}"
     )
@@ -101,6 +103,7 @@ def measures(
 
 def _timed(run: Callable[[], object]) -> tuple[float, float]:
     """Seconds of a call by the clock, and of the processor in all threads."""
-    began, busy = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
+    busy = time.process_time()
     run()
     return time.perf_counter() - began, time.process_time() - busy

@@ -3,6 +3,7 @@ in shape.
 """
 
 import dataclasses
+import itertools
 import pathlib
 import time
 
@@ -69,15 +70,21 @@ def pieces(
       python -m tests.benchmarks pieces --objects my-objects
       python -m tests.benchmarks pieces --objects my-objects --counts 8 32 --vertices 32
     """
-    found, task = objects_of(objects), TaskConfig(hand=hand)
-    budgets = [(p, v) for p in counts for v in vertices]
-    variants = [[coarser(obj, p, v) for obj in found] for p, v in budgets]
-    held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
-    seconds = np.array(
-        [[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)]
-    )
-    per_step = np.median(seconds, axis=0).sum(-1) / (len(found) * _STEPS * task.substeps)
-    table = Table(title=f"{len(found)} objects, {hand} hand, {repeats} repeats")
+    loaded = objects_of(objects)
+    task = TaskConfig(hand=hand)
+    budgets = list(itertools.product(counts, vertices))
+    variants = []
+    scenes = []
+    for count, limit in budgets:
+        objects_of_budget = [coarser(obj, count, limit) for obj in loaded]
+        variants.append(objects_of_budget)
+        scenes.append([_closed_around(get_hand(hand), task, obj) for obj in objects_of_budget])
+    rounds = []
+    for _ in range(repeats):
+        rounds.append([_timed(*scene, task) for scene in itertools.chain(*scenes)])
+    seconds = np.array(rounds).reshape(repeats, len(budgets), len(loaded))
+    per_step = np.median(seconds, axis=0).sum(-1) / (len(loaded) * _STEPS * task.substeps)
+    table = Table(title=f"{len(loaded)} objects, {hand} hand, {repeats} repeats")
     for column in (
         "pieces",
         "vertices",
@@ -90,7 +97,7 @@ def pieces(
         table.add_column(column, justify="right")
     for i, (p, v) in enumerate(budgets):
         used = np.mean([len(obj.pieces) for obj in variants[i]])
-        contacts = np.mean([data.ncon for _, data in held[i]])
+        contacts = np.mean([data.ncon for _, data in scenes[i]])
         error = np.mean([_error(obj) for obj in variants[i]])
         cost = [f"{1 / per_step[i]:,.0f}", f"{per_step[0] / per_step[i]:.2f}"]
         table.add_row(
@@ -109,7 +116,8 @@ def _closed_around(
     palm and tips.
     """
     model = compile_scene(hand, task, obj)
-    where, data = addresses(model, hand), mujoco.MjData(model)
+    where = addresses(model, hand)
+    data = mujoco.MjData(model)
     model.body_pos[where.base_body] = 0.0
     data.qpos[where.finger_qpos] = hand.q_open
     data.mocap_pos[where.table_mocap] = TABLE_AWAY
@@ -120,7 +128,8 @@ def _closed_around(
     data.mocap_pos[where.anchor_mocap] = middle
     data.mocap_quat[where.anchor_mocap] = (1.0, 0.0, 0.0, 0.0)
     data.eq_active[where.weld] = 1
-    data.ctrl[:6], data.ctrl[6:] = 0.0, motor_positions(hand, hand.q_closed)
+    data.ctrl[:6] = 0.0
+    data.ctrl[6:] = motor_positions(hand, hand.q_closed)
     mujoco.mj_step(model, data, _CLOSING * task.substeps)
     return model, data
 

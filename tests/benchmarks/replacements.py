@@ -55,10 +55,10 @@ def _replacement(cluster: Cluster) -> float:
     """
     with cuttable(cluster.endpoint) as link:
         first_owner = _start(cluster, set(), link.endpoint)
-        known = {first_owner, *_rollouts(cluster.wait(bool))}
+        owners = {first_owner, *_rollouts(cluster.wait(bool))}
         link.cut()
         began = time.monotonic()
-        _start(cluster, known, cluster.endpoint)
+        _start(cluster, owners, cluster.endpoint)
         duration = time.monotonic() - began
     for process in cluster.processes[-2:]:
         process.kill()
@@ -67,7 +67,7 @@ def _replacement(cluster: Cluster) -> float:
     return duration
 
 
-def _start(cluster: Cluster, known: set[tuple[str, str]], endpoint: str) -> tuple[str, str]:
+def _start(cluster: Cluster, owners: set[tuple[str, str]], endpoint: str) -> tuple[str, str]:
     """Starts an actor; returns its name and incarnation once a rollout of it is accepted.
 
     Args:
@@ -81,7 +81,7 @@ def _start(cluster: Cluster, known: set[tuple[str, str]], endpoint: str) -> tupl
         return [
             owner
             for owner, accepted in _rollouts(status).items()
-            if accepted and owner not in known
+            if accepted and owner not in owners
         ]
 
     return contributors(cluster.wait(contributors))[0]

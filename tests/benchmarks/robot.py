@@ -36,8 +36,11 @@ from congrasp.common.transport.ports import free_port
 from tests.bare_zenoh import bare_session
 from tests.examples import EXAMPLES, example
 
-JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
-CLOUD, FIELD, FLOAT32 = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointField", 7
+JOINTS = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/PoseStamped"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+FIELD = "sensor_msgs/msg/PointField"
+FLOAT32 = 7
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SEED = 1_000_000
 """Of the object."""
@@ -63,7 +66,8 @@ class DepthCamera:
         self._parameters = self._sensor.draw(config, task.control_dt, jax.random.key(episode), 1)
         self._surface = Surface(surface[None].astype(np.float32), np.zeros((1, len(surface)), bool))
         start = robot.request
-        goal, pose = goal_of(get_hand(task.hand), task, start), np.concatenate(start.object_pose)
+        goal = goal_of(get_hand(task.hand), task, start)
+        pose = np.concatenate(start.object_pose)
         goal, pose = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], (goal, pose))
         begin = EpisodeStart(
             hand=get_hand(task.hand), task=self._task, pose=pose, surface=self._surface, goal=goal
@@ -79,9 +83,9 @@ class DepthCamera:
         that arrives, m.
         """
         self._steps += 1
-        known = {name: state[name] for name in SceneState._fields if name in state} | self._base
-        time, known = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), known))
-        self._camera = _look(self._task, self._parameters, self._camera, time, known, self._surface)
+        scene = {name: state[name] for name in SceneState._fields if name in state} | self._base
+        time, scene = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), scene))
+        self._camera = _look(self._task, self._parameters, self._camera, time, scene, self._surface)
         before, self._shown = self._shown, np.asarray(self._camera.cloud.points[0])
         return None if np.array_equal(before, self._shown) else self._shown
 
@@ -92,7 +96,7 @@ def _look(
     parameters: SensorParameters,
     camera: Any,
     time: Any,
-    known: dict[str, Any],
+    scene: dict[str, Any],
     surface: Surface,
 ) -> Any:
     unknown: dict[str, Any] = dict.fromkeys(SceneState._fields)
@@ -100,8 +104,8 @@ def _look(
         hand=get_hand(task.hand),
         task=task,
         time=time,
-        state=SceneState(**{**unknown, **known}),
-        object_position=known["object_position"],
+        state=SceneState(**{**unknown, **scene}),
+        object_position=scene["object_position"],
         lift=None,
         surface=surface,
     )
@@ -128,12 +132,18 @@ class Rig:
           robot: a `MujocoRobot` with the object of `SEED`.
           task: its task.
         """
-        self.robot, self._folder, self._task, hand = robot, folder, task, get_hand(task.hand)
+        self.robot = robot
+        self._folder = folder
+        self._task = task
+        hand = get_hand(task.hand)
         (obj,) = scale_objects(hand, task, [procedural.generate(SEED)])
         self._object = folder / f"object{store.SUFFIX}"
         store.save(obj, self._object)
-        self._origin, self._names = np.asarray(obj.origin), [joint.name for joint in hand.joints]
-        self._surface, self._camera, self._episodes = obj.points[: task.surface_points], None, 0
+        self._origin = np.asarray(obj.origin)
+        self._names = [joint.name for joint in hand.joints]
+        self._surface = obj.points[: task.surface_points]
+        self._camera = None
+        self._episodes = 0
         position, quaternion = self.robot.request.wrist
         self._base = np.asarray(position), Rotation.from_quat(quaternion, scalar_first=True)
         self._endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -143,12 +153,12 @@ class Rig:
             topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics
         }
         self._node: subprocess.Popen[bytes] | None = None
-        self._ticker, self.commands, self._highest = congrasp.Ticker(100.0), 0, -np.inf
+        self._ticker = congrasp.Ticker(100.0)
+        self.commands = 0
+        self._highest = -np.inf
         # Ns, of the episode's begin
-        self._target, self._begun = (
-            (np.array(self.robot.request.q), np.zeros(6)),
-            0,
-        )
+        self._target = (np.array(self.robot.request.q), np.zeros(6))
+        self._begun = 0
 
     @property
     def lines(self) -> list[str]:
@@ -158,9 +168,11 @@ class Rig:
         """Puts hand and object to where an episode begins, and starts the node."""
         self.end()
         self.robot.reset()
-        self._target, self._highest = (np.array(self.robot.request.q), np.zeros(6)), -np.inf
+        self._target = (np.array(self.robot.request.q), np.zeros(6))
+        self._highest = -np.inf
         self._begun = time.time_ns()
-        heading, thing = self.robot.request.constraints["heading"]["direction"], [str(self._object)]
+        heading = self.robot.request.constraints["heading"]["direction"]
+        thing = [str(self._object)]
         if self._task.observation == "camera":
             self._camera = DepthCamera(self.robot, self._task, self._surface, self._episodes)
             self._episodes += 1
@@ -231,13 +243,15 @@ class Rig:
             )
         elif (points := self._camera.look(state)) is not None:
             self._send_points(points, self._camera.delay)
-        joints, wrist = self._newest("joint_command", JOINTS), self._newest("wrist_command", POSE)
+        joints = self._newest("joint_command", JOINTS)
+        wrist = self._newest("wrist_command", POSE)
         q_target, u_target = self._target
         if joints is not None:
             self.commands += 1
             q_target = np.array(joints.position)
         if wrist is not None:
-            place, around = wrist.pose.position, wrist.pose.orientation
+            place = wrist.pose.position
+            around = wrist.pose.orientation
             back = self._base[1].inv()
             turn = back * Rotation.from_quat([around.x, around.y, around.z, around.w])
             moved = back.apply(np.array([place.x, place.y, place.z]) - self._base[0])
@@ -260,7 +274,8 @@ class Rig:
         return message
 
     def _header(self, age: float = 0.0) -> Any:
-        types, stamp = STORE.types, time.time_ns() - round(1e9 * age)
+        types = STORE.types
+        stamp = time.time_ns() - round(1e9 * age)
         now = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
         return types["std_msgs/msg/Header"](stamp=now, frame_id="world")
 
@@ -270,7 +285,8 @@ class Rig:
         self._session.put("joint_states", bytes(STORE.serialize_cdr(message, JOINTS)))
 
     def _send_pose(self, topic: str, position: np.ndarray, rotation: Rotation) -> None:
-        types, (x, y, z, w) = STORE.types, rotation.as_quat().tolist()
+        types = STORE.types
+        x, y, z, w = rotation.as_quat().tolist()
         place = types["geometry_msgs/msg/Point"](*np.asarray(position, float).tolist())
         pose = types["geometry_msgs/msg/Pose"](
             place, types["geometry_msgs/msg/Quaternion"](x, y, z, w)
@@ -281,7 +297,8 @@ class Rig:
 
     def _send_points(self, points: np.ndarray, age: float) -> None:
         fields = [STORE.types[FIELD](name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
-        data, size = points.astype("<f4").view(np.uint8).ravel(), len(points)
+        data = points.astype("<f4").view(np.uint8).ravel()
+        size = len(points)
         message = STORE.types[CLOUD](
             self._header(age), 1, size, fields, False, 12, 12 * size, data, True
         )
@@ -311,14 +328,16 @@ def robot(
       python -m tests.benchmarks robot --seconds 60 --kill-every 20
     """
     out.mkdir(parents=True, exist_ok=True)
-    loop, policy = example("robot_loop"), named_policy(student)
+    loop = example("robot_loop")
+    policy = named_policy(student)
     task = bundles.load(policy).task
     hand = get_hand(task.hand)
     simulated = loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
     with contextlib.closing(Rig(out, simulated, task)) as rig:
         server = loop.Server(policy)
         counts = {"episodes": 0, "lifted": 0, "kills": 0, "dropped after a kill": 0, "dropped": 0}
-        end, kill = time.monotonic() + seconds, time.monotonic() + kill_every
+        end = time.monotonic() + seconds
+        kill = time.monotonic() + kill_every
         try:
             while time.monotonic() < end:
                 with congrasp.PolicyClient(server.url, hand=task.hand, wait=180.0) as client:

@@ -15,7 +15,8 @@ from tests.browser import SIZE, chromium, drag, on_object, picture
 _PHONE = {"width": 390, "height": 844}
 _HELD = 6
 """Most grasps until one is held."""
-_SCRUB, _SCRUB_RUN = 0.32, 0.8
+_SCRUB = 0.32
+_SCRUB_RUN = 0.8
 """Shares of a motion, and of an episode of a training, at which they are shown."""
 
 
@@ -61,7 +62,7 @@ def _served(*arguments: str) -> Iterator[str]:
         assert server.stdout
         try:
             yield next(
-                found[0] for line in server.stdout if (found := re.search(r"http://\S+", line))
+                address[0] for line in server.stdout if (address := re.search(r"http://\S+", line))
             )
         finally:
             server.terminate()
@@ -113,15 +114,15 @@ def _grasped(page: Any) -> str:
         page.wait_for_function(
             "(n) => document.querySelectorAll('[data-motion]').length > n", arg=len(before)
         )
-        (made,) = {
+        (motion,) = {
             item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()
         } - before
-        page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
+        page.wait_for_selector(f"[data-motion='{motion}'][data-shown]")
         if "not held" not in page.inner_text("#result") and "held" in page.inner_text("#result"):
             break
         page.click("#edit")
     _stopped(page, _SCRUB)
-    return str(made)
+    return str(motion)
 
 
 def _stopped(page: Any, share: float) -> None:

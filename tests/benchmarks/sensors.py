@@ -79,7 +79,8 @@ def _held(
     policy.reset(robot.request)
     targets = {"q_target": np.asarray(robot.request.q), "u_target": np.zeros(6)}
     waiting = collections.deque([targets] * condition.late)
-    approach, height = task.approach_steps * 3 // 2, np.inf
+    approach = task.approach_steps * 3 // 2
+    height = np.inf
     for step in range(approach + hold):
         if step == approach:
             height = robot.height

@@ -14,7 +14,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.grasp.files import MOTION
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
-SHARE, SPEED = (0.3, 0.4), (0.5, 1.2)
+SHARE = (0.3, 0.4)
+SPEED = (0.5, 1.2)
 """Share of the movement's time at which human reaches of some 40 cm are fastest, and m/s."""
 _STILL = 0.05  # m/s below which the wrist has arrived
 _PROMINENT = 0.05  # m/s by which the speed falls on both sides of a peak
@@ -53,7 +54,8 @@ class Profile(NamedTuple):
 
 def profile(motion: Episode) -> Profile:
     """The profile of a motion, which has a reach."""
-    phases, dt = motion.about["phases"], motion.control_dt
+    phases = motion.about["phases"]
+    dt = motion.control_dt
     if "approach" not in phases:
         raise CongraspError(f"The grasp of '{motion.object}' has no reach.", "Set --approach.")
     end = round(phases.get("lift", phases["hold"]) / dt)
@@ -88,21 +90,21 @@ def speeds(
         raise CongraspError(
             f"There is no {MOTION} in the folders of {grasps}.", "Run the gallery first."
         )
-    found = {file.parent.parent.name: profile(load_motion(file)) for file in files}
-    rows = -(-len(found) // _COLUMNS)
+    profiles = {file.parent.parent.name: profile(load_motion(file)) for file in files}
+    rows = -(-len(profiles) // _COLUMNS)
     figure = new_figure(
         12,
         2.3 * rows + 0.6,
         "Wrist speed from the start of the reach to the lift; human reaches green",
     )
-    for i, (name, one) in enumerate(found.items(), 1):
+    for i, (name, one) in enumerate(profiles.items(), 1):
         _draw(figure.add_subplot(rows, _COLUMNS, i), name, one)
     save(figure, out.with_suffix(""), [out.suffix[1:]])
     print(
         "| grasp | way | peak | at | peaks | after the handover | arrival "
         "|\n|---|---|---|---|---|---|---|"
     )
-    for name, one in found.items():
+    for name, one in profiles.items():
         print(
             f"| {name} | {one.way:.2f} m | {one.peak:.2f} m/s | {100 * one.at:.0f} % | {one.peaks} "
             f"| "

@@ -58,16 +58,21 @@ def test_search_ignores_scores_not_finite():
 def test_counts_by_object():
     counts = {one.name: one for one in by_object(EPISODES, LOST)}
     assert list(counts) == ["plate", "mug", "book"]
-    assert counts["plate"][1:] == (3, 3, 1, 1) and counts["plate"].unreached == 1
-    assert counts["mug"][1:] == (2, 1, 0, 0) and counts["mug"].unreached == 1
-    assert counts["book"][1:] == (1, 0, 0, 0) and counts["book"].ceiling == 1
+    assert counts["plate"][1:] == (3, 3, 1, 1)
+    assert counts["plate"].unreached == 1
+    assert counts["mug"][1:] == (2, 1, 0, 0)
+    assert counts["mug"].unreached == 1
+    assert counts["book"][1:] == (1, 0, 0, 0)
+    assert counts["book"].ceiling == 1
 
 
 def test_counts_by_row_and_ceiling():
     heading, pose = by_row(EPISODES, LOST)
-    assert heading[:5] == ("heading", 3, 2, 1, 0) and pose[:5] == ("pose", 3, 2, 0, 1)
+    assert heading[:5] == ("heading", 3, 2, 1, 0)
+    assert pose[:5] == ("pose", 3, 2, 0, 1)
     total = counts_of("all", len(EPISODES), LOST)
-    assert total.held == pytest.approx(2 / 6) and total.ceiling == pytest.approx(4 / 6)
+    assert total.held == pytest.approx(2 / 6)
+    assert total.ceiling == pytest.approx(4 / 6)
     (row,) = table("", [total]).rows
     assert row == ["all", "6", "4", "1", "1", "2", "33.3 %", "66.7 %"]
 

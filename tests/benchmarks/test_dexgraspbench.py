@@ -3,6 +3,7 @@ are examined.
 """
 
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -81,8 +82,7 @@ PHALANX = [
 ]
 BOXES = {
     f"{name}j{i}": (size, (0, 0, size[2]))
-    for name in ("ff", "mf", "rf")
-    for i, size in enumerate(PHALANX)
+    for name, (i, size) in itertools.product(("ff", "mf", "rf"), enumerate(PHALANX))
 } | {
     "thj0": ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
     "thj1": ((0.0098, 0.01375, 0.00885), (0, 0, 0.00885)),
@@ -193,13 +193,13 @@ def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_pat
     # Another order would be seen
     assert np.linalg.norm(ours - np.roll(theirs, 1, 0), axis=-1).min() > 1e-2
     # The object's file frame: a point of the file is where the motion has it.
-    turn, place = (
-        Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True),
-        arrays["obj_pose"][:3],
-    )
+    turn = Rotation.from_quat(arrays["obj_pose"][3:], scalar_first=True)
+    place = arrays["obj_pose"][:3]
     point = np.array([0.1, -0.2, 0.3])
-    own = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
-    expected = own.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
+    object_rotation = Rotation.from_quat(motion.object_quaternion[-1], scalar_first=True)
+    expected = (
+        object_rotation.apply(0.5 * point - motion.object_file_origin) + motion.object_position[-1]
+    )
     np.testing.assert_allclose(
         turn.apply(float(arrays["obj_scale"]) * point) + place, expected, atol=1e-6
     )
@@ -210,15 +210,16 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
     for link, theirs in match.solids(
         HAND.joint_links
     ).items():  # the hand that grasps has them, too
-        for mine, solid in zip(HAND.links[link].solids, theirs, strict=True):
-            assert (mine.kind, mine.size) == (solid.kind, pytest.approx(solid.size))
-            np.testing.assert_allclose(mine.position, solid.position, atol=2e-6)
+        for our_solid, solid in zip(HAND.links[link].solids, theirs, strict=True):
+            assert our_solid.kind == solid.kind
+            assert our_solid.size == pytest.approx(solid.size)
+            np.testing.assert_allclose(our_solid.position, solid.position, atol=2e-6)
             turns = [
                 Rotation.from_quat(x.quaternion, scalar_first=True).as_matrix()
-                for x in (mine, solid)
+                for x in (our_solid, solid)
             ]
             np.testing.assert_allclose(
-                *(turn @ np.diag(mine.size) ** 2 @ turn.T for turn in turns), atol=1e-8
+                *(turn @ np.diag(our_solid.size) ** 2 @ turn.T for turn in turns), atol=1e-8
             )
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -250,43 +251,49 @@ def test_in_the_exam_allegro_has_the_boxes_of_menageries_model(motion):
         return rows[np.lexsort(np.round(rows[:, :3], 5).T)]
 
     palm = [ours.geom("palm_0").id]
-    found, expected = outlines(ours, here, palm), outlines(theirs, there, [])
-    assert len(found) == len(expected) == 20
-    np.testing.assert_allclose(found, expected, atol=2e-6)
+    our_outlines = outlines(ours, here, palm)
+    expected = outlines(theirs, there, [])
+    assert len(our_outlines) == len(expected) == 20
+    np.testing.assert_allclose(our_outlines, expected, atol=2e-6)
     np.testing.assert_allclose(ours.geom_size[palm[0]], (0.0204, 0.0565, 0.0475))
     np.testing.assert_allclose(here.geom_xpos[palm[0]], (-0.0093, 0, 0.095 - 0.0475), atol=1e-6)
 
 
-def test_a_shadow_hand_is_told_by_its_kinematics_whatever_its_joints_are_called(motion):
+def test_a_shadow_hand_is_recognised_by_its_kinematics(motion):
     """A file that has its palm elsewhere, fingers in another order under other names, and joints
     that turn back.
     """
-    turned = [
-        [(f"x{n}", p, q, tuple(-x for x in axis)) for n, p, q, axis in finger]
-        for finger in SHADOW[::-1]
-    ]
-    own = mujoco.MjModel.from_xml_string(
+    turned = []
+    for finger in SHADOW[::-1]:
+        joints = []
+        for name, position, quaternion, axis in finger:
+            opposite = tuple(-x for x in axis)
+            joints.append((f"x{name}", position, quaternion, opposite))
+        turned.append(joints)
+    renamed = mujoco.MjModel.from_xml_string(
         benchmark_model(turned, "pos='0.01 0.02 0.03' quat='1 1 0 0'", root=False)
     )
-    data = mujoco.MjData(own)
-    mujoco.mj_kinematics(own, data)
+    data = mujoco.MjData(renamed)
+    mujoco.mj_kinematics(renamed, data)
     motion = dataclasses.replace(
         motion,
-        joint_names=np.array([own.joint(j).name for j in range(own.njnt)]),
+        joint_names=np.array([renamed.joint(j).name for j in range(renamed.njnt)]),
         joint_anchor=data.xanchor.copy(),
         joint_axis=data.xaxis.copy(),
-        joint_link=own.jnt_bodyid - 2,  # the world and the root are no links
-        link_parent=np.maximum(own.body_parentid[2:] - 2, -1),
+        joint_link=renamed.jnt_bodyid - 2,  # the world and the root are no links
+        link_parent=np.maximum(renamed.body_parentid[2:] - 2, -1),
     )
     match = match_hand(motion)
-    assert match.name == "shadow" and (match.sign == -1).all()
+    assert match.name == "shadow"
+    assert (match.sign == -1).all()
     rng = np.random.default_rng(0)
-    data.qpos[:] = q = rng.uniform(*own.jnt_range.T)
-    mujoco.mj_kinematics(own, data)
+    data.qpos[:] = q = rng.uniform(*renamed.jnt_range.T)
+    mujoco.mj_kinematics(renamed, data)
     model = mujoco.MjModel.from_xml_string(benchmark_model(SHADOW, "pos='0 0 0.034'"))
     theirs = mujoco.MjData(model)
     assert tuple(model.joint(i).name for i in range(1, model.njnt)) == match.hand.joints
-    place, turn = rng.normal(size=3), Rotation.random(rng=rng)
+    place = rng.normal(size=3)
+    turn = Rotation.random(rng=rng)
     theirs.qpos[:] = match.qpos(place, turn, q)
     mujoco.mj_kinematics(model, theirs)
     tip = np.array([0.0, 0.0, 0.025])
@@ -308,7 +315,8 @@ def test_hands_that_the_benchmark_lacks_are_refused_with_their_distance(motion):
 def test_squeezing_applies_the_policys_torque_within_the_motors_limit(motion):
     """Allegro's servos have 3 N.m/rad and 0.7 N.m, the benchmark's 5 N.m/rad."""
     ahead = np.zeros((T, 16))
-    ahead[:, 0], ahead[:, 1] = 0.1, -1.0  # 0.3 N.m, and 3 N.m of which the motor has 0.7
+    ahead[:, 0] = 0.1  # 0.3 N.m
+    ahead[:, 1] = -1.0  # 3 N.m, of which the motor has 0.7
     motion = dataclasses.replace(
         motion,
         joint_position=np.tile(motion.joint_position[-1], (T, 1)),
@@ -400,7 +408,9 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
     )
     lost = held._replace(name="lost", states=dict.fromkeys(STATES, afar))
     first, second = replayed([held, lost])
-    assert first.from_grasp and 0.0 < first.depth_mm < 3.0 and 0.0 < first.pushed_mm < 3.0
+    assert first.from_grasp
+    assert 0.0 < first.depth_mm < 3.0
+    assert 0.0 < first.pushed_mm < 3.0
     assert not (second.from_grasp or second.from_pregrasp)
     assert second.depth_mm == second.pushed_mm == 0.0
 
@@ -414,8 +424,9 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         )
     out = tmp_path / "bench"
     assert dexgraspbench((tmp_path / "grasps",), out) == 0
-    said = capsys.readouterr().out
-    assert "lost/grasp.npz: The object is not held." in said and "1 grasps" in said
+    printed = capsys.readouterr().out
+    assert "lost/grasp.npz: The object is not held." in printed
+    assert "1 grasps" in printed
     script = [
         sys.executable,
         str(ROOT / "examples" / "dexgraspbench.py"),
@@ -431,9 +442,8 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         "squeeze_qpos": (23,),
         "obj_pose": (7,),
     }
-    assert data["obj_scale"] == 0.5 and data["joint_names"] == list(
-        BENCHMARK_HANDS["allegro"].joints
-    )
+    assert data["obj_scale"] == 0.5
+    assert data["joint_names"] == list(BENCHMARK_HANDS["allegro"].joints)
     # Mass by the benchmark's formula, and the pieces where it looks for them, in the file's unit.
     info = json.loads((out / "object/ball/info/simplified.json").read_text())
     coefficient = info["mass"] / (info["density"] * info["scale"] ** 3)
@@ -458,7 +468,8 @@ def test_every_motion_has_a_name_of_its_own(motion, tmp_path):
     for above in ("1/a", "2/a", "3/a-2"):
         save_motions(tmp_path / above[0], **{above[2:]: motion})
     grasps, left_out = read_grasps([tmp_path / x for x in "123"])
-    assert [grasp.name for grasp in grasps] == ["a", "a-2", "a-2-2"] and not left_out
+    assert [grasp.name for grasp in grasps] == ["a", "a-2", "a-2-2"]
+    assert not left_out
 
 
 def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
@@ -475,6 +486,7 @@ def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
     assert [grasp.name for grasp in grasps] == ["good"]
     reasons = {"flat": "has no volume", "moved": "no hand like", "torn": "motion"}
     for (name, word), line in zip(reasons.items(), left_out, strict=True):
-        assert f"{name}/grasp.npz" in line and word in line
+        assert f"{name}/grasp.npz" in line
+        assert word in line
     with pytest.raises(CongraspError, match=r"None of the motions can be exported.*has no volume"):
         read_grasps([tmp_path / "in" / "flat"])

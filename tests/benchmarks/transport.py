@@ -98,7 +98,9 @@ def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:
         _through_queries,
         _through_sockets,
     )
-    rates = [[way(senders, seconds) for way in ways] for _ in range(repeats)]
+    rates = []
+    for _ in range(repeats):
+        rates.append([way(senders, seconds) for way in ways])
     return [statistics.median(each) for each in zip(*rates, strict=True)]
 
 
@@ -153,7 +155,7 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
     endpoint = local_url()
     ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
-        made = learner_hub(
+        bench = learner_hub(
             transport,
             _RUN,
             form=_FORM,
@@ -162,8 +164,8 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
             log=WriteAheadLog(folder / FOLDER, 1, write=write_ahead),
             admission=Admission(lambda: ranges),
         )
-        yield made, endpoint
-        made.rollouts.close()
+        yield bench, endpoint
+        bench.rollouts.close()
 
 
 def _rollout() -> Message:
@@ -236,7 +238,8 @@ def _through_sockets(senders: int, seconds: float) -> float:
     import zmq
 
     with zmq.Context() as context, context.socket(zmq.PULL) as socket:
-        socket.rcvhwm, socket.rcvtimeo = 8, 500
+        socket.rcvhwm = 8
+        socket.rcvtimeo = 500
         port = socket.bind_to_random_port("tcp://127.0.0.1")
 
         def receive() -> int:
@@ -252,7 +255,8 @@ def _through_sockets(senders: int, seconds: float) -> float:
 def _rate(receive: Callable[[], int], seconds: float) -> float:
     """MB/s that a function receives, after a while in which it is not counted."""
     _until(lambda: receive() > 0, "Nothing was received.")
-    received, began = 0, time.monotonic() + _WARM_UP
+    received = 0
+    began = time.monotonic() + _WARM_UP
     while (now := time.monotonic()) < began + seconds:
         size = receive()
         received += size if now >= began else 0

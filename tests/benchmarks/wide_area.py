@@ -110,9 +110,13 @@ def _measure(case: Case, seconds: float, max_staleness: int) -> dict[str, Any]:
                 raise CongraspError(f"{case.name}: no rollouts arrive.", "Look at the output.")
             time.sleep(0.1)
         time.sleep(seconds / 2)
-        before, sent_before, began = counters(), link.sent_up, time.monotonic()
+        before = counters()
+        sent_before = link.sent_up
+        began = time.monotonic()
         time.sleep(seconds)
-        after, sent_after, ended = counters(), link.sent_up, time.monotonic()
+        after = counters()
+        sent_after = link.sent_up
+        ended = time.monotonic()
     per_s = (after["accepted"] - before["accepted"]) / (ended - began)
     return {
         "link": case.name,

@@ -2,6 +2,7 @@
 tests.cases.make`.
 """
 
+import itertools
 import json
 import pathlib
 import re
@@ -42,7 +43,8 @@ def scene(positions: np.ndarray, faces: np.ndarray, primitives=(), node=None, **
     """A GLB file of one mesh; positions may be rows of integers with padding, of which three
     columns count.
     """
-    points, corners = np.ascontiguousarray(positions), np.ascontiguousarray(faces, np.uint16)
+    points = np.ascontiguousarray(positions)
+    corners = np.ascontiguousarray(faces, np.uint16)
     kinds = {"f": 5126, "H": 5123, "h": 5122, "B": 5121}
     kind = kinds[points.dtype.char]
     views = [
@@ -109,10 +111,11 @@ def archive(*names: str) -> bytes:
 def ply(header: str, rows: np.ndarray) -> bytes:
     """A PLY file of points."""
     names = "".join(f"property float {name}\n" for name in header.split())
-    return (
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n".encode()
-        + "\n".join(" ".join(f"{x:.3f}" for x in row) for row in rows).encode()
-    )
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
+    lines = []
+    for row in rows:
+        lines.append(" ".join(f"{x:.3f}" for x in row))
+    return (header + "\n".join(lines)).encode()
 
 
 def collada(mesh: trimesh.Trimesh) -> bytes:
@@ -133,17 +136,20 @@ def moved(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
 
 def main() -> None:
     """Writes all of them."""
-    box, float_box = stl(BOX), BOX.vertices.astype(np.float32)
+    box = stl(BOX)
+    float_box = BOX.vertices.astype(np.float32)
     long = trimesh.creation.box((0.12, 0.03, 0.03))
     both = trimesh.util.concatenate([BOX, BOX])
     other = trimesh.util.concatenate([BOX, moved(BOX, 0.04, 0, 0)])
     random = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(1, 0.03)
-    mixed, pierced = ball.copy(), ball.copy()
+    mixed = ball.copy()
+    pierced = ball.copy()
     spoilt, worse = (trimesh.creation.icosphere(2, 0.03) for _ in range(2))
     mixed.faces[::7] = np.asarray(mixed.faces)[::7, ::-1]
     pierced.update_faces(np.arange(len(ball.faces)) > 1)
-    spoilt.vertices[3], worse.vertices[:40] = np.nan, np.nan
+    spoilt.vertices[3] = np.nan
+    worse.vertices[:40] = np.nan
     far = ball.copy().apply_scale(0.5).apply_translation([0.2, 0, 0])
     inverted = BOX.copy()
     inverted.invert()
@@ -195,8 +201,7 @@ def main() -> None:
         "archive_zip/part.stl": archive("models/mug.obj", "licence.txt"),
         **{
             f"{case}/{folder}/mug.stl": box
-            for case in ("sets_of_one_name", "equal_names")
-            for folder in "ab"
+            for case, folder in itertools.product(("sets_of_one_name", "equal_names"), "ab")
         },
         "names/碗.stl": box,
         "names/कटोरी.stl": box,

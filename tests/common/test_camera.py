@@ -4,6 +4,7 @@ the object's pose.
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,8 @@ def cube():
     grid = np.linspace(-0.029, 0.029, 8)
     a, b = (axis.ravel() for axis in np.meshgrid(grid, grid))
     faces = [
-        np.insert(np.stack([a, b], 1), axis, side, 1) for axis in range(3) for side in (-0.03, 0.03)
+        np.insert(np.stack([a, b], 1), axis, side, 1)
+        for axis, side in itertools.product(range(3), (-0.03, 0.03))
     ]
     return jnp.asarray(np.concatenate(faces)[None], jnp.float32)
 
@@ -61,7 +63,8 @@ def test_the_faces_towards_the_camera_are_visible(eye, front):
     assert seen.reshape(6, 64).mean(1)[front].min() > 0.9
     points = np.asarray(cube())[0][seen]
     depth = np.min([0.03 - points[:, face // 2] * (1 if face % 2 else -1) for face in front], 0)
-    assert depth.max() <= 0.018 and (depth > 1e-3 + 1e-6).mean() < 0.25
+    assert depth.max() <= 0.018
+    assert (depth > 1e-3 + 1e-6).mean() < 0.25
 
 
 def test_a_capsule_hides_what_is_behind_it():
@@ -237,7 +240,9 @@ def cloud_block():
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_order_of_the_points_does_not_matter(seed):
-    rng, policy, block = np.random.default_rng(seed), bundle(), cloud_block()
+    rng = np.random.default_rng(seed)
+    policy = bundle()
+    block = cloud_block()
     seen = rng.normal(size=(2, sum(size for _, size in policy.spec.layout))).astype(np.float32)
     seen[:, -1] = 1.0
     other = seen.copy()
@@ -253,7 +258,8 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
     path = tmp_path / "camera.safetensors"
     bundles.save(bundle(), path)
     loaded = bundles.load(path)
-    assert loaded.spec == bundle().spec and loaded.spec.network.points == (8, 16)
+    assert loaded.spec == bundle().spec
+    assert loaded.spec.network.points == (8, 16)
     other = dataclasses.replace(loaded.spec, network=dataclasses.replace(NETWORK, points=(8, 8)))
     assert other.schema != loaded.spec.schema
     for kind in ("onnx", "stablehlo"):
@@ -266,10 +272,8 @@ def test_student_learns_from_its_cloud(tmp_path):
     is the cloud.
     """
     full = dataclasses.replace(TASK, observation="full")
-    teacher, path = (
-        random_bundle(full, NETWORK, 30.0, seed=2, std=0.2),
-        tmp_path / "teacher.safetensors",
-    )
+    teacher = random_bundle(full, NETWORK, 30.0, seed=2, std=0.2)
+    path = tmp_path / "teacher.safetensors"
     bundles.save(teacher, path)
     run = RunConfig(task=TASK, network=NETWORK, algorithm="distill", updates=1000)
     run = dataclasses.replace(
@@ -278,7 +282,9 @@ def test_student_learns_from_its_cloud(tmp_path):
             run.distill, teacher=str(path), minibatches=4, learning_rate=3e-3
         ),
     )
-    student, block = Distillation(policy_spec(TASK, NETWORK), run), cloud_block()
+    spec = policy_spec(TASK, NETWORK)
+    student = Distillation(spec, run)
+    block = cloud_block()
     size = sum(width for _, width in full_layout(TASK))
     assert sum(width for _, width in teacher.spec.layout) == size
 
@@ -287,13 +293,14 @@ def test_student_learns_from_its_cloud(tmp_path):
         middle = rng.normal(size=(4, 32, 3))
         taught = np.zeros((4, 32, size + extra(get_hand(TASK.hand))), np.float32)
         taught[..., :3] = middle
-        seen = np.zeros((4, 32, sum(width for _, width in student._spec.layout)), np.float16)
+        seen = np.zeros((4, 32, sum(width for _, width in spec.layout)), np.float16)
         points = 0.1 * rng.normal(size=(4, 32, POINTS, 4)) + np.append(np.zeros(3), 1.0)
         points[..., :3] += middle[..., None, :]
         seen[..., block] = points.reshape(4, 32, -1)
         return {"observation": seen, "teacher_observation": taught}
 
-    state, losses = student.init(0), []
+    state = student.init(0)
+    losses = []
     first = jax.tree.map(np.asarray, state.params["actor"]["network"])
     for seed in range(60):
         state, metrics = student.update(state, batch(seed))

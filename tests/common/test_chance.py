@@ -22,10 +22,13 @@ def test_numbers_of_a_name_depend_on_no_other_name_and_on_no_wider_one():
     key = jax.random.key(3)
     alone = chance.uniforms(key, {"a": 2}, 5)
     with_others = chance.uniforms(key, {"b": 7, "a": 2, "c": 1}, 5)
-    assert alone["a"].shape == (5, 2) and with_others["b"].shape == (5, 7)
+    assert alone["a"].shape == (5, 2)
+    assert with_others["b"].shape == (5, 7)
     np.testing.assert_array_equal(alone["a"], with_others["a"])
     numbers = np.concatenate([np.ravel(part) for part in with_others.values()])
-    assert len(set(numbers.tolist())) == numbers.size and numbers.min() >= 0 and numbers.max() < 1
+    assert len(set(numbers.tolist())) == numbers.size
+    assert numbers.min() >= 0
+    assert numbers.max() < 1
 
 
 def test_numbers_are_uniform():
@@ -50,8 +53,8 @@ def test_indices_are_equally_likely_and_below_the_count():
 
 def test_weighted_indices_have_their_shares_and_skip_zeros():
     """By hand: weights 0, 1, 0, 3: a quarter and three quarters."""
-    found = np.asarray(chance.weighted(UNIFORM, np.float32([0, 1, 0, 3])))
-    assert np.bincount(found, minlength=4) / MANY == pytest.approx([0, 0.25, 0, 0.75], abs=0.01)
+    indices = np.asarray(chance.weighted(UNIFORM, np.float32([0, 1, 0, 3])))
+    assert np.bincount(indices, minlength=4) / MANY == pytest.approx([0, 0.25, 0, 0.75], abs=0.01)
     assert chance.weighted(np.float32([0.0, LAST]), np.float32([0, 1, 0, 3])).tolist() == [1, 3]
 
 

@@ -42,17 +42,17 @@ def _pose(hand, closures):
 @pytest.mark.parametrize("name", HANDS)
 def test_the_shipped_wide_pose_is_the_one_that_is_found(name):
     hand = get_hand(name)
-    found = hand.posed(widest_pose(hand))
-    np.testing.assert_allclose(wide_angles(hand), found, atol=0.03)
-    assert (wide_angles(hand) >= hand.lower - 1e-6).all() and (
-        wide_angles(hand) <= hand.upper + 1e-6
-    ).all()
+    widest = hand.posed(widest_pose(hand))
+    np.testing.assert_allclose(wide_angles(hand), widest, atol=0.03)
+    assert (wide_angles(hand) >= hand.lower - 1e-6).all()
+    assert (wide_angles(hand) <= hand.upper + 1e-6).all()
 
 
 @pytest.mark.parametrize("name", HANDS)
 def test_gaps_are_those_between_skins_along_the_cross_finger_axis(name):
     hand = get_hand(name)
-    cross, radii = grasp_frame(hand).cross, hand.keypoint_radii[len(hand.links) :]
+    cross = grasp_frame(hand).cross
+    radii = hand.keypoint_radii[len(hand.links) :]
     for closure, gap in zip(CLOSURES, table_of_gaps(hand), strict=True):
         tips = _tips(hand, _pose(hand, [closure]))
         skins = (tips[1:] - tips[0]) @ cross - radii[1:] - radii[0]
@@ -62,7 +62,8 @@ def test_gaps_are_those_between_skins_along_the_cross_finger_axis(name):
 @pytest.mark.parametrize("name", HANDS)
 def test_the_widest_pose_opens_by_a_quarter_and_faces_the_object_as_the_open_one_does(name):
     hand = get_hand(name)
-    gaps, frame = table_of_gaps(hand), grasp_frame(hand)
+    gaps = table_of_gaps(hand)
+    frame = grasp_frame(hand)
     assert (np.diff(gaps) < 0).all()
     assert widest_gap(hand) > 1.25 * gaps[CLOSURES.tolist().index(0.0)]
     assert widest_gap(hand) > 0.9 * WIDEST * hand.object_scale
@@ -79,8 +80,8 @@ def test_closures_meet_the_three_poses_and_mix_between_them():
     np.testing.assert_allclose(half, (wide_angles(hand) + hand.q_open) / 2, atol=1e-6)
     apart = np.linspace(-1, 1, len(hand.joints), dtype=np.float32)
     for joint, closure in enumerate(apart):
-        own = _pose(hand, [closure])[joint]
-        assert _pose(hand, apart)[joint] == pytest.approx(own, abs=1e-6)
+        angles = _pose(hand, [closure])[joint]
+        assert _pose(hand, apart)[joint] == pytest.approx(angles, abs=1e-6)
 
 
 _preshape = jax.jit(functools.partial(preshape, get_hand("human")))
@@ -93,6 +94,7 @@ def test_a_preshaped_hand_is_wider_than_the_object_by_the_margin_or_as_wide_as_i
 ):
     hand = get_hand("human")
     q = np.asarray(_preshape(np.float32([width]), np.float32(margin)))[0]
-    tips, radii = _tips(hand, q), hand.keypoint_radii[len(hand.links) :]
+    tips = _tips(hand, q)
+    radii = hand.keypoint_radii[len(hand.links) :]
     gap = ((tips[1:] - tips[0]) @ grasp_frame(hand).cross - radii[1:] - radii[0]).min()
     assert gap == pytest.approx(min(width + margin, widest_gap(hand)), abs=2e-3)

@@ -61,7 +61,8 @@ def assert_equal(left, right):
     assert left.meta == right.meta
     assert left.arrays.keys() == right.arrays.keys()
     for name, array in left.arrays.items():
-        assert right.arrays[name].dtype == array.dtype and right.arrays[name].shape == array.shape
+        assert right.arrays[name].dtype == array.dtype
+        assert right.arrays[name].shape == array.shape
         assert right.arrays[name].tobytes() == np.ascontiguousarray(array).tobytes()
 
 
@@ -151,7 +152,7 @@ def test_shared_message_is_encoded_once():
         (Message(meta={"a": "x" * MAX_HEADER}), "header has .* bytes"),
     ],
 )
-def test_what_cannot_be_written_is_named(message, match):
+def test_unencodable_values_are_named(message, match):
     with pytest.raises(CongraspError, match=match):
         encode(message)
 
@@ -220,7 +221,8 @@ def signed(rest):
 def test_damage_is_named(data, match):
     with pytest.raises(CongraspError, match=match) as caught:
         decode(data)
-    assert len(str(caught.value)) < 250 and str(caught.value).isascii()
+    assert len(str(caught.value)) < 250
+    assert str(caught.value).isascii()
 
 
 def test_length_is_limited():

@@ -25,10 +25,8 @@ def test_earlier_configurations_keep_their_batch(file):
     written = json.loads(file.read_text())
     earlier = {**written, **written["ppo"]}  # where they were until they belonged to the run
     config = run_config_from_json(file.read_text())
-    assert (config.rollouts_per_update, config.max_staleness) == (
-        earlier["rollouts_per_update"],
-        earlier["max_staleness"],
-    )
+    assert config.rollouts_per_update == earlier["rollouts_per_update"]
+    assert config.max_staleness == earlier["max_staleness"]
 
 
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])

@@ -55,22 +55,23 @@ each_optional = pytest.mark.parametrize(
 
 
 @pytest.fixture(scope="module")
-def whole():
+def full_scene():
     """A scene in which every constraint is active."""
     return scene_of(TASK, *scene(9))
 
 
-def _without(whole, constraint):
+def _without(full_scene, constraint):
     """The scene with this constraint's blocks inactive."""
-    others = (block for other in OPTIONAL if other is not constraint for block in other.blocks)
-    return whole._replace(goal=dataclasses.replace(whole.goal, active=active(*others)))
+    others = itertools.chain(*(other.blocks for other in OPTIONAL if other is not constraint))
+    return full_scene._replace(goal=dataclasses.replace(full_scene.goal, active=active(*others)))
 
 
 @each
-def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
-    described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
+def test_block_sizes_equal_the_sum_of_their_fields(constraint, full_scene):
+    described = fields(HAND, TASK)
+    sizes = dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
-    observed = evaluated(constraint.observe, whole)
+    observed = evaluated(constraint.observe, full_scene)
     assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
     for name, parts in zip(names, observed, strict=True):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
@@ -79,25 +80,25 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
 
 
 def test_names_are_unique_over_all_constraints():
-    arrays = [
-        f"{constraint.name}_{name}" for constraint in CONSTRAINTS for name in constraint.arrays
-    ]
-    errors = [error for constraint in CONSTRAINTS for error in constraint.errors]
+    arrays = []
+    errors = []
+    weights = []
+    block_names = []
+    options = []
+    for constraint in CONSTRAINTS:
+        arrays += [f"{constraint.name}_{name}" for name in constraint.arrays]
+        errors += constraint.errors
+        weights += [weight.name for weight in constraint.weights]
+        block_names += constraint.blocks or (constraint.name,)
+        options += [option.name for option in constraint.options]
     groups = {
         "constraints": NAMES,
         "goal arrays": arrays,
         "errors": [error.name for error in errors],
         "columns": [error.column or error.name for error in errors],
-        "weights": [
-            *(weight.name for constraint in CONSTRAINTS for weight in constraint.weights),
-            *(term.name for term in GRASP),
-        ],
-        "blocks": [
-            "state",
-            *(block for c in CONSTRAINTS for block in c.blocks or (c.name,)),
-            "mask",
-        ],
-        "options": [option.name for constraint in CONSTRAINTS for option in constraint.options],
+        "weights": [*weights, *(term.name for term in GRASP)],
+        "blocks": ["state", *block_names, "mask"],
+        "options": options,
     }
     for group, names in groups.items():
         twice = [name for name, count in Counter(names).items() if count > 1]
@@ -105,31 +106,38 @@ def test_names_are_unique_over_all_constraints():
 
 
 @each
-def test_terms_and_errors_match_declarations(constraint, whole):
-    paid, measured = evaluated(constraint.reward, whole), evaluated(constraint.measure, whole)
+def test_terms_and_errors_match_declarations(constraint, full_scene):
+    paid = evaluated(constraint.reward, full_scene)
+    measured = evaluated(constraint.measure, full_scene)
     assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
     assert sorted(measured) == sorted(error.name for error in constraint.errors)
     for error in constraint.errors:
         # Ratios have no unit
         assert isinstance(measured[error.name], tuple) == (error.unit == ""), error.name
-        assert error.tolerance >= 0 and error.scale > 0 and error.unit in ("rad", "m", "")
+        assert error.tolerance >= 0
+        assert error.scale > 0
+        assert error.unit in ("rad", "m", "")
     for value in jax.tree.leaves((paid, measured)):
-        assert value.shape == (4,) and np.isfinite(value).all()
+        assert value.shape == (4,)
+        assert np.isfinite(value).all()
     for weight in constraint.weights:
         assert getattr(RewardWeights(), weight.name) == weight.default
     assert not constraint.optional or getattr(TASK, f"p_{constraint.name}") == 0.5
 
 
 @each_optional
-def test_inactive_constraint_has_no_effect(constraint, whole):
-    off = _without(whole, constraint)
-    start, mask = 0, dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
-    on_observation, off_observation = evaluated(observe, whole), evaluated(observe, off)
+def test_inactive_constraint_has_no_effect(constraint, full_scene):
+    off = _without(full_scene, constraint)
+    start = 0
+    mask = dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
+    on_observation = evaluated(observe, full_scene)
+    off_observation = evaluated(observe, off)
     for name, size in layout(HAND, TASK):
         block = slice(start, start + size)
         start += size
         if name in constraint.blocks:
-            assert on_observation[:, block].any() and not off_observation[:, block].any(), name
+            assert on_observation[:, block].any(), name
+            assert not off_observation[:, block].any(), name
         elif name == "mask":
             silent = [mask[block] for block in constraint.blocks]
             np.testing.assert_array_equal(
@@ -140,16 +148,22 @@ def test_inactive_constraint_has_no_effect(constraint, whole):
                 on_observation[:, block], off_observation[:, block], err_msg=name
             )
     assert not any(np.any(value) for value in evaluated(constraint.reward, off).values())
-    touching, force = whole.features.touching, whole.features.force
+    touching = full_scene.features.touching
+    force = full_scene.features.force
     for before, after in zip(
         (touching, force), constraint.earning(off, touching, force), strict=True
     ):
         np.testing.assert_array_equal(before, after)
     # Nor does it change what the others are paid, but for contacts that it forbids and what it
     # declares.
-    others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (whole, off))
-    own = {weight.name for weight in constraint.weights}
-    for name in set(terms(TASK)) - own - {"contact", "force"} - CHANGES.get(constraint.name, set()):
+    others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (full_scene, off))
+    terms_of_constraint = {weight.name for weight in constraint.weights}
+    for name in (
+        set(terms(TASK))
+        - terms_of_constraint
+        - {"contact", "force"}
+        - CHANGES.get(constraint.name, set())
+    ):
         np.testing.assert_array_equal(others[name], paid[name], err_msg=name)
 
 
@@ -184,15 +198,18 @@ def test_neutral_arrays_match_declarations(constraint, hand, sizes):
 @each
 def test_names_that_it_gives_are_there(constraint):
     weaker = CONSTRAINTS[: NAMES.index(constraint.name)]
-    assert set(constraint.overrides) <= {
-        name for other in weaker for name in (other.name, *other.blocks)
-    }
+    overridable = set()
+    for other in weaker:
+        overridable |= {other.name, *other.blocks}
+    assert set(constraint.overrides) <= overridable
     assert set(constraint.overridden_by) <= {*NAMES} - {constraint.name}
     assert {relation.weaker for relation in constraint.relations} <= {
         other.name for other in weaker
     }
     assert constraint.guides in ("", constraint.name, *constraint.blocks)
-    assert constraint.title and constraint.options and constraint.name.isidentifier()
+    assert constraint.title
+    assert constraint.options
+    assert constraint.name.isidentifier()
 
 
 def test_constraints_of_the_paper_are_first():
@@ -245,18 +262,20 @@ def test_nothing_depends_on_where_the_scene_is(seed):
 @jax.jit
 def _judged(state, surface, goal, action):
     """Reward terms of a scene; and its observation, errors and targets."""
-    made = traced_scene(HAND, TASK, state, surface, goal)
-    return reward_terms(made, RewardWeights()), (
-        observe(made),
-        metrics.errors(made),
-        decode(made, TASK.control, action),
+    traced = traced_scene(HAND, TASK, state, surface, goal)
+    return reward_terms(traced, RewardWeights()), (
+        observe(traced),
+        metrics.errors(traced),
+        decode(traced, TASK.control, action),
     )
 
 
 def test_task_ignores_unsupported_constraints():
     """A choice of fingers and a limit of the force: f_max stays a number."""
-    task, (state, surface, goal) = TaskConfig(constraints=PAPER), scene(5)
-    flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
+    task = TaskConfig(constraints=PAPER)
+    state, surface, goal = scene(5)
+    known_blocks = itertools.chain(*(get_constraint(name).blocks for name in PAPER))
+    flags = {block: goal.active[block] for block in known_blocks}
     known_alone = Goal({name: goal[name] for name in PAPER}, flags)
     some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
     np.testing.assert_array_equal(
@@ -283,8 +302,12 @@ def test_requests_fill_the_arrays_that_they_give():
     np.testing.assert_array_equal(goal["heading"].direction, np.array([0, 1, 0], np.float32))
     np.testing.assert_array_equal(goal["heading"].position, np.zeros(3))
     np.testing.assert_array_equal(goal["fingers"].allowed, [True, False, True, False, False])
-    assert goal["fingers"].allowed.dtype == bool and goal["heading"].direction.dtype == np.float32
-    assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
+    assert goal["fingers"].allowed.dtype == bool
+    assert goal["heading"].direction.dtype == np.float32
+    names = set()
+    for constraint in CONSTRAINTS:
+        names |= {f"{constraint.name}_{name}" for name in constraint.arrays}
+    assert set(goal.flat()) == names
 
 
 def test_active_blocks():
@@ -293,7 +316,7 @@ def test_active_blocks():
     """
     for flags in itertools.product([False, True], repeat=5):
         affordance, pose, trajectory, fingers, force = flags
-        found = active_blocks(
+        active = active_blocks(
             {c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)}
         )
         expected = {
@@ -304,7 +327,7 @@ def test_active_blocks():
             "fingers": fingers and not pose,
             "force_limit": force,
         }
-        assert {name: flags.tolist() for name, flags in found.items()} == {
+        assert {name: flags.tolist() for name, flags in active.items()} == {
             n: [x, x] for n, x in expected.items()
         }
 
@@ -343,12 +366,13 @@ def _same(
     )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]
-    own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
-    assert (
-        goals[0]
-        and set(goals[1]) - set(goals[0]) <= own
-        and set(actives[1]) - set(actives[0]) == own & {*blocks(TASK)}
-    )
+    excluded = {
+        *get_constraint(but).blocks,
+        *(f"{but}_{name}" for name in get_constraint(but).arrays),
+    }
+    assert goals[0]
+    assert set(goals[1]) - set(goals[0]) <= excluded
+    assert set(actives[1]) - set(actives[0]) == excluded & {*blocks(TASK)}
     for one, other in (goals, actives):
         for name in one:
             check(one[name], other[name], err_msg=name)
@@ -363,7 +387,8 @@ def test_draws_are_independent_of_other_constraints(constraint):
     episodes.
     """
     others = tuple(name for name in NAMES if name != constraint.name)
-    some, all_of_them = _drawn(others), _drawn(NAMES, never=constraint.name)
+    some = _drawn(others)
+    all_of_them = _drawn(NAMES, never=constraint.name)
     assert not any(np.any(all_of_them.goal.active[block]) for block in constraint.blocks)
     _same(some, all_of_them, constraint.name)
 
@@ -373,15 +398,18 @@ def test_fingers_change_no_other_draw():
     without = dataclasses.replace(
         TASK, constraints=tuple(name for name in NAMES if name != "fingers")
     )
-    some, more = suite.episodes(DRAWN, task=without), suite.episodes(DRAWN)
+    some = suite.episodes(DRAWN, task=without)
+    more = suite.episodes(DRAWN)
     _same(
         some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6)
     )
     chosen, pose = (np.asarray(more.goal.active[name]) for name in ("fingers", "pose_finger"))
-    assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15
+    assert not chosen[pose].any()
+    assert abs(chosen[~pose].mean() - 0.5) < 0.15
 
 
 def test_constraint_without_blocks_is_active():
     *_, goal = scene(0)
     always = [constraint for constraint in known(TASK) if not constraint.blocks]
-    assert always and all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)
+    assert always
+    assert all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)

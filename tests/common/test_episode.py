@@ -67,9 +67,11 @@ def test_message_survives_the_type(message: Message) -> None:
 
 def test_message_without_frame_of_the_file_gets_defaults() -> None:
     read = Episode.from_message(episode_message())
-    assert read.object_file_scale == 1.0 and read.object_file_origin.tolist() == [0.0, 0.0, 0.0]
+    assert read.object_file_scale == 1.0
+    assert read.object_file_origin.tolist() == [0.0, 0.0, 0.0]
     meta = read.to_message().meta
-    assert meta["object_file_scale"] == 1.0 and meta["object_file_origin"] == [0.0, 0.0, 0.0]
+    assert meta["object_file_scale"] == 1.0
+    assert meta["object_file_origin"] == [0.0, 0.0, 0.0]
 
 
 def test_fields_are_arrays_of_the_message() -> None:
@@ -77,7 +79,9 @@ def test_fields_are_arrays_of_the_message() -> None:
     read = Episode.from_message(message)
     recorded = read.require_recorded()
     arrays = message.arrays
-    assert read.hand == "human" and read.object == "cylinder-0" and read.version == 3
+    assert read.hand == "human"
+    assert read.object == "cylinder-0"
+    assert read.version == 3
     assert read.about == {"version": 3, "actor": "a0"}
     assert read.constraints == ("heading", "affordance", "trajectory")
     assert read.active == {
@@ -100,8 +104,10 @@ def test_older_recording_is_read() -> None:
     message = episode_message(mask=(1, 0, 1, 0))
     read = Episode.from_message(older(message))
     now = Episode.from_message(message)
-    assert read.active == now.active and read.constraints == now.constraints
-    assert "mask" not in read.goal and not read.require_recorded().errors
+    assert read.active == now.active
+    assert read.constraints == now.constraints
+    assert "mask" not in read.goal
+    assert not read.require_recorded().errors
     for name, values in now.goal.items():
         np.testing.assert_array_equal(read.goal[name], values)
     drawn = [name for name, _ in read.markers()]
@@ -143,22 +149,23 @@ def test_damaged_message_is_a_one_line_error(data: st.DataObject) -> None:
 
 def test_damaged_arm_is_an_error() -> None:
     arm = moved_arm(12)
-    whole = arm.add_to(episode_message())
+    message = arm.add_to(episode_message())
     for changes in (
         {"arm/arm_joint_position": arm.joint_position[:2]},
         {"arm/arm_link_parent": np.array([0, 0], np.int32)},
         {"arm/arm_hand_link": np.array(2, np.int32)},
     ):
         with pytest.raises(CongraspError, match="The episode's arm is not valid"):
-            Episode.from_message(Message({**whole.arrays, **changes}, whole.meta))
-    without_names = {**whole.meta, "arm": {"name": "two"}}
+            Episode.from_message(Message({**message.arrays, **changes}, message.meta))
+    without_names = {**message.meta, "arm": {"name": "two"}}
     with pytest.raises(CongraspError, match="The episode's arm is not valid"):
-        Episode.from_message(Message(whole.arrays, without_names))
+        Episode.from_message(Message(message.arrays, without_names))
 
 
 def test_meshes_of_an_arm_have_their_own_vertices() -> None:
     first, second = moved_arm(2).meshes
-    assert (first.link, second.link) == (0, 1)
+    assert first.link == 0
+    assert second.link == 1
     np.testing.assert_array_equal(first.vertices[first.faces[0]], np.eye(3))
     np.testing.assert_array_equal(second.vertices[second.faces[0]], 2 * np.eye(3))
 
@@ -186,42 +193,44 @@ def test_grasp_span_ends_with_lift_or_table(phases: Any, span: tuple[int, int]) 
 
 
 def test_other_frames_are_those_of_every_array() -> None:
-    whole = dataclasses.replace(episode(6), arm=moved_arm(6))
+    original = dataclasses.replace(episode(6), arm=moved_arm(6))
     frames = np.array([0, 0, 5])
-    other = whole.at_frames(frames)
-    recorded = whole.require_recorded()
-    assert other.steps == 3 and other.control_dt == whole.control_dt
-    np.testing.assert_array_equal(other.time, whole.time[frames])
-    np.testing.assert_array_equal(other.link_force, whole.link_force[frames])
-    np.testing.assert_array_equal(other.object_vertices, whole.object_vertices)
+    other = original.at_frames(frames)
+    recorded = original.require_recorded()
+    assert other.steps == 3
+    assert other.control_dt == original.control_dt
+    np.testing.assert_array_equal(other.time, original.time[frames])
+    np.testing.assert_array_equal(other.link_force, original.link_force[frames])
+    np.testing.assert_array_equal(other.object_vertices, original.object_vertices)
     other_recorded = other.require_recorded()
     np.testing.assert_array_equal(other_recorded.action, recorded.action[frames])
     for name, values in recorded.rewards.items():
         np.testing.assert_array_equal(other_recorded.rewards[name], values[frames])
-    assert whole.arm and other.arm
-    np.testing.assert_array_equal(other.arm.joint_position, whole.arm.joint_position[frames])
+    assert original.arm
+    assert other.arm
+    np.testing.assert_array_equal(other.arm.joint_position, original.arm.joint_position[frames])
 
 
 @given(st.integers(1, 5))
 @settings(deadline=None, max_examples=5)
 def test_parts_of_an_episode_join_to_the_whole(cut: int) -> None:
-    whole = episode(6)
-    steps = np.arange(whole.steps)
-    joined = whole.at_frames(steps[cut:]).preceded_by(whole.at_frames(steps[:cut]))
-    assert_equal_messages(joined.to_message(), whole.to_message())
-    np.testing.assert_array_equal(joined.time, whole.time)
+    original = episode(6)
+    steps = np.arange(original.steps)
+    joined = original.at_frames(steps[cut:]).preceded_by(original.at_frames(steps[:cut]))
+    assert_equal_messages(joined.to_message(), original.to_message())
+    np.testing.assert_array_equal(joined.time, original.time)
 
 
 def test_mirror_image_is_that_of_the_message() -> None:
     """By the names of the message's arrays (`common.mirror.fields`); twice is the episode again."""
-    whole = dataclasses.replace(
+    original = dataclasses.replace(
         episode(4, mask=(1, 1, 1, 1)),
         colours=Colours(np.ones((2, 3), np.float32), np.full((2, 3), 7, np.uint8)),
         object_file_origin=np.array([0.1, 0.2, 0.3]),
     )
     left = get_hand("human:left")
-    image = mirrored_episode(whole, left)
-    message = whole.to_message()
+    image = mirrored_episode(original, left)
+    message = original.to_message()
     meta = {**message.meta, "hand": left.reference, "object_file_origin": [-0.1, 0.2, 0.3]}
     assert_equal_messages(image.to_message(), Message(mirror.fields(message.arrays), meta))
     np.testing.assert_array_equal(image.joint_anchor, hand_arrays(left)["joint_anchor"])
@@ -230,10 +239,10 @@ def test_mirror_image_is_that_of_the_message() -> None:
 
 
 def test_normalised_has_unit_quaternions() -> None:
-    whole = episode()
+    original = episode()
     scales = np.array([1.0, 1.009, 0.991, 1.02])[:, None]
     tilted = np.array([[0.6, 0.8, 0.0, 0.0]]) * scales
-    rounded = dataclasses.replace(whole.at_frames(np.arange(4)), object_quaternion=tilted)
+    rounded = dataclasses.replace(original.at_frames(np.arange(4)), object_quaternion=tilted)
     quaternions = rounded.normalised().object_quaternion
     np.testing.assert_allclose(quaternions[:3], np.tile([0.6, 0.8, 0.0, 0.0], (3, 1)), atol=1e-12)
     np.testing.assert_array_equal(quaternions[3], tilted[3])  # not rounded but wrong

@@ -34,8 +34,14 @@ BOX = procedural.generate(0, "box")
 PINCH = np.array([[True, True, False, False, False]])
 # Links and tips in the order of the human hand: palm, then three links of thumb, index, middle,
 # ring and little finger.
-PALM, THUMB, INDEX, MIDDLE, RING = 0, 3, 6, 9, 12
-THUMB_TIP, MIDDLE_TIP, RING_TIP = 16, 18, 19
+PALM = 0
+THUMB = 3
+INDEX = 6
+MIDDLE = 9
+RING = 12
+THUMB_TIP = 16
+MIDDLE_TIP = 18
+RING_TIP = 19
 
 
 def pinch(on: bool = True):
@@ -44,7 +50,7 @@ def pinch(on: bool = True):
 
     Palm, thumb, index, middle and ring finger touch it; index and middle with 3 and 5 N.
     """
-    made = lone_scene(TASK, *["fingers"] * on, fingers={"allowed": PINCH})
+    pinching = lone_scene(TASK, *["fingers"] * on, fingers={"allowed": PINCH})
     nearest = np.zeros((1, len(HAND.keypoints), 3), np.float32)
     nearest[..., 0] = 0.2
     nearest[0, THUMB_TIP] = [0.001, 0.0, 0.0]
@@ -52,9 +58,10 @@ def pinch(on: bool = True):
     nearest[0, RING_TIP] = [0.0, 0.0, -0.004 - 0.0068]
     touching = np.isin(np.arange(L), (PALM, THUMB, INDEX, MIDDLE, RING))[None]
     force = np.zeros((1, L, 3), np.float32)
-    force[0, INDEX, 0], force[0, MIDDLE, 2] = 3.0, 5.0
-    return made._replace(
-        features=made.features._replace(nearest=nearest, touching=touching, force=force)
+    force[0, INDEX, 0] = 3.0
+    force[0, MIDDLE, 2] = 5.0
+    return pinching._replace(
+        features=pinching.features._replace(nearest=nearest, touching=touching, force=force)
     )
 
 
@@ -90,14 +97,10 @@ def test_reward_by_hand():
 
 
 def test_contacts_of_other_fingers_earn_nothing():
-    weights, unit = (
-        HAND.contact_weights,
-        RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0),
-    )
-    paid, free = (
-        evaluated(reward_terms, pinch(), unit),
-        evaluated(reward_terms, pinch(on=False), unit),
-    )
+    weights = HAND.contact_weights
+    unit = RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0)
+    paid = evaluated(reward_terms, pinch(), unit)
+    free = evaluated(reward_terms, pinch(on=False), unit)
     np.testing.assert_allclose(paid["contact"], [weights[[PALM, THUMB, INDEX]].sum()], rtol=1e-6)
     np.testing.assert_allclose(paid["force"], [weights[INDEX] * 3 / 5], rtol=1e-6)
     np.testing.assert_allclose(
@@ -109,12 +112,16 @@ def test_contacts_of_other_fingers_earn_nothing():
 def test_error_is_the_share_of_other_fingers_links():
     for on in (True, False):  # measured whether or not it is active
         wrong, all_of_them = evaluated(FINGERS.measure, pinch(on))["fingers_ratio"]
-        assert (wrong, all_of_them) == (2.0, 5.0)
-    step, yes, no = evaluated(metrics.errors, pinch()), np.ones(1, bool), np.zeros(1, bool)
+        assert wrong == 2.0
+        assert all_of_them == 5.0
+    step = evaluated(metrics.errors, pinch())
+    yes = np.ones(1, bool)
+    no = np.zeros(1, bool)
     sums = metrics.empty_sums(TASK, 1)
     for hold in (no, yes, yes):
         sums = metrics.accumulate(TASK, sums, step, ~hold, hold)
-    assert (sums["fingers_ratio"], sums["fingers_ratio/of"]) == (4.0, 10.0)
+    assert sums["fingers_ratio"] == 4.0
+    assert sums["fingers_ratio/of"] == 10.0
     np.testing.assert_allclose(metrics.episode_errors(TASK, sums)["fingers_ratio"], [0.4])
     idle = metrics.episode_errors(TASK, metrics.empty_sums(TASK, 1))
     np.testing.assert_array_equal(idle["fingers_ratio"], [0.0])  # nothing touched: nothing wrong
@@ -127,7 +134,8 @@ def test_draws_are_the_thumb_with_any_of_the_others():
     zero = np.zeros(6000, int)
     uniform = np.random.default_rng(0).uniform(size=(6000, 1)).astype(np.float32)
     allowed = np.asarray(FINGERS.sample(HAND, Draw(None, zero, zero, zero, {}), uniform).allowed)
-    assert allowed[:, 0].all() and allowed[:, 1:].any(-1).all()
+    assert allowed[:, 0].all()
+    assert allowed[:, 1:].any(-1).all()
     number = allowed @ (1 << np.arange(5))
     shares = np.bincount(number, minlength=32) / len(number)
     expected = np.full(32, 1 / 30) * (np.arange(32) % 2)
@@ -140,10 +148,10 @@ def test_draws_are_the_thumb_with_any_of_the_others():
 @pytest.mark.parametrize(("hand", "count"), [("human", 15), ("allegro", 7)])
 def test_sets_are_all_with_a_thumb_and_another_finger(hand, count):
     sets, shares = finger_sets(get_hand(hand))
-    assert len(sets) == count == len(
-        {row.tobytes() for row in sets}
-    ) and shares.sum() == pytest.approx(1.0)
-    assert sets[:, 0].all() and sets[:, 1:].any(-1).all()
+    assert len(sets) == count == len({row.tobytes() for row in sets})
+    assert shares.sum() == pytest.approx(1.0)
+    assert sets[:, 0].all()
+    assert sets[:, 1:].any(-1).all()
     likely = {tuple(row.nonzero()[0].tolist()) for row in sets[shares > 2 * shares.min()]}
     assert likely == {(0, 1), (0, 1, 2), tuple(range(sets.shape[1]))}
 
@@ -165,7 +173,8 @@ def test_the_hand_centre_is_that_of_the_set():
     fingers = np.array([[1, 1, 0, 0, 0], [1, 0, 1, 0, 1], [1, 1, 1, 1, 1]], bool)
     np.testing.assert_allclose(hand_center(HAND, points, fingers)[:, 0], [0.1, 0.4, 0.3], atol=1e-6)
     np.testing.assert_array_equal(hand_center(HAND, points), kinematics.hand_center(HAND, points))
-    with_pinch, without = pinch(), pinch(on=False)
+    with_pinch = pinch()
+    without = pinch(on=False)
     tips = np.asarray(with_pinch.features.keypoints)[:, len(HAND.links) :]
     np.testing.assert_allclose(with_pinch.features.center, (tips[:, 0] + tips[:, 1]) / 2, atol=1e-6)
     np.testing.assert_allclose(
@@ -178,12 +187,12 @@ def test_the_distance_reward_is_that_of_the_set():
     4 = 15 count.
     """
     assert len(HAND.keypoints) == 21
-    made = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))[
+    rewards = evaluated(reward_terms, pinch(), RewardWeights(**dict.fromkeys(terms(TASK), 1.0)))[
         "distance"
     ]
     # 6 link origins and the palm at 0.2 m, the thumb's tip at 1 mm, the index finger's at 0.2 m;
     # all weigh 21 together.
-    np.testing.assert_allclose(made, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
+    np.testing.assert_allclose(rewards, [-21 / 15 * (7 * 0.2 + 4 * 0.001 + 4 * 0.2)], rtol=1e-5)
     free = evaluated(
         reward_terms, pinch(on=False), RewardWeights(**dict.fromkeys(terms(TASK), 1.0))
     )["distance"]
@@ -204,7 +213,8 @@ def test_fingers_that_may_not_touch_move_neither_centre_nor_distance(seed, which
         hand_center(HAND, points, chosen), hand_center(HAND, moved, chosen), atol=1e-6
     )
     weights = np.asarray(keypoint_weights(HAND, chosen))
-    assert (weights[:, other] == 0).all() and (weights[:, ~other] > 0).all()
+    assert (weights[:, other] == 0).all()
+    assert (weights[:, ~other] > 0).all()
     np.testing.assert_allclose(weights.sum(-1), HAND.keypoint_weights.sum(), rtol=1e-5)
 
 
@@ -251,10 +261,8 @@ def test_words():
             read_request(BOX, HAND, 15, fingers=written).given("fingers", "allowed"), PINCH[0]
         )
     assert read_request(BOX, HAND, 15).given("fingers", "allowed") is None
-    assert (
-        FINGERS.parse({"fingers": ()}, HAND, BOX) is None
-        and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
-    )
+    assert FINGERS.parse({"fingers": ()}, HAND, BOX) is None
+    assert FINGERS.parse({"fingers": ""}, HAND, BOX) is None
     with pytest.raises(
         CongraspError, match=r"has no finger 'pinky'.*from: thumb, index, middle, ring, little"
     ):
@@ -275,17 +283,17 @@ def test_features_of_a_whole_step_reach_it():
     skin.
     """
     state, surface, goal = scene(4)
-    made = scene_of(TASK, state, surface, goal)
-    ((_, room, _),) = evaluated(FINGERS.observe, made)
-    skin = np.linalg.norm(made.features.nearest, axis=-1) - HAND.keypoint_radii
+    scene_of_step = scene_of(TASK, state, surface, goal)
+    ((_, room, _),) = evaluated(FINGERS.observe, scene_of_step)
+    skin = np.linalg.norm(scene_of_step.features.nearest, axis=-1) - HAND.keypoint_radii
     for finger in range(5):
-        own = [
+        per_step = [
             i
             for i, link in enumerate(HAND.keypoint_links)
             if (link - 1) // 3 == finger and link > 0
         ]
-        assert len(own) == 4  # three joints and a tip
+        assert len(per_step) == 4  # three joints and a tip
         expected = np.where(
-            goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, own].min(-1), 0.1)
+            goal["fingers"].allowed[:, finger], 0.0, np.minimum(skin[:, per_step].min(-1), 0.1)
         )
         np.testing.assert_allclose(room[:, finger], expected, atol=1e-6)

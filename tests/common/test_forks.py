@@ -114,7 +114,8 @@ def test_a_fork_is_refused(before, listener, tmp_path, paper_policy):
     lines = lines_of(tmp_path, body)
     assert len(lines) == 2 * len(forks)
     for answer in lines[::2]:
-        assert answer.startswith("ForkError: ") and "spawn" in answer
+        assert answer.startswith("ForkError: ")
+        assert "spawn" in answer
     assert lines[1::2] == ["ended"] * len(forks)
 
 

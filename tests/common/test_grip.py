@@ -14,15 +14,15 @@ EVERY_LINK = jnp.ones((1, L), bool)
 
 def two_contacts(force: float, half_distance: float, center: float = 0.0):
     """Two opposite contacts on the x axis, with the object's centre of mass at the origin."""
-    found = np.zeros((1, L, CONTACTS_PER_LINK), bool)
+    contact_found = np.zeros((1, L, CONTACTS_PER_LINK), bool)
     forces = np.zeros((1, L, CONTACTS_PER_LINK, 3), np.float32)
     positions = np.full((1, L, CONTACTS_PER_LINK, 3), np.nan, np.float32)
     for link, side in ((0, -1.0), (1, 1.0)):
-        found[0, link, 0] = True
+        contact_found[0, link, 0] = True
         forces[0, link, 0] = (-side * force, 0.0, 0.0)
         positions[0, link, 0] = (center + side * half_distance, 0.0, 0.0)
     return STATE._replace(
-        contact_found=jnp.asarray(found),
+        contact_found=jnp.asarray(contact_found),
         contact_force=jnp.asarray(forces),
         contact_position=jnp.asarray(positions),
         object_position=jnp.zeros((1, 3)),

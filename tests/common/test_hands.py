@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.physics.scene import addresses
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand
 from congrasp.common.hands.kinematics import grasp_frame, link_poses
@@ -77,11 +78,13 @@ def test_fingertips_at_zero_are_where_the_makers_have_them(name):
 
 
 def test_joint_limits_torques_and_masses_are_the_makers():
-    allegro, sharpa = get_hand("allegro"), get_hand("sharpa")
-    assert (len(allegro.joints), len(sharpa.joints)) == (16, 22)
+    allegro = get_hand("allegro")
+    sharpa = get_hand("sharpa")
+    assert len(allegro.joints) == 16
+    assert len(sharpa.joints) == 22
     assert sum(link.mass for link in allegro.links) == pytest.approx(0.955, abs=1e-3)
     assert sum(link.mass for link in sharpa.links) == pytest.approx(1.246, abs=1e-3)
-    joints = {joint.name: joint for hand in (allegro, sharpa) for joint in hand.joints}
+    joints = {joint.name: joint for joint in (*allegro.joints, *sharpa.joints)}
     expected = {
         "thumb_0": (0.263, 1.396, 0.7),
         "thumb_1": (-0.105, 1.163, 0.7),
@@ -95,11 +98,9 @@ def test_joint_limits_torques_and_masses_are_the_makers():
     }
     for name, figures in expected.items():
         assert (joints[name].lower, joints[name].upper, joints[name].torque_limit) == figures, name
-    assert (allegro.object_scale, sharpa.object_scale, get_hand("human").object_scale) == (
-        1.4,
-        1.1,
-        1.0,
-    )
+    assert allegro.object_scale == 1.4
+    assert sharpa.object_scale == 1.1
+    assert get_hand("human").object_scale == 1.0
 
 
 @pytest.mark.parametrize(
@@ -122,9 +123,9 @@ def test_joint_limits_torques_and_masses_are_the_makers():
 )
 def test_joints_are_where_the_makers_have_them(name, joint, tip, anchor, axis):
     hand = get_hand(name)
-    found = next(x for x in hand.joints if x.name == joint)
-    np.testing.assert_allclose(np.subtract(found.anchor, ORIGIN[name]), anchor, atol=1e-4)
-    np.testing.assert_allclose(found.axis, axis, atol=1e-3)
+    actual = next(x for x in hand.joints if x.name == joint)
+    np.testing.assert_allclose(np.subtract(actual.anchor, ORIGIN[name]), anchor, atol=1e-4)
+    np.testing.assert_allclose(actual.axis, axis, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ("human", *ROBOTS))
@@ -156,7 +157,8 @@ def test_poses_keep_within_limits_and_name_joints(hand):
     assert len(names) == len(hand.joints)
     assert {*hand.open_pose, *hand.closed_pose} <= names
     for q in (hand.q_open, hand.q_closed):
-        assert np.all(hand.lower <= q) and np.all(q <= hand.upper)
+        assert np.all(hand.lower <= q)
+        assert np.all(q <= hand.upper)
 
 
 def test_opening_and_palm_side(hand):
@@ -181,13 +183,13 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     """Frame, limits, gains and torques: fingers that close around a cylinder in the hand's middle
     carry 400 g.
     """
-    found = next(
+    held = next(
         obj
         for i in range(99)
         if 0.02 < (obj := procedural.generate(i, "cylinder")).pieces[0].size[0] < 0.03
     )
     task = TaskConfig(hand=hand.name)
-    (cylinder,) = scale_objects(hand, task, [found])
+    (cylinder,) = scale_objects(hand, task, [held])
     frame = grasp_frame(hand)
     tips = _tips(hand, hand.q_open + 0.5 * (hand.q_closed - hand.q_open))
     center = 0.5 * (tips[0] + tips[1:].mean(0)) - 0.01 * frame.heading
@@ -215,17 +217,20 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
         firm = hand.q_open + min(1.2, step / 30) * (hand.q_closed - hand.q_open)
         target[:, 6:] = np.clip(firm, hand.lower, hand.upper)
         if step == 60:
-            physics.instances[0].data.eq_active[physics._where.weld] = False
+            instance = physics.instances[0]
+            instance.data.eq_active[addresses(instance.model, hand).weld] = False
         state, after = physics.step(state, target, np.zeros(1, bool))
         touched |= after.contact_found[0].any(-1)
         if step >= 180:
             speeds.append(np.linalg.norm(after.object_velocity))
     physics.close()
     fingers = {hand.links[i].name.partition("_")[0] for i in np.flatnonzero(touched)}
-    assert "thumb" in fingers and len(fingers - {"palm"}) >= 3, fingers
+    assert "thumb" in fingers, fingers
+    assert len(fingers - {"palm"}) >= 3, fingers
     moved = np.asarray(after.object_position[0]) - reset_state.object_position[0]
     # Fingers may pull it into the palm
-    assert moved[2] > -0.02 and np.linalg.norm(moved) < 0.10, "the object fell"
+    assert moved[2] > -0.02, "the object fell"
+    assert np.linalg.norm(moved) < 0.10, "the object fell"
     assert max(speeds) < 0.05, "the object shakes"
 
 
@@ -276,11 +281,13 @@ def test_links_that_nest_do_not_collide_and_all_others_do(hand):
     data.qpos[6:] = hand.q_open
     mujoco.mj_forward(model, data)
     assert not (data.contact.dist < 0).any()
-    touched, deepest = False, 0.0
+    touched = False
+    deepest = 0.0
     for step in range(400):
         data.ctrl[6:] = hand.q_open + min(1.0, step / 200) * (hand.q_closed - hand.q_open)
         mujoco.mj_step(model, data)
         touched |= data.ncon > 0
         deepest = min(deepest, data.contact.dist.min(initial=0.0))
-    assert touched and -0.005 < deepest < 0
+    assert touched
+    assert -0.005 < deepest < 0
     assert np.abs(data.qvel).max() < 0.05

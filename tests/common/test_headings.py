@@ -27,7 +27,9 @@ from congrasp.common.task.sampling.headings import (
 )
 from congrasp.common.task.sampling.reach import above, clear_table, feasible, within_reach
 
-DOWN, LEVEL, UP = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+DOWN = [0.0, 0.0, -1.0]
+LEVEL = [1.0, 0.0, 0.0]
+UP = [0.0, 0.0, 1.0]
 FLAT = np.array([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0])
 ANY = np.array([np.inf])  # opening of a hand that is open wide enough for everything
 
@@ -52,9 +54,11 @@ def defined_opposition(obj, touchable, position, direction, cross, rounding):
     cross-finger axis.
     """
     offset = (obj.points - position)[:256]
-    breadth, depth = np.abs(offset @ np.cross(direction, cross)), offset @ direction
+    breadth = np.abs(offset @ np.cross(direction, cross))
+    depth = offset @ direction
     slab = (breadth < 0.03 + rounding) & (depth < 0.01 + rounding) & touchable[:256]
-    along, facing = (offset @ cross)[slab], (obj.normals[:256] @ cross)[slab]
+    along = (offset @ cross)[slab]
+    facing = (obj.normals[:256] @ cross)[slab]
     sides = facing[along < along.min() + 0.015 + 1e-6], facing[along > along.max() - 0.015 - 1e-6]
     return sides[0].min() < -np.cos(np.pi / 4) + 1e-6 and sides[1].max() > np.cos(np.pi / 4) - 1e-6
 
@@ -107,10 +111,12 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
         # Seen along the cross-finger axis, the graspable region reaches further to both sides.
         for p, v, w in zip(position, direction, cross, strict=True):
             offset = (obj.points - p)[:256]
-            breadth, depth = np.abs(offset @ np.cross(v, w)), offset @ v
+            breadth = np.abs(offset @ np.cross(v, w))
+            depth = offset @ v
             sides = (offset @ w)[(breadth < 0.0301) & (depth < 0.0101) & ~avoid[:256]]
             opposed = (offset @ w)[(breadth < 0.0299) & (depth < 0.0199) & avoid[:256]]
-            assert (opposed < sides.max() - 0.0049).all() and (opposed > sides.min() + 0.0049).all()
+            assert (opposed < sides.max() - 0.0049).all()
+            assert (opposed > sides.min() + 0.0049).all()
     else:
         graspable = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
         unlabelled = sample_headings(graspable, np.random.default_rng(draw), use_affordance=False)
@@ -227,7 +233,7 @@ def test_an_object_without_o_plus_still_gets_headings():
     assert sample_headings(barren, np.random.default_rng(0), use_affordance=True) is None
 
 
-def test_feasible_keeps_what_stays_above_the_table():
+def test_feasible_headings_stay_above_the_table():
     steep = [0.0, np.sin(0.1), np.cos(0.1)]
     headings = made(
         ([0, 0, 0.0], DOWN),  # 5 cm high
@@ -302,7 +308,8 @@ def test_a_hand_needs_room_below_its_centre():
     bar = Outline(np.array([[[0, -0.03, 0], [0, 0.03, 0]]]), np.array([0.01, 0.01]), ANY)
     upright = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.02], LEVEL, UP)))
     level = upright._replace(cross=np.array([[0, 1, 0]], np.float32))
-    assert not feasible(upright, FLAT, bar)[0] and feasible(level, FLAT, bar)[0]  # 3 cm high
+    assert not feasible(upright, FLAT, bar)[0]
+    assert feasible(level, FLAT, bar)[0]  # 3 cm high
     higher = upright._replace(position=np.array([[0, 0, -0.009]], np.float32))
     assert feasible(higher, FLAT, bar)[0]  # 4.1 cm high
     down = Headings(*(np.array([row], np.float32) for row in ([0, 0, -0.06], DOWN, LEVEL)))
@@ -367,8 +374,8 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
     v, w = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0].transpose(0, 2, 1)[:, :2].transpose(1, 0, 2)
     up = np.stack([v[:, 2], w[:, 2], np.cross(v, w)[:, 2]], -1)
     frame = grasp_frame(hand)
-    own = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
-    turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), own)
+    axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
+    turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), axes)
     ends = jax.jit(lambda q: capsules(hand, link_transforms(hand, q)))(hand.q_open)
     ends = np.asarray(ends).reshape(-1, 3) - frame.center
     opened = CLOSURES.tolist().index(0.0)
@@ -455,23 +462,25 @@ def covered(obj, hand):
     graspable region.
     """
     widest = max_width(hand, 1.0)
-    found = sample_headings(
+    headings = sample_headings(
         obj, np.random.default_rng(0), use_affordance=True, options=HeadingOptions(max_width=widest)
     )
-    if found is None:
+    if headings is None:
         return [], np.zeros((len(obj.rest_poses), 0), bool)
-    return within_reach(found, obj, obj.rest_poses, hand, obj.non_graspable_points)
+    return within_reach(headings, obj, obj.rest_poses, hand, obj.non_graspable_points)
 
 
 @pytest.mark.parametrize("families", ["all", "scans"])
 @pytest.mark.slow
 def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
     """Over a pool: what is allowed obeys the rules at the place to which the table moved it."""
-    hand, uncovered = outline(get_hand("human")), 0
+    hand = outline(get_hand("human"))
+    uncovered = 0
     objects = generate_many(66 if families == "all" else 12, 1_000_000, (families,))
     assert {obj.family for obj in objects} == set(GROUPS[families])
     for obj in objects:
-        points, avoid = obj.points[:256].astype(float), obj.non_graspable_points[:256]
+        points = obj.points[:256].astype(float)
+        avoid = obj.non_graspable_points[:256]
         for moved, allowed, rest in zip(*covered(obj, hand), obj.rest_poses, strict=False):
             assert not allowed.any() or local_width(moved, obj.points)[allowed].max() <= max_width(
                 hand, 1.0
@@ -488,9 +497,7 @@ def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
                 other = offset[slab & avoid & (offset @ direction < 0.02)] @ cross
                 assert len(held) >= 2
                 if len(other):
-                    assert (
-                        held.min() + 0.005 <= other.min() + 1e-6
-                        and other.max() - 1e-6 <= held.max() - 0.005
-                    )
+                    assert held.min() + 0.005 <= other.min() + 1e-6
+                    assert other.max() - 1e-6 <= held.max() - 0.005
         uncovered += not covered(obj, hand)[1].any()
     assert uncovered <= 0.1 * len(objects)

@@ -29,10 +29,12 @@ def model_of(name: str) -> mujoco.MjModel:
 
 @pytest.mark.parametrize("name", ["human", "allegro", "sharpa"])
 def test_equal_angles_and_mirrored_wrists_give_mirrored_links(name):
-    right, left = model_of(name), model_of(f"{name}:left")
+    right = model_of(name)
+    left = model_of(f"{name}:left")
     rng = np.random.default_rng(0)
     hand = get_hand(name)
-    u, q = rng.uniform(-0.5, 0.5, 6), rng.uniform(hand.lower, hand.upper)
+    u = rng.uniform(-0.5, 0.5, 6)
+    q = rng.uniform(hand.lower, hand.upper)
     poses = []
     for model, wrist in ((right, u), (left, u * [-1, 1, 1, 1, -1, -1])):
         data = mujoco.MjData(model)
@@ -53,7 +55,8 @@ def test_a_left_hand_is_one_object_by_either_name_and_messages_may_name_it():
 
 
 def test_the_surface_of_a_left_hand_is_closed_to_the_outside_and_mirrored():
-    right, left = skin_of(get_hand("human")), skin_of(get_hand("human:left"))
+    right = skin_of(get_hand("human"))
+    left = skin_of(get_hand("human:left"))
     np.testing.assert_allclose(left.points, right.points * [-1, 1, 1], atol=1e-6)
     for skin in (right, left):
         a, b, c = (skin.points[skin.faces[:, i]] for i in range(3))
@@ -97,8 +100,10 @@ class Lopsided:
 def test_mirrored_inputs_give_mirrored_actions():
     rng = np.random.default_rng(1)
     x, v, r, u, q = (rng.normal(size=size) for size in (3, 3, 4, 6, 16))
-    right, left = Lopsided(), LeftPolicy(Lopsided())
-    flip, turn = np.array([-1, 1, 1]), np.array([1, 1, -1, -1])
+    right = Lopsided()
+    left = LeftPolicy(Lopsided())
+    flip = np.array([-1, 1, 1])
+    turn = np.array([1, 1, -1, -1])
     wrist = np.concatenate([flip, -flip])
     answers = []
     for policy, m, t, w in ((right, np.ones(3), np.ones(4), np.ones(6)), (left, flip, turn, wrist)):
@@ -118,35 +123,37 @@ def test_mirrored_inputs_give_mirrored_actions():
 
 def test_angular_velocities_are_mirrored_as_rotations():
     """A wheel that rolls forwards does so in the mirror too, where x is the axle."""
-    found = mirror.fields(
+    mirrored = mirror.fields(
         {"object_angular_velocity": [1.0, 2.0, 3.0], "object_velocity": [1.0, 2.0, 3.0]}
     )
-    np.testing.assert_array_equal(found["object_angular_velocity"], [1, -2, -3])
-    np.testing.assert_array_equal(found["object_velocity"], [-1, 2, 3])
+    np.testing.assert_array_equal(mirrored["object_angular_velocity"], [1, -2, -3])
+    np.testing.assert_array_equal(mirrored["object_velocity"], [-1, 2, 3])
 
 
 def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
     """By hand: slides along x and hinges about y and z change their sign, so that their bounds
     change places.
     """
-    lower, upper = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3], [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
+    lower = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3]
+    upper = [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
     limits = {"lower": lower, "upper": upper, "palm": [[0.01, 0.02, 0.03, 0.04]]}
     right = mock.Mock(metadata=lambda: {"hand": "human", "limits": limits, "period": 0.01})
-    found = LeftPolicy(right).metadata()
-    assert found["hand"] == "human:left" and found["period"] == 0.01
+    metadata = LeftPolicy(right).metadata()
+    assert metadata["hand"] == "human:left"
+    assert metadata["period"] == 0.01
     np.testing.assert_array_equal(
-        found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
+        metadata["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6]
     )
-    np.testing.assert_array_equal(found["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
-    assert found["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
+    np.testing.assert_array_equal(metadata["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
+    assert metadata["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
 
 
 def test_everything_that_a_camera_sees_is_mirrored():
     points = np.array([[1.0, 2.0, 3.0]])
     request = GraspRequest({}, cloud=points, normals=points, camera=points[0])
     mirrored = mirrored_request(request)
-    for found in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
-        np.testing.assert_array_equal(found, [-1.0, 2.0, 3.0])
+    for vectors in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
+        np.testing.assert_array_equal(vectors, [-1.0, 2.0, 3.0])
     state = mirror.fields(
         {"cloud": points, "surface_normals": points, "camera_position": points[0]}
     )

@@ -31,7 +31,8 @@ def _points(hand, **angles):
 
 
 def test_a_files_arrays_are_read_exactly(mano):
-    model, expected = read_mano(mano), content()
+    model = read_mano(mano)
+    expected = content()
     np.testing.assert_array_equal(model.vertices, expected["v_template"])
     np.testing.assert_array_equal(model.shape_directions, expected["shapedirs"])
     np.testing.assert_array_equal(model.regressor, expected["J_regressor"])
@@ -80,7 +81,8 @@ def test_a_variant_that_cannot_be_read_is_named_with_its_conversion(tmp_path):
 
 def test_the_skeleton_is_that_of_the_file_about_the_wrist(hand):
     joints, tips = skeleton()
-    assert len(hand.joints) == 20 and len(hand.tip_links) == 5
+    assert len(hand.joints) == 20
+    assert len(hand.tip_links) == 5
     points = _points(hand)
     for i, finger in enumerate(MANO_FINGERS):
         names = (

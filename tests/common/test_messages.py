@@ -1,6 +1,7 @@
 """What messages must hold."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +21,11 @@ from congrasp.common.wire.messages import (
     validate_rollout,
 )
 
-T, B, D, A, E = 3, 2, 5, 4, 1
+T = 3
+B = 2
+D = 5
+A = 4
+E = 1
 FORM = RolloutForm(T, B, D, A, half=True)
 
 
@@ -145,8 +150,8 @@ def test_empty_rollout_is_refused():
 
 
 def test_zeros_have_the_forms_sizes_and_dtypes():
-    whole = RolloutForm(T, B, D, A, half=False).zeros(rollouts=3)
-    assert {name: (array.shape, str(array.dtype)) for name, array in whole.items()} == {
+    zeros = RolloutForm(T, B, D, A, half=False).zeros(rollouts=3)
+    assert {name: (array.shape, str(array.dtype)) for name, array in zeros.items()} == {
         "observation": ((T, 3 * B, D), "float32"),
         "action": ((T, 3 * B, A), "float32"),
         "log_probability": ((T, 3 * B), "float32"),
@@ -180,7 +185,9 @@ def test_device_arrays_pass_unread():
 @pytest.mark.parametrize("at", [0, 65535, 65536, 200_000])
 def test_every_half_is_looked_at(value, at):
     array = np.full((3, 66_667), 65504, np.float16)
-    assert is_finite(array) and is_finite(-array) and is_finite(array[:0])
+    assert is_finite(array)
+    assert is_finite(-array)
+    assert is_finite(array[:0])
     array.flat[at] = value
     assert not is_finite(array)
 
@@ -188,8 +195,9 @@ def test_every_half_is_looked_at(value, at):
 def bundle(**arrays):
     statistics = {
         f"{kind}/{name}": np.zeros(shape)
-        for kind, shape in (("observation", 5), ("value", ()))
-        for name in ("mean", "m2")
+        for (kind, shape), name in itertools.product(
+            (("observation", 5), ("value", ())), ("mean", "m2")
+        )
     }
     counts = {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     weights = {

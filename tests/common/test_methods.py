@@ -23,7 +23,8 @@ from congrasp.common.task.reward import reward_terms
 from tests.scenes import HAND, F, N, evaluated, scene
 from tests.scenes import scene_of as compiled_scene
 
-FIRST, LAST = RewardWeights(drop=2.0), RewardWeights(drop=9.0, heading_position=30.0)
+FIRST = RewardWeights(drop=2.0)
+LAST = RewardWeights(drop=9.0, heading_position=30.0)
 RUN = RunConfig(
     updates=100,
     task=TaskConfig(reward=FIRST),
@@ -61,7 +62,8 @@ def test_two_phases_by_hand():
 
 def test_a_single_stage_has_the_last_weights_from_the_start():
     run = with_method(RUN, "single-stage")
-    assert run.curriculum.weights(run.task.reward, 0) == LAST and not run.curriculum.stationary(0)
+    assert run.curriculum.weights(run.task.reward, 0) == LAST
+    assert not run.curriculum.stationary(0)
     constant = with_method(dataclasses.replace(RUN, curriculum=CurriculumConfig()), "single-stage")
     assert constant.curriculum.weights(constant.task.reward, 0) == FIRST
 
@@ -85,7 +87,8 @@ def test_dgrasp_always_has_a_pose():
     terms = jax.jit(lambda weights, *step: reward_terms(scene_of(HAND, run.task, *step), weights))
     for version in (0, 99):
         paid = terms(run.curriculum.weights(run.task.reward, version), *scene(0))
-        assert not np.any(paid["heading_direction"]) and not np.any(paid["heading_position"])
+        assert not np.any(paid["heading_direction"])
+        assert not np.any(paid["heading_position"])
         assert np.any(paid["pose_wrist_position"])
 
 
@@ -128,10 +131,13 @@ def test_invalid_methods_are_refused():
         with_method(RUN, "pd")
 
 
-def test_rows_that_a_method_can_be_asked_for():
-    assert takes("ours", "heading") and takes("graspxl", "affordance")
-    assert takes("pd", "trajectory+affordance") and not takes("pd", "affordance")
-    assert takes("dgrasp", "pose") and not takes("dgrasp", "heading")
+def test_rows_that_a_method_supports():
+    assert takes("ours", "heading")
+    assert takes("graspxl", "affordance")
+    assert takes("pd", "trajectory+affordance")
+    assert not takes("pd", "affordance")
+    assert takes("dgrasp", "pose")
+    assert not takes("dgrasp", "heading")
 
 
 # --- targets of a teacher ---
@@ -154,10 +160,12 @@ def label(teacher, ahead, limit, velocity, table, own):
     rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own), *lag], np.float32)
     assert len(rows) == extra(ALLEGRO)
     action = np.append(np.full(16, 0.3), along(teacher)).astype(np.float32)
-    found = np.asarray(_student_action(rows, action))
-    np.testing.assert_allclose(found[:16], action[:16] + lag / 0.1, atol=1e-6)  # alpha_f = 0.1 rad
-    np.testing.assert_allclose(found[17:], 0.0, atol=1e-6)
-    return found[16]
+    student = np.asarray(_student_action(rows, action))
+    np.testing.assert_allclose(
+        student[:16], action[:16] + lag / 0.1, atol=1e-6
+    )  # alpha_f = 0.1 rad
+    np.testing.assert_allclose(student[17:], 0.0, atol=1e-6)
+    return student[16]
 
 
 def test_label_reaches_the_teacher_s_target():
@@ -198,19 +206,18 @@ def test_labelled_student_moves_like_its_teacher():
 
     @jax.jit
     def targets(action):
-        true, shown = (
-            scene_of(HAND, task, state, surface, goal),
-            scene_of(HAND, tracked, seen, surface, goal),
-        )
-        rows = observe_for_teacher(true, shown, task.control)
-        own = student_action(HAND, task.control, rows, action)
+        true = scene_of(HAND, task, state, surface, goal)
+        tracked_scene = scene_of(HAND, tracked, seen, surface, goal)
+        rows = observe_for_teacher(true, tracked_scene, task.control)
+        label = student_action(HAND, task.control, rows, action)
         one, two, copied = (
-            decode(s, task.control, a) for s, a in ((true, action), (shown, own), (shown, action))
+            decode(s, task.control, a)
+            for s, a in ((true, action), (tracked_scene, label), (tracked_scene, action))
         )
         return rows, observe(true), one, two, copied
 
-    rows, whole, teacher, student, copied = targets(action)
-    np.testing.assert_array_equal(rows[:, : -extra(HAND)], whole)
+    rows, full_target, teacher, student, copied = targets(action)
+    np.testing.assert_array_equal(rows[:, : -extra(HAND)], full_target)
     np.testing.assert_allclose(student.u_target, teacher.u_target, atol=1e-5)
     np.testing.assert_array_equal(student.q_target, teacher.q_target)
     # What the teacher's residual would have given

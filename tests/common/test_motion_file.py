@@ -112,17 +112,19 @@ def test_blocks_of_a_motion_are_those_of_its_constraints(tmp_path: pathlib.Path)
     assert motion.constraints == ("heading", "affordance", "pose")
     save_motion(tmp_path / "a.npz", motion)
     active = load_motion(tmp_path / "a.npz").active
-    assert active["affordance"] and active["pose_finger"] and active["pose_wrist"]
+    assert active["affordance"]
+    assert active["pose_finger"]
+    assert active["pose_wrist"]
     assert not active["trajectory"]
 
 
 def test_rounded_quaternions_need_normalising(tmp_path: pathlib.Path) -> None:
-    whole = episode_message()
+    message = episode_message()
     rounded = {
-        name: 1.002 * np.asarray(whole.arrays[name])
+        name: 1.002 * np.asarray(message.arrays[name])
         for name in ("link_quaternion", "object_quaternion")
     }
-    recorded = Episode.from_message(Message({**whole.arrays, **rounded}, whole.meta))
+    recorded = Episode.from_message(Message({**message.arrays, **rounded}, message.meta))
     save_motion(tmp_path / "a.npz", recorded)
     with pytest.raises(CongraspError, match=r"a\.npz's wrist_quaternion .* not normalised"):
         load_motion(tmp_path / "a.npz")
@@ -158,7 +160,8 @@ def test_file_of_the_first_format_is_read(tmp_path: pathlib.Path) -> None:
     older_file(tmp_path / "older.npz", motion)
     read = load_motion(tmp_path / "older.npz")
     assert (read.hand, read.object, read.success) == ("human", "mug", True)
-    assert read.metrics == {"held": 1.0} and read.version == 3
+    assert read.metrics == {"held": 1.0}
+    assert read.version == 3
     assert read.constraints == ("heading", "pose", "trajectory")
     expected = {name: value for name, value in motion.goal.items() if name != "heading_cross"}
     np.testing.assert_equal(read.goal, expected)
@@ -212,7 +215,8 @@ def test_damaged_file_is_a_one_line_error(tmp_path_factory, data: st.DataObject)
     try:
         load_motion(path)
     except CongraspError as error:
-        assert str(path) in str(error) and "\n" not in str(error)
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
     else:
         assert kind == "changed"  # a byte of the archive that no reader uses
 
@@ -224,9 +228,11 @@ def test_motion_alone_suffices_for_kinematics() -> None:
     turns: list[Rotation] = []
     places: list[np.ndarray] = []
     for link, parent in enumerate(motion.link_parent):
-        turn, place = Rotation.identity(), np.zeros(3)
+        turn = Rotation.identity()
+        place = np.zeros(3)
         if parent >= 0:
-            turn, place = turns[parent], places[parent]
+            turn = turns[parent]
+            place = places[parent]
         for j in np.flatnonzero(motion.joint_link == link):
             joint_turn = Rotation.from_rotvec(q[j] * motion.joint_axis[j])
             anchor = motion.joint_anchor[j]

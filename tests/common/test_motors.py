@@ -44,7 +44,8 @@ def _index(hand, *names):
 
 def test_motors_and_joints_by_hand(hand):
     names = [motor.name for motor in hand.motors]
-    assert len(names) == 16 - 3 and names[:6] == [
+    assert len(names) == 16 - 3
+    assert names[:6] == [
         "thumb_0",
         "thumb_1",
         "thumb_2",
@@ -52,13 +53,12 @@ def test_motors_and_joints_by_hand(hand):
         "index_0",
         "index_1",
     ]
-    assert "middle_tendon" in names and not {"index_3", "ring_1", "middle_2", "middle_3"} & {*names}
+    assert "middle_tendon" in names
+    assert not {"index_3", "ring_1", "middle_2", "middle_3"} & {*names}
     m = np.zeros(len(names), np.float32)
-    m[names.index("index_2")], m[names.index("index_1")], m[names.index("middle_tendon")] = (
-        1.0,
-        0.5,
-        1.0,
-    )
+    m[names.index("index_2")] = 1.0
+    m[names.index("index_1")] = 0.5
+    m[names.index("middle_tendon")] = 1.0
     q = joint_positions(hand, m)
     i2, i3, r1, m2, m3 = _index(hand, "index_2", "index_3", "ring_1", "middle_2", "middle_3")
     np.testing.assert_allclose(q[[i2, i3, r1]], [1.0, 0.9, 0.1 + 0.8 * 0.5], rtol=1e-6)
@@ -83,21 +83,24 @@ def test_motors_go_to_joints_and_back_within_all_limits(hand):
     q = joint_positions(hand, m)
     np.testing.assert_allclose(motor_positions(hand, q), m, atol=1e-6)
     np.testing.assert_allclose(coupled(hand, q), q, atol=1e-6)
-    assert (q > hand.lower - 1e-5).all() and (q < hand.upper + 1e-5).all()
+    assert (q > hand.lower - 1e-5).all()
+    assert (q < hand.upper + 1e-5).all()
     human = get_hand("human")
-    assert (
-        motor_positions(human, q) is q and joint_positions(human, q) is q and coupled(human, q) is q
-    )
+    assert motor_positions(human, q) is q
+    assert joint_positions(human, q) is q
+    assert coupled(human, q) is q
 
 
 def test_poses_follow_and_fingers_that_one_motor_moves_close_together(hand):
     i2, i3, r1, i1 = _index(hand, "index_2", "index_3", "ring_1", "index_1")
     for q in (hand.q_open, hand.q_closed):
-        assert q[i3] == pytest.approx(0.9 * q[i2]) and q[r1] == pytest.approx(0.1 + 0.8 * q[i1])
+        assert q[i3] == pytest.approx(0.9 * q[i2])
+        assert q[r1] == pytest.approx(0.1 + 0.8 * q[i1])
     groups = finger_groups(hand)
     finger_of_joint = groups.of_joint
     count = groups.number
-    assert count == 3 and finger_of_joint[r1] == finger_of_joint[i1] != finger_of_joint[0]
+    assert count == 3
+    assert finger_of_joint[r1] == finger_of_joint[i1] != finger_of_joint[0]
 
 
 def test_a_policy_has_as_many_actions_as_motors(hand):
@@ -140,8 +143,10 @@ def _closing(hand):
     """The hand alone with its motors half closed, and the indices of its finger joints in qpos."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    spec.option.timestep, spec.option.integrator = 0.0025, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.iterations, spec.option.ls_iterations = 24, 40
+    spec.option.timestep = 0.0025
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.iterations = 24
+    spec.option.ls_iterations = 40
     add_hand(spec, hand)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
@@ -161,7 +166,8 @@ def test_warp_couples_joints_as_mujoco_c_does(hand):
     from mujoco.mjx.third_party import mujoco_warp  # takes seconds
 
     model, native = _closing(hand)
-    theirs, data = mujoco_warp.put_model(model), mujoco_warp.put_data(model, native)
+    theirs = mujoco_warp.put_model(model)
+    data = mujoco_warp.put_data(model, native)
     for _ in range(40):
         mujoco.mj_step(model, native)
         mujoco_warp.step(theirs, data)
@@ -179,7 +185,8 @@ def test_mjx_couples_joints_as_mujoco_c_does():
     tendon = Motor("tendon", {"opposing_root": 1.0, "opposing_middle": 0.5}, 4.0, 0.1, 1.0)
     follow = Coupling("left_middle", "left_root", 0.9)
     model, native = _closing(dataclasses.replace(claw, couplings=(follow,), tendons=(tendon,)))
-    compiled, fresh = mjx.put_model(model, impl="jax"), mjx.put_data(model, native, impl="jax")
+    compiled = mjx.put_model(model, impl="jax")
+    fresh = mjx.put_data(model, native, impl="jax")
     step = jax.jit(
         lambda data: jax.lax.scan(lambda d, _: (mjx.step(compiled, d), None), data, None, 100)[0]
     )
@@ -187,7 +194,7 @@ def test_mjx_couples_joints_as_mujoco_c_does():
     np.testing.assert_allclose(step(fresh).qpos, native.qpos, atol=1e-3)
 
 
-def test_a_tendon_goes_on_where_one_of_its_joints_is_held_and_couplings_do_not_give(hand):
+def test_a_tendon_moves_its_free_joints_if_one_is_held(hand):
     model, data = _closing(hand)
     held, other, leader, follower = (
         model.joint(x) for x in ("middle_2", "middle_3", "index_2", "index_3")
@@ -197,11 +204,12 @@ def test_a_tendon_goes_on_where_one_of_its_joints_is_held_and_couplings_do_not_g
     for _ in range(400):
         data.qfrc_applied[follower.dofadr] = -0.2  # N.m against the motor of the leader
         mujoco.mj_step(model, data)
-    angle, shared = data.qpos[held.qposadr][0], data.qpos[other.qposadr][0]
+    angle = data.qpos[held.qposadr][0]
+    shared = data.qpos[other.qposadr][0]
     assert angle == pytest.approx(0.3, abs=0.02)
     assert angle + 0.5 * shared == pytest.approx(target, abs=0.05)
     now = data.qpos[leader.qposadr][0]
     assert data.qpos[follower.qposadr][0] == pytest.approx(0.9 * now, abs=5e-3)
     # Virtual work: the leader's motor holds 0.9 times what acts on the follower.
-    wanted = data.ctrl[model.actuator("index_2").id] - 0.9 * 0.2 / 3.0
-    assert now == pytest.approx(wanted, abs=5e-3)
+    expected = data.ctrl[model.actuator("index_2").id] - 0.9 * 0.2 / 3.0
+    assert now == pytest.approx(expected, abs=5e-3)

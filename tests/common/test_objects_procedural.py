@@ -39,15 +39,20 @@ def is_primitive(obj):
 
 
 def test_most_basic_families_are_primitive():
-    made = [generate(0, family) for family in BASIC_FAMILIES]
-    assert sum(is_primitive(obj) for obj in made) >= 12
-    assert {obj.family for obj in made if not is_primitive(obj)} == {"ring", "bowl", "cup"}
+    objects_of_families = [generate(0, family) for family in BASIC_FAMILIES]
+    assert sum(is_primitive(obj) for obj in objects_of_families) >= 12
+    assert {obj.family for obj in objects_of_families if not is_primitive(obj)} == {
+        "ring",
+        "bowl",
+        "cup",
+    }
 
 
 @settings(max_examples=12, deadline=None)
 @given(objects)
 def test_geometry_is_sound(obj):
-    points, normals = obj.points.astype(float), obj.normals.astype(float)
+    points = obj.points.astype(float)
+    normals = obj.normals.astype(float)
     assert points.shape == normals.shape == (SURFACE_POINTS, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     # On the surface of the union, with the normal pointing out of it.
@@ -149,13 +154,13 @@ def test_seed_and_family_decide_the_object(seed, family):
 
 def test_no_two_of_many_are_alike():
     many = generate_many(48, 10)
-    volumes = [sum(shapes.volume(piece) for piece in obj.pieces) for obj in many]
+    volumes = [sum(map(shapes.volume, obj.pieces)) for obj in many]
     assert len(np.unique(np.round(volumes, 12))) == 48
     assert len({obj.name for obj in many}) == 48
     assert {obj.family for obj in many} == set(BASIC_FAMILIES)
 
 
-def test_groups_stand_for_their_families():
+def test_a_group_means_its_families():
     assert family_turns(3, 0, ("mug", "household")) == ["mug", *HOUSEHOLD_FAMILIES[:2]]
     assert set(family_turns(66, 0, ("all",))) == {*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES}
     assert set(family_turns(74, 0, ("all", "scans"))) == set(FAMILIES)
@@ -167,7 +172,8 @@ def test_half_of_the_points_lie_on_a_thin_handle(family):
     obj = generate(3, family)
     owner = sample_union(obj.pieces, np.random.default_rng(0))[2]
     assert np.mean([obj.pieces[i].part for i in owner]) < 0.3
-    assert obj.graspable[obj.labels].mean() == 0.5 and obj.graspable[obj.labels[:256]].mean() == 0.5
+    assert obj.graspable[obj.labels].mean() == 0.5
+    assert obj.graspable[obj.labels[:256]].mean() == 0.5
 
 
 @pytest.mark.parametrize(
@@ -178,7 +184,7 @@ def test_half_of_the_points_lie_on_a_thin_handle(family):
         ("compound", 0.280085458611, 1164.81867416),
     ],
 )
-def test_held_out_objects_of_basic_families_stay_what_they_are(family, mass, moment):
+def test_held_out_objects_of_basic_families_are_unchanged(family, mass, moment):
     """Figures of different versions are of the same objects."""
     obj = generate(1_000_000, family)
     np.testing.assert_allclose([obj.mass, 1e6 * np.trace(obj.inertia)], [mass, moment], rtol=1e-6)
@@ -204,14 +210,17 @@ def test_unknown_families_and_negative_seeds_are_named():
 
 def test_actors_have_objects_of_their_own():
     config = ObjectsConfig(count=2, seed=3, families=("box",))
-    pools = [[obj.name for obj in load_pool(config, shift)] for shift in (0, 1)]
+    pools = []
+    for shift in (0, 1):
+        pools.append([obj.name for obj in load_pool(config, shift)])
     assert pools == [["box_3", "box_4"], ["box_5", "box_6"]]
 
 
 @given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32 - 1))
 def test_training_never_touches_the_objects_of_evaluation(seed, count, shift):
     first = first_seed(ObjectsConfig(seed=seed, count=count), shift)
-    assert first >= 0 and first + count <= HELD_OUT_SEED
+    assert first >= 0
+    assert first + count <= HELD_OUT_SEED
 
 
 @given(
@@ -233,7 +242,7 @@ def test_evaluation_has_the_same_objects_everywhere():
     assert first_seed(config, 0) == first_seed(config, 123) == HELD_OUT_SEED + 7
 
 
-def test_a_folder_gives_all_its_objects_whoever_asks(tmp_path):
+def test_a_folder_gives_every_actor_all_its_objects(tmp_path):
     catalogue = Catalogue(tmp_path)
     for seed in (2, 1):
         catalogue.add(procedural.generate(seed, "box"))
@@ -255,7 +264,7 @@ def test_pools_that_cannot_be_are_refused_in_words(config, words):
         load_pool(config)
 
 
-def test_an_empty_folder_says_how_to_fill_it(tmp_path):
+def test_an_empty_folder_names_the_remedy(tmp_path):
     with pytest.raises(CongraspError, match=r"contains no object\. .*objects import"):
         load_pool(ObjectsConfig(folder=str(tmp_path)))
 
@@ -269,12 +278,10 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
     save(obj, tmp_path / "x.safetensors")
     back = load(tmp_path / "x.safetensors")
     assert digest(back) == digest(obj)
-    assert (back.name, back.family, back.part_names, back.mass) == (
-        obj.name,
-        obj.family,
-        obj.part_names,
-        obj.mass,
-    )
+    assert back.name == obj.name
+    assert back.family == obj.family
+    assert back.part_names == obj.part_names
+    assert back.mass == obj.mass
     for name in (
         "graspable",
         "inertia",
@@ -287,13 +294,15 @@ def test_an_object_comes_back_as_it_was(tmp_path, family):
         np.testing.assert_array_equal(getattr(back, name), getattr(obj, name))
         assert getattr(back, name).dtype == getattr(obj, name).dtype
     for a, b in zip(back.pieces, obj.pieces, strict=True):
-        assert (a.kind, a.size, a.part) == (b.kind, b.size, b.part)
+        assert a.kind == b.kind
+        assert a.size == b.size
+        assert a.part == b.part
         np.testing.assert_array_equal(a.pos, b.pos)
         np.testing.assert_array_equal(a.quat, b.quat)
         np.testing.assert_array_equal(a.vertices, b.vertices)
 
 
-def test_a_catalogue_lists_what_was_added(tmp_path):
+def test_a_catalogue_lists_its_objects(tmp_path):
     catalogue = Catalogue(tmp_path / "new")
     with pytest.raises(CongraspError, match="no folder"):
         catalogue.list()

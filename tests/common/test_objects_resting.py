@@ -1,6 +1,7 @@
 """Resting poses against solid angles worked out by hand, and what keeps round objects still."""
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -42,7 +43,9 @@ def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces():
     poses, likelihood = quasi_static_poses((Piece("box", tuple(half)),))
     # A rectangle of half sides a, b seen from d before its middle: 4 asin(ab / sqrt((a^2 + d^2)(b^2
     # + d^2))).
-    a, b, d = half[[1, 2, 0]], half[[2, 0, 1]], half
+    a = half[[1, 2, 0]]
+    b = half[[2, 0, 1]]
+    d = half
     share = np.arcsin(a * b / np.sqrt((a**2 + d**2) * (b**2 + d**2))) / np.pi
 
     order = np.repeat(np.argsort(-share), 2)
@@ -52,7 +55,8 @@ def test_a_box_has_six_poses_with_the_solid_angles_of_its_faces():
 
 
 def test_a_cylinder_stands_with_the_likelihood_of_its_ends():
-    radius, half = 0.03, 0.05
+    radius = 0.03
+    half = 0.05
     poses, likelihood = quasi_static_poses((Piece("cylinder", (radius, half, 0)),))
     standing = np.isclose(poses[:, 2], half, atol=1e-6)
     assert standing.sum() == 2
@@ -67,7 +71,9 @@ def test_a_face_beside_which_the_centre_of_mass_falls_is_no_resting_pose():
     # An oblique prism that leans over by more than its foot: it cannot stand on it.
     foot = np.array([[-0.01, -0.01], [0.01, -0.01], [0.01, 0.01], [-0.01, 0.01]])
     lean = np.array([0.03, 0.0])
-    vertices = np.array([[*(xy + side * lean), side * 0.04] for side in (-1, 1) for xy in foot])
+    vertices = np.array(
+        [[*(xy + side * lean), side * 0.04] for side, xy in itertools.product((-1, 1), foot)]
+    )
     poses, likelihood = quasi_static_poses((Piece("mesh", (0, 0, 0), vertices=vertices),))
     down = np.array([-shapes.matrix(pose[3:])[2] for pose in poses])
     assert (np.abs(down[:, 2]) < 0.99).all()
@@ -99,7 +105,8 @@ def test_round_objects_rest_still(piece):
 
 
 def test_the_free_joints_damping_stops_a_rolling_ball_after_the_distance_worked_out():
-    radius, speed = 0.03, 0.05
+    radius = 0.03
+    speed = 0.05
     obj = make(Piece("ellipsoid", (radius,) * 3))
     scene = TableScene(obj)
     data = scene.data
@@ -117,7 +124,7 @@ def test_the_free_joints_damping_stops_a_rolling_ball_after_the_distance_worked_
     np.testing.assert_allclose(data.qpos[0], speed * constant, rtol=0.1)
 
 
-def test_settling_reports_what_moved():
+def test_settling_reports_the_motion():
     obj = make(Piece("box", (0.02, 0.02, 0.02)))
     fallen = settle(obj, np.array([0, 0, 0.05, 1.0, 0, 0, 0]), 1.0)
     np.testing.assert_allclose(fallen.moved, 0.03, atol=1e-3)
@@ -151,7 +158,8 @@ def test_the_mujoco_body_is_the_object(family):
         if piece.vertices is None:
             np.testing.assert_allclose(geom.pos, piece.pos, atol=1e-9)
             continue
-        start, count = model.mesh_vertadr[geom.dataid[0]], model.mesh_vertnum[geom.dataid[0]]
+        start = model.mesh_vertadr[geom.dataid[0]]
+        count = model.mesh_vertnum[geom.dataid[0]]
         placed = (
             model.mesh_vert[start : start + count] @ data.geom_xmat[i].reshape(3, 3).T
             + data.geom_xpos[i]
@@ -171,7 +179,8 @@ def test_poses_follow_the_object_when_it_is_turned():
         )
         for piece in obj.pieces
     )
-    before, after = quasi_static_poses(obj.pieces), quasi_static_poses(moved)
+    before = quasi_static_poses(obj.pieces)
+    after = quasi_static_poses(moved)
     np.testing.assert_allclose(after[1], before[1], rtol=1e-6)
     np.testing.assert_allclose(after[0][:, 2], before[0][:, 2], rtol=1e-6)
 

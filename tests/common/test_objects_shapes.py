@@ -40,11 +40,13 @@ def piece(request):
 
 
 def test_mass_properties_of_a_union_with_densities_equal_mujocos():
-    pieces, densities = tuple(PIECES.values()), np.array([500.0, 900.0, 300.0, 2000.0, 1100.0])
-    found, expected = mass_properties(pieces, densities), mujoco_mass_properties(pieces, densities)
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-7)
-    np.testing.assert_allclose(found[2], expected[2], atol=1e-5 * np.abs(expected[2]).max())
+    pieces = tuple(PIECES.values())
+    densities = np.array([500.0, 900.0, 300.0, 2000.0, 1100.0])
+    actual = mass_properties(pieces, densities)
+    expected = mujoco_mass_properties(pieces, densities)
+    np.testing.assert_allclose(actual[0], expected[0], rtol=1e-5)
+    np.testing.assert_allclose(actual[1], expected[1], atol=1e-7)
+    np.testing.assert_allclose(actual[2], expected[2], atol=1e-5 * np.abs(expected[2]).max())
 
 
 def test_surface_samples_have_supporting_planes_and_separate_inside_from_outside(piece):
@@ -114,7 +116,8 @@ def test_a_union_has_no_points_inside_or_on_seams_and_keeps_flush_faces():
     assert not on_seam.any()
     # Area: a 8 x 4 x 4 cm block without two 1 x 1 cm holes, and two stubs of 2 cm with 1 x 1 cm
     # ends.
-    block, stubs = 2 * 16 + 4 * 32 - 2, 2 * (4 * 2 + 1)
+    block = 2 * 16 + 4 * 32 - 2
+    stubs = 2 * (4 * 2 + 1)
     assert np.isclose(bar.mean(), stubs / (block + stubs), atol=0.02)
     # Any prefix covers the surface as the whole does.
     assert np.isclose(bar[:400].mean(), bar.mean(), atol=0.03)
@@ -127,7 +130,7 @@ def test_halves_cut_across_the_longest_axis():
     assert points[labels == 0, 1].max() < points[labels == 1, 1].min() + 0.02
 
 
-def test_mesh_samples_leave_out_what_the_pieces_cover():
+def test_mesh_samples_exclude_areas_covered_by_pieces():
     # A cube's surface with a second, smaller one inside it, whose faces look inwards.
     outer = shapes.triangulate(np.array(np.meshgrid(*[[-0.03, 0.03]] * 3)).reshape(3, -1).T)
     inner = np.asarray(outer.triangles)[:, ::-1] * 0.6
@@ -167,7 +170,7 @@ def test_a_lathed_solid_has_a_piece_for_each_convex_stretch():
     assert len(lathe([(0.0, 0.02), (0.05, 0.04), (0.1, 0.02)])) == 1
 
 
-def test_a_shell_is_what_lies_between_its_polygons():
+def test_a_shell_is_the_solid_between_its_polygons():
     ring = shell([(0.0, 0.05, 0.04), (0.1, 0.05, 0.04)], 8)
     assert len(ring) == 8
     assert _volume(ring) == pytest.approx(0.1 * (_polygon(16) * 0.05**2 - _polygon(8) * 0.04**2))

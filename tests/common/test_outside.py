@@ -36,7 +36,9 @@ class LevelGoal(NamedTuple):
 class Level(Constraint):
     """The hand stays as high as the object."""
 
-    name, title, goal = "level", "level hand", LevelGoal
+    name = "level"
+    title = "level hand"
+    goal = LevelGoal
     blocks = ("level",)
     weights = (Weight("level_height", 0.7, "Per metre of height."),)
     errors = (ErrorSpec("level_m", "m", "hold", 0.05, 0.05, "height beside the object's"),)
@@ -80,10 +82,10 @@ class Level(Constraint):
     def measure(self, scene):
         return {"level_m": jnp.abs(self._height(scene))}
 
-    def parse(self, given, hand, obj):
-        if given["levelled"]:
-            return {"wrist": np.abs(np.diff(given["levelled"]["position"][-2:, 2])) < 1e-3}
-        return {"wrist": np.array([given["level"] == "wrist"])} if given["level"] else None
+    def parse(self, text, hand, obj):
+        if text["levelled"]:
+            return {"wrist": np.abs(np.diff(text["levelled"]["position"][-2:, 2])) < 1e-3}
+        return {"wrist": np.array([text["level"] == "wrist"])} if text["level"] else None
 
     def _height(self, scene):
         features = scene.features
@@ -130,7 +132,8 @@ def episodes(task):
     from congrasp.common.task.observation import layout
     from congrasp.common.task.sampling.build import build_bank
 
-    hand, batch = get_hand("human"), 32
+    hand = get_hand("human")
+    batch = 32
     objects = [procedural.generate(0, "box")]
     physics = NativePhysics(hand, task, objects, 1)
 
@@ -151,24 +154,26 @@ def episodes(task):
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)
     physics.close()
-    active, wrist = goal.active["level"], goal["level"].wrist[:, 0]
-    assert 0.25 < active.mean() < 0.75 and 0.25 < wrist.mean() < 0.75
-    found = finished_episodes(rollout, task)
-    np.testing.assert_array_equal(found["episode/mask_level"], active)
+    active = goal.active["level"]
+    wrist = goal["level"].wrist[:, 0]
+    assert 0.25 < active.mean() < 0.75
+    assert 0.25 < wrist.mean() < 0.75
+    metrics = finished_episodes(rollout, task)
+    np.testing.assert_array_equal(metrics["episode/mask_level"], active)
 
     # What the engine shows, worked out from the traces; in `final` the steps after the table's
     # removal.
     height = np.asarray(rollout.trace.wrist_position - rollout.trace.object_position)[..., 2]
     final = np.asarray(rollout.trace.table)[-1] == 0
-    assert final.all() and task.hold_steps == 1
+    assert final.all()
+    assert task.hold_steps == 1
     np.testing.assert_allclose(
-        found["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
+        metrics["episode/level_m"][wrist], np.abs(height[-1])[wrist], atol=1e-5
     )
     paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
-    np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
-    assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][
-        ~active
-    ].any()
+    np.testing.assert_allclose(-metrics["term/level_height"][wrist], paid[wrist], atol=1e-4)
+    assert (metrics["term/level_height"][active] < 0).all()
+    assert not metrics["term/level_height"][~active].any()
     assert layout(hand, task)[-2:] == (("level", 2), ("mask", 1))
     block = np.asarray(rollout.observation)[..., -3:-1]
     np.testing.assert_array_equal(block[0, :, 0], active & wrist)
@@ -176,7 +181,7 @@ def episodes(task):
     assert not block[:, ~active].any()
     return {
         name.removeprefix("episode/"): values
-        for name, values in found.items()
+        for name, values in metrics.items()
         if name.startswith("episode/")
     }
 
@@ -188,9 +193,8 @@ def tables(task, values):
     from congrasp.services.evaluate import columns, episodes, scores
     from tests.rows import summarised
 
-    assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {
-        "level_m": "level_m"
-    }
+    assert scores.TABLES["single"][-1] == "level"
+    assert scores.ERRORS["level"] == {"level_m": "level_m"}
     alone = values["mask_level"] > 0
     plan = {"identity": np.arange(len(alone)), "mass_kg": np.full(len(alone), 0.2)}
     some = {
@@ -206,7 +210,8 @@ def tables(task, values):
         objects=list("abcdefgh"),
     )
     np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
-    assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
+    assert row.to_json()["level_m"] == row.errors["level_m"]
+    assert row.errors["heading_m"] is None
     assert "level" in columns.RATE["error"](row) or "level" in columns.RATE["constraint"](row)
 
 
@@ -216,7 +221,8 @@ def server(task):
     from congrasp.services.serve.requests import Layout
 
     layout = Layout(get_hand("human"), task)
-    assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (2,)
+    assert layout.shapes["level_wrist"] == (1,)
+    assert layout.shapes["asked"] == (2,)
     assert layout.description()["fields"]["level_wrist"] == [layout.offsets["level_wrist"], 1]
 
 
@@ -238,17 +244,16 @@ def command_line():
         "Per metre of rise.",
     ]
     for command, words in {"grasp": ["--level"], "train": train}.items():
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
             main.load(command)(["--help"])
         for word in words:
-            assert word in said.getvalue(), word
+            assert word in printed.getvalue(), word
     parsed = parse_errors.parse("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
-    assert list(request.constraints) == ["heading", "level"] and request.constraints["level"][
-        "wrist"
-    ].tolist() == [True]
+    assert list(request.constraints) == ["heading", "level"]
+    assert request.constraints["level"]["wrist"].tolist() == [True]
     assert RunConfig().task.reward.level_height == 0.7
 
 
@@ -284,7 +289,8 @@ def marker():
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
     arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
     drawn = dict(markers(goal_arrays(arrays), active_blocks(arrays)))
-    assert list(drawn) == ["heading", "level"] and drawn["level"].points[1, 2] == 0.01
+    assert list(drawn) == ["heading", "level"]
+    assert drawn["level"].points[1, 2] == 0.01
 
 
 def studio(task):
@@ -294,11 +300,12 @@ def studio(task):
     from congrasp.services.studio.page import describe
     from congrasp.services.studio.state import Studio
 
-    made = Studio(get_hand("human"), task, procedural.generate(0, "box"))
-    made.choose("level", "wrist", [True])
+    session = Studio(get_hand("human"), task, procedural.generate(0, "box"))
+    session.choose("level", "wrist", [True])
     row = {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}}
-    assert row in describe(made)["constraints"]
-    assert made.asked == {"level"} and made.request.constraints["level"]["wrist"].tolist() == [True]
+    assert row in describe(session)["constraints"]
+    assert session.asked == {"level"}
+    assert session.request.constraints["level"]["wrist"].tolist() == [True]
 
 
 def onnx(task):
@@ -307,9 +314,12 @@ def onnx(task):
     from congrasp.services.export.policy import describe
     from congrasp.services.train.command import untrained
 
-    said = describe(untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2))))
-    assert said["masks"][-1] == "level" and ["level", 2] in said["layout"]
-    fields = [entry for entry in said["observation"] if entry["block"] == "level"]
+    description = describe(
+        untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=2)))
+    )
+    assert description["masks"][-1] == "level"
+    assert ["level", 2] in description["layout"]
+    fields = [entry for entry in description["observation"] if entry["block"] == "level"]
     assert [(entry["field"], entry["size"], entry["meaning"]) for entry in fields] == [
         ("level_wrist", 1, "1 for the wrist"),
         ("level_height", 1, "m, world"),
@@ -323,16 +333,17 @@ def term():
     from congrasp.common.task.reward import reward_terms, terms
     from tests.scenes import evaluated, scene, scene_of
 
-    task, (state, surface, goal) = TaskConfig(constraints=("heading",)), scene(0, batch=3)
+    task = TaskConfig(constraints=("heading",))
+    state, surface, goal = scene(0, batch=3)
     start = state.object_position_initial * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.1]
     risen = start + np.array([[0.0, 0.0, 0.05], [0.0, 0.0, -0.05], [0.0, 0.0, 0.8]])
     state = state._replace(object_position=risen, object_position_initial=start)
     weights = dataclasses.replace(RewardWeights(), height=3.0)
     paid = evaluated(reward_terms, scene_of(task, state, surface, goal), weights)
     np.testing.assert_allclose(paid["height"], [3.0 * 0.05, 0.0, 3.0 * 0.2], rtol=1e-5)
-    assert (
-        set(paid) == set(terms(task)) and "height" in terms(task) and RewardWeights().height == 2.0
-    )
+    assert set(paid) == set(terms(task))
+    assert "height" in terms(task)
+    assert RewardWeights().height == 2.0
     config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))
     assert run_config_from_json(to_json(config)) == config
 

@@ -26,7 +26,8 @@ from tests.common.own_sensor import SWITCH_FORCE_N, Tactile
 from tests.task import HAND
 
 OBJECTS = suite.OBJECTS[1:2]
-BATCH, STEPS = 2, 20
+BATCH = 2
+STEPS = 20
 TASK = TaskConfig(
     constraints=("heading",),
     surface_points=64,
@@ -99,7 +100,8 @@ def test_outside_sensor_is_trained_with(episode):
     weights = np.array(before.params["actor"]["network"]["trunk_0"]["kernel"])
     batch = collate([rollout._asdict()], algorithm.batch_schema)
     after, metrics = algorithm.update(before, batch)
-    assert after.version == 1 and all(np.isfinite(value) for value in metrics.values())
+    assert after.version == 1
+    assert all(np.isfinite(value) for value in metrics.values())
     changed = np.any(after.params["actor"]["network"]["trunk_0"]["kernel"] != weights, 1)
     size = dict(observation.layout(HAND, TASK))["state"]
     switches = changed[size - len(HAND.links) : size]

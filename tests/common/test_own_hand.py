@@ -26,7 +26,8 @@ def test_a_hand_from_outside_needs_one_file(tmp_path, monkeypatch):
     for reference in ("claw", str(file)):
         task = TaskConfig(hand=reference, hand_self_collision=False)
         hand = get_hand(task.hand)
-        assert hand.name == "claw" and len(hand.joints) == 6
+        assert hand.name == "claw"
+        assert len(hand.joints) == 6
         np.testing.assert_allclose(grasp_frame(hand).heading, [0, 0, 1], atol=0.1)
         model = scene_spec(hand, task).compile()
         data = mujoco.MjData(model)
@@ -41,14 +42,16 @@ def test_a_hand_from_outside_needs_one_file(tmp_path, monkeypatch):
 def test_a_hand_file_is_a_hand_by_path_by_name_and_by_its_text(tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     get_hand.cache_clear()
-    claw, path = read_hand(FILE), pathlib.Path(shutil.copy(FILE, tmp_path))
+    claw = read_hand(FILE)
+    path = pathlib.Path(shutil.copy(FILE, tmp_path))
     assert get_hand(str(path)) is get_hand("claw") is get_hand(claw.reference) is claw
     config = with_hand(get_preset("quickstart"), "claw")
     path.unlink()  # actors elsewhere do not have the file
     travelled = run_config_from_json(to_json(config))
     assert get_hand(travelled.task.hand) is claw
     spec = policy_spec(travelled.task, travelled.network)
-    assert spec.hand_name == "claw" and spec.action_size == 12
+    assert spec.hand_name == "claw"
+    assert spec.action_size == 12
     assert spec.schema != policy_spec(TaskConfig(), travelled.network).schema
 
 

@@ -123,7 +123,8 @@ def test_a_script_without_a_guard_runs_once(kind, by, tmp_path):
         )
     lines = [line for line in done.stdout.splitlines() if line.startswith(("started", "RESULT"))]
     assert lines == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}"], done.stderr
-    assert done.returncode == 0 and "Traceback" not in done.stderr
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
 
 
 def _dedented(text):
@@ -212,8 +213,8 @@ def test_quotas_of_control_groups_count(membership, files, expected, monkeypatch
     cores.
     """
     monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1, 2})
-    monkeypatch.setattr(parallel, "_GROUPS", tmp_path)
-    monkeypatch.setattr(parallel, "_MEMBERSHIP", tmp_path / "membership")
+    monkeypatch.setattr(parallel, "CGROUPS", tmp_path)
+    monkeypatch.setattr(parallel, "CGROUP_MEMBERSHIP", tmp_path / "membership")
     (tmp_path / "membership").write_text(membership)
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

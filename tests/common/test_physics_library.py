@@ -49,6 +49,6 @@ def test_unstable_physics_leaves_no_file(entry, tmp_path):
 
 
 def test_warning_handler_of_the_program_stays(tmp_path):
-    mine = "import mujoco\nmujoco.set_mju_user_warning(print)\n"
+    handler = "import mujoco\nmujoco.set_mju_user_warning(print)\n"
     check = "assert mujoco.get_mju_user_warning() is print\n"
-    run(f"{mine}import congrasp.common.hands.mjcf\n{check}", tmp_path)
+    run(f"{handler}import congrasp.common.hands.mjcf\n{check}", tmp_path)

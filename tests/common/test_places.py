@@ -31,7 +31,8 @@ class Server:
 
 def test_place_of_a_closed_connection_is_free():
     server = Server(1)
-    assert server.connect(0, "a") and not server.connect(1, "a")
+    assert server.connect(0, "a")
+    assert not server.connect(1, "a")
     server.disconnect(0)
     assert server.connect(2, "a")
 
@@ -49,7 +50,8 @@ def test_no_connection_is_ended_for_an_equal_one():
     server = Server(3)
     for number, address in enumerate("abc"):
         assert server.connect(number, address)
-    assert not server.connect(3, "d") and sorted(server.open) == [0, 1, 2]
+    assert not server.connect(3, "d")
+    assert sorted(server.open) == [0, 1, 2]
 
 
 @given(st.lists(st.sampled_from("abcdef"), max_size=40), st.integers(1, 8))

@@ -4,6 +4,7 @@ simple motions.
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import mujoco
@@ -45,7 +46,8 @@ def deepest_contact(name: str, q: np.ndarray) -> float:
     """Deepest contact in metres between the links in MuJoCo, whose hand excludes what it
     excludes.
     """
-    hand, spec = get_hand(name), mujoco.MjSpec()
+    hand = get_hand(name)
+    spec = mujoco.MjSpec()
     hand = dataclasses.replace(
         hand, links=tuple(dataclasses.replace(link, solids=()) for link in hand.links)
     )
@@ -69,8 +71,8 @@ def deepest_contact(name: str, q: np.ndarray) -> float:
     ],
 )
 def test_distances_of_segments_worked_out_by_hand(a, b, c, d, distance):
-    found = _distance(*(np.array(x, np.float32) for x in (a, b, c, d)))
-    assert float(found) == pytest.approx(distance, abs=1e-6)
+    computed = _distance(*(np.array(x, np.float32) for x in (a, b, c, d)))
+    assert float(computed) == pytest.approx(distance, abs=1e-6)
 
 
 @settings(max_examples=50, deadline=None)
@@ -84,17 +86,19 @@ def test_no_points_of_two_segments_are_nearer_than_their_distance(seed):
 
 @pytest.mark.parametrize("name", HANDS)
 def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
-    hand, rng = get_hand(name), np.random.default_rng(0)
+    hand = get_hand(name)
+    rng = np.random.default_rng(0)
     measured = jax.jit(lambda q: hand_hand(hand, link_transforms(hand, q)))
     poses = [
         hand.q_open,
         hand.q_closed,
         *rng.uniform(hand.lower, hand.upper, (8, len(hand.joints))),
     ]
-    found = np.asarray(measured(np.array(poses, np.float32)))
-    np.testing.assert_allclose(found, [deepest_contact(name, q) for q in poses], atol=1e-5)
+    depths = np.asarray(measured(np.array(poses, np.float32)))
+    np.testing.assert_allclose(depths, [deepest_contact(name, q) for q in poses], atol=1e-5)
     # Open hands are free of themselves, some poses are not
-    assert found[0] == 0.0 and found.max() > 0.002
+    assert depths[0] == 0.0
+    assert depths.max() > 0.002
 
 
 def test_hand_in_table_is_the_lowest_point_of_a_capsule():
@@ -102,8 +106,10 @@ def test_hand_in_table_is_the_lowest_point_of_a_capsule():
     # At zero the lowest capsule is the thumb's last: its tip's centre at z = -0.0403, its radius
     # 6.5 mm.
     for height, depth in ((0.0, 0.0468), (0.04, 0.0068), (0.05, 0.0)):
-        found = hand_table(hand, transforms, np.array([[0.0, 0.0, height]], np.float32), UPRIGHT)
-        assert float(found[0]) == pytest.approx(depth, abs=1e-6)
+        penetration = hand_table(
+            hand, transforms, np.array([[0.0, 0.0, height]], np.float32), UPRIGHT
+        )
+        assert float(penetration[0]) == pytest.approx(depth, abs=1e-6)
     over = (
         Rotation.from_euler("x", 180, degrees=True)
         .as_quat(scalar_first=True)[None]
@@ -111,22 +117,24 @@ def test_hand_in_table_is_the_lowest_point_of_a_capsule():
     )
     # Turned over, the middle finger's last joint is lowest: z = 0.0197, and the radius of its
     # middle link 8 mm.
-    found = hand_table(hand, transforms, np.zeros((1, 3), np.float32), over)
-    assert float(found[0]) == pytest.approx(0.0197 + 0.008, abs=1e-6)
+    penetration = hand_table(hand, transforms, np.zeros((1, 3), np.float32), over)
+    assert float(penetration[0]) == pytest.approx(0.0197 + 0.008, abs=1e-6)
 
 
 def test_hand_in_object_is_the_radius_less_the_axis_distance():
     hand, transforms = posed("human", np.zeros(20))
     ball = procedural.generate(1, "ball")
     ball = type(ball)(**{**ball.__dict__, "pieces": (Piece("ellipsoid", (0.03, 0.03, 0.03)),)})
-    field, index = distance_field([ball]), np.zeros(1, int)
-    tip, radius = np.array(hand.links[6].tip), hand.links[6].capsules[0].radius
+    field = distance_field([ball])
+    index = np.zeros(1, int)
+    tip = np.array(hand.links[6].tip)
+    radius = hand.links[6].capsules[0].radius
     along = tip - np.array(hand.links[6].capsules[0].start)
     along /= np.linalg.norm(along)
     for gap in (0.010, 0.0, -0.004):
         centre = (tip + (radius + 0.03 + gap) * along)[None].astype(np.float32)
-        found = _in_object(transforms, centre, UPRIGHT, index, field)
-        assert float(found[0]) == pytest.approx(max(-gap, 0.0), abs=2e-4)
+        depth = _in_object(transforms, centre, UPRIGHT, index, field)
+        assert float(depth[0]) == pytest.approx(max(-gap, 0.0), abs=2e-4)
 
 
 def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
@@ -134,14 +142,14 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     blade = procedural.generate(1, "box")
     plate = Piece("box", (0.06, 0.001, 0.06))
     vertices = np.array(
-        [[x, y, z] for x in (-0.06, 0.06) for y in (-0.001, 0.001) for z in (-0.06, 0.06)],
+        list(itertools.product((-0.06, 0.06), (-0.001, 0.001), (-0.06, 0.06))),
         np.float32,
     )
     blade = type(blade)(**{**blade.__dict__, "pieces": (plate,), "visual_vertices": vertices})
     middle = 0.5 * np.add(
         *[np.array(getattr(hand.links[8].capsules[0], end)) for end in ("start", "end")]
     )
-    found = _in_object(
+    depth = _in_object(
         transforms,
         middle[None].astype(np.float32),
         UPRIGHT,
@@ -150,7 +158,7 @@ def test_a_finger_through_a_thin_blade_counts_with_its_thickness():
     )
     # The plate lies across the middle finger; the points on the axis are at most 4 mm apart.
     thickest = max(capsule.radius for capsule in hand.links[8].capsules)
-    assert thickest - 0.001 < float(found[0]) < thickest + 0.0025
+    assert thickest - 0.001 < float(depth[0]) < thickest + 0.0025
 
 
 def motion(steps: int, **arrays: np.ndarray) -> Sample:
@@ -184,8 +192,8 @@ def test_measures_of_a_motion_worked_out_by_hand():
         torque_share=torque,
         hand_hand=depth,
     )
-    found = measures(samples, 0.01)
-    assert set(found) == set(plausibility.MEASURES)
+    measured = measures(samples, 0.01)
+    assert set(measured) == set(plausibility.MEASURES)
     expected = {
         "hand_hand_mm": 4.0,
         "hand_table_mm": 0.0,
@@ -201,12 +209,12 @@ def test_measures_of_a_motion_worked_out_by_hand():
         "torque_share_peak": 1.0,
     }
     for name, value in expected.items():
-        assert found[name][0] == pytest.approx(value, rel=1e-5), name
+        assert measured[name][0] == pytest.approx(value, rel=1e-5), name
 
 
 def test_hand_without_meshes_has_no_mesh_measure():
-    found = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
-    assert set(found) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
+    measured = measures(motion(2, hand_mesh=np.full((2, 1), np.nan)), 0.01)
+    assert set(measured) == {*plausibility.MEASURES} - {"hand_mesh_mm"}
 
 
 def test_clean_is_held_and_shallow_everywhere():
@@ -223,7 +231,7 @@ def test_clean_is_held_and_shallow_everywhere():
         ("hand_object_mm", 3.0),
         ("hand_mesh_mm", 3.0),
     ):
-        found = {**shallow, name: value}
+        values = {**shallow, name: value}
         assert is_clean(
-            np.array([True]), {name: np.array([x]) for name, x in found.items()}
+            np.array([True]), {name: np.array([x]) for name, x in values.items()}
         ).tolist() == [False]

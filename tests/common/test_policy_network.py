@@ -85,11 +85,9 @@ def test_a_block_matters_exactly_while_its_bit_is_set(params, mask):
 
 def test_gaussian_against_scipy():
     rng = np.random.default_rng(1)
-    mean, log_std, action = (
-        rng.normal(size=(5, 4)),
-        rng.normal(size=4) * 0.3,
-        rng.normal(size=(5, 4)),
-    )
+    mean = rng.normal(size=(5, 4))
+    log_std = rng.normal(size=4) * 0.3
+    action = rng.normal(size=(5, 4))
     expected = scipy.stats.norm.logpdf(action, mean, np.exp(log_std)).sum(-1)
     np.testing.assert_allclose(network.log_probability(mean, log_std, action), expected, rtol=1e-5)
     np.testing.assert_allclose(
@@ -106,10 +104,8 @@ def test_kl_divergence_by_hand():
 
 
 def test_samples_have_the_gaussians_moments():
-    mean, log_std = (
-        jnp.broadcast_to(jnp.array([1.0, -2.0]), (40_000, 2)),
-        jnp.log(jnp.array([0.5, 0.1])),
-    )
+    mean = jnp.broadcast_to(jnp.array([1.0, -2.0]), (40_000, 2))
+    log_std = jnp.log(jnp.array([0.5, 0.1]))
     draws = np.asarray(network.sample(jax.random.PRNGKey(3), mean, log_std))
     np.testing.assert_allclose(draws.mean(0), [1.0, -2.0], atol=4 * 0.5 / np.sqrt(40_000))
     np.testing.assert_allclose(draws.std(0), [0.5, 0.1], rtol=0.02)
@@ -126,7 +122,8 @@ def test_foreign_layouts_are_refused(layout):
 def test_privileged_inputs_reach_the_critic_alone(params):
     wide = network.init(0, LAYOUT, ACTIONS, CONFIG, 3)
     jax.tree.map(np.testing.assert_array_equal, wide["actor"], params["actor"])
-    x, inputs = np.ones((2, SIZE), np.float32), np.zeros((2, 3), np.float32)
+    x = np.ones((2, SIZE), np.float32)
+    inputs = np.zeros((2, 3), np.float32)
     inputs[1, 2] = 1.0
     assert (
         len(wide["critic"]["trunk_0"]["kernel"]) == len(params["critic"]["trunk_0"]["kernel"]) + 3
@@ -137,10 +134,8 @@ def test_privileged_inputs_reach_the_critic_alone(params):
 
 def test_new_inputs_leave_results_unchanged(params):
     rng = np.random.default_rng(0)
-    x, inputs = (
-        rng.normal(size=(5, SIZE)).astype(np.float32),
-        rng.normal(size=(5, 3)).astype(np.float32),
-    )
+    x = rng.normal(size=(5, SIZE)).astype(np.float32)
+    inputs = rng.normal(size=(5, 3)).astype(np.float32)
     states = np.arange(dict(LAYOUT)["state"])
     wide = network.with_inputs(params, states, np.full(3, -1))
     np.testing.assert_allclose(value_of(wide, x, inputs), value_of(params, x), rtol=1e-5)
@@ -152,8 +147,8 @@ def test_new_inputs_leave_results_unchanged(params):
     )
     layout = (("state", len(states) + 1), *LAYOUT[1:])
     means = [
-        network.policy(tree, *given)[0]
-        for tree, given in ((params, (LAYOUT, x)), (swapped, (layout, wider)))
+        network.policy(tree, *arguments)[0]
+        for tree, arguments in ((params, (LAYOUT, x)), (swapped, (layout, wider)))
     ]
     np.testing.assert_allclose(*means, rtol=1e-5, atol=1e-7)
 
@@ -169,7 +164,9 @@ def exact(samples: np.ndarray) -> Statistics:
 def test_moments_by_hand():
     # 1, 2, 3, 6: mean 3, squared deviations 4 + 1 + 0 + 9.
     count, mean, m2 = normalizer.moments(jnp.array([[1.0, 2.0], [3.0, 6.0]]))
-    assert (count, mean, m2) == (4.0, 3.0, 14.0)
+    assert count == 4.0
+    assert mean == 3.0
+    assert m2 == 14.0
 
 
 def test_moments_of_half_precision_far_from_zero():
@@ -194,11 +191,11 @@ def test_merging_any_partition_gives_the_whole(samples, cuts):
     one_by_one = normalizer.empty((3,))
     for part in parts:
         one_by_one = normalizer.merge(one_by_one, exact(part))
-    whole = exact(samples)
+    of_all = exact(samples)
     for got in (merged, one_by_one):
-        assert got.count == whole.count
-        np.testing.assert_allclose(got.mean, whole.mean, rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(got.m2, whole.m2, rtol=1e-9, atol=1e-7)
+        assert got.count == of_all.count
+        np.testing.assert_allclose(got.mean, of_all.mean, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(got.m2, of_all.m2, rtol=1e-9, atol=1e-7)
 
 
 def test_merging_ranks_in_order_gives_every_rank_the_same_bits():
@@ -207,10 +204,8 @@ def test_merging_ranks_in_order_gives_every_rank_the_same_bits():
     deltas = [
         normalizer.moments(jnp.asarray(rng.normal(size=(20, 3)), jnp.float32), 1) for _ in range(4)
     ]
-    first, second = (
-        normalizer.merge(state, *deltas),
-        normalizer.merge(state, *[Statistics(*d) for d in deltas]),
-    )
+    first = normalizer.merge(state, *deltas)
+    second = normalizer.merge(state, *[Statistics(*d) for d in deltas])
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert first.count == 50 + 4 * 20
 
@@ -268,4 +263,5 @@ def test_half_precision_observations_become_float32(seen):
 def test_values_by_hand():
     # Returns -1 and 3: mean 1, standard deviation 2.
     affine = normalizer.value_affine(exact(np.array([-1.0, 3.0])))
-    assert (affine.shift, affine.scale) == (1.0, 0.5)
+    assert affine.shift == 1.0
+    assert affine.scale == 0.5

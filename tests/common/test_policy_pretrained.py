@@ -1,6 +1,7 @@
 """Policies that come with the package."""
 
 import dataclasses
+import itertools
 import pathlib
 import tomllib
 
@@ -28,10 +29,10 @@ from congrasp.services.train.command import untrained
 ROOT = pathlib.Path(module.__file__).resolve().parents[2]
 
 
-def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_FOLDER", tmp_path)
-    given = tmp_path / "mine.safetensors"
-    assert policy_file(given) == given
+def test_a_given_policy_precedes_the_shipped_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    custom = tmp_path / "mine.safetensors"
+    assert policy_file(custom) == custom
     with pytest.raises(
         CongraspError, match=r"this installation has none for the hand 'human'.*--policy"
     ):
@@ -43,12 +44,13 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
     assert pretrained_file("allegro") is None
 
 
-def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
+def test_a_custom_hand_has_its_custom_policy(tmp_path, monkeypatch):
     monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path))
     get_hand.cache_clear()
-    mine = dataclasses.replace(get_hand("human"), name="mine")
-    (tmp_path / "mine.json").write_text(hand_text(mine))
-    assert pretrained_file("mine") is None and hands_with_policy() == pretrained_hands()
+    hand = dataclasses.replace(get_hand("human"), name="mine")
+    (tmp_path / "mine.json").write_text(hand_text(hand))
+    assert pretrained_file("mine") is None
+    assert hands_with_policy() == pretrained_hands()
     with pytest.raises(CongraspError, match=r"for the hand 'mine'.*congrasp hands train"):
         policy_file(None, "mine")
     task = TaskConfig(hand=get_hand("mine").reference, constraints=("heading",))
@@ -63,16 +65,16 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     # Another hand of the same name as one of the package does not get the package's policy.
     (tmp_path / "human.json").write_text(hand_text(get_hand("human")))
     assert pretrained_file(str(tmp_path / "human.json")) is None
-    assert pretrained_file("human").parent == module._FOLDER
+    assert pretrained_file("human").parent == module.FOLDER
     # Nor has a hand that was changed since the policy of the hand as it was before.
-    (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(mine, object_scale=0.9)))
+    (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.9)))
     get_hand.cache_clear()
     with pytest.raises(CongraspError, match=r"for an earlier version of the hand's file.*--policy"):
         policy_file(None, "mine")
     get_hand.cache_clear()
 
 
-def test_what_is_shipped_is_installed_and_can_be_loaded():
+def test_shipped_policies_are_installed_and_load():
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"][
         "package-data"
     ]
@@ -80,30 +82,32 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
         pathlib.Path("congrasp/common/policy", pattern)
         for pattern in data["congrasp.common.policy"]
     ]
-    assert [module._FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
+    assert [module.FOLDER.relative_to(ROOT) / "*.safetensors"] == patterns
     assert pretrained_hands() == ["human", "allegro", "sharpa"]
-    assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
+    assert {path.stem for path in module.FOLDER.glob("*.safetensors")} == {
         f"{hand}{kind}"
-        for hand in pretrained_hands()
-        for kind in ("", "-reference", "-student", "-camera")
+        for hand, kind in itertools.product(
+            pretrained_hands(), ("", "-reference", "-student", "-camera")
+        )
     }
     for hand in pretrained_hands():
         assert bundles.load(policy_file(None, hand)).spec.hand == hand
 
 
-@pytest.mark.parametrize("file", sorted(module._FOLDER.glob("*.safetensors")), ids=lambda f: f.stem)
+@pytest.mark.parametrize("file", sorted(module.FOLDER.glob("*.safetensors")), ids=lambda f: f.stem)
 def test_shipped_policy_has_no_critic(file):
     assert not bundles.load(file).has_critic
 
 
 def test_shipping_leaves_out_the_critic(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(module, "_FOLDER", tmp_path)
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
     task = TaskConfig(constraints=("heading",))
     trained = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4)))
     bundles.save(trained, tmp_path / "run.safetensors")
     ship.main([str(tmp_path / "run.safetensors"), "mine"])
     shipped = bundles.load(tmp_path / "mine.safetensors")
-    assert not shipped.has_critic and shipped.actor_sha256 == trained.actor_sha256
+    assert not shipped.has_critic
+    assert shipped.actor_sha256 == trained.actor_sha256
     assert trained.actor_sha256 in capsys.readouterr().out
 
 
@@ -112,11 +116,14 @@ def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     name = "allegro-student"
     file = named_policy(name)
-    assert file == policy_file(pathlib.Path(name)) == module._FOLDER / f"{name}.safetensors"
-    student, teacher = bundles.load(file).task, bundles.load(policy_file(None, "allegro")).task
-    assert student.observation == "tracked" and student.hand == teacher.hand
+    assert file == policy_file(pathlib.Path(name)) == module.FOLDER / f"{name}.safetensors"
+    student = bundles.load(file).task
+    teacher = bundles.load(policy_file(None, "allegro")).task
+    assert student.observation == "tracked"
+    assert student.hand == teacher.hand
     (entrant,) = read_entrants([name])
-    assert (entrant.hand, entrant.method) == ("allegro", "student")
+    assert entrant.hand == "allegro"
+    assert entrant.method == "student"
     (tmp_path / name).touch()
     assert policy_file(pathlib.Path(name)) == pathlib.Path(name)
     assert policy_file(pathlib.Path("folder", name)) == pathlib.Path("folder", name)

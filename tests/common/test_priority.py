@@ -37,8 +37,8 @@ resolved = jax.jit(functools.partial(resolve, HAND))
 
 
 def _resolve(affordance: bool, pose: bool, trajectory: bool):
-    _, surface, asked = scene(0)
-    return asked, resolved(surface, asked, _flags(affordance, pose, trajectory))
+    _, surface, goal = scene(0)
+    return goal, resolved(surface, goal, _flags(affordance, pose, trajectory))
 
 
 def test_active_blocks_follow_priority():
@@ -51,17 +51,19 @@ def test_active_blocks_follow_priority():
 
 
 def test_lone_heading_is_unchanged():
-    asked, done = _resolve(False, False, False)
-    np.testing.assert_allclose(done.goal["heading"].position, asked["heading"].position, atol=1e-6)
+    requested, done = _resolve(False, False, False)
     np.testing.assert_allclose(
-        done.goal["heading"].direction, asked["heading"].direction, atol=1e-6
+        done.goal["heading"].position, requested["heading"].position, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        done.goal["heading"].direction, requested["heading"].direction, atol=1e-6
     )
 
 
 @pytest.mark.parametrize("trajectory", [False, True])
 def test_overridden_heading_is_the_reference_s(trajectory):
-    asked, done = _resolve(False, not trajectory, trajectory)
-    q = asked["trajectory"].quaternion[0, -1] if trajectory else asked["pose"].quaternion[0]
+    requested, done = _resolve(False, not trajectory, trajectory)
+    q = requested["trajectory"].quaternion[0, -1] if trajectory else requested["pose"].quaternion[0]
     expected = Rotation.from_quat(q, scalar_first=True).apply(grasp_frame(HAND).heading)
     np.testing.assert_allclose(done.goal["heading"].direction[0], expected, atol=1e-5)
     assert abs(np.dot(done.goal["heading"].direction[0], done.goal["heading"].cross[0])) < 1e-5
@@ -71,51 +73,52 @@ def test_heading_of_a_lone_trajectory():
     """By hand: the last waypoint is at (1, 2, 3) m and not turned, so that the centre is only
     shifted.
     """
-    _, surface, asked = scene(0)
-    path = asked["trajectory"].position.copy()
-    turns = asked["trajectory"].quaternion.copy()
-    path[:, -1], turns[:, -1] = (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)
-    asked = asked.replace("trajectory", position=path, quaternion=turns)
+    _, surface, goal = scene(0)
+    path = goal["trajectory"].position.copy()
+    turns = goal["trajectory"].quaternion.copy()
+    path[:, -1] = (1.0, 2.0, 3.0)
+    turns[:, -1] = (1.0, 0.0, 0.0, 0.0)
+    goal = goal.replace("trajectory", position=path, quaternion=turns)
     q = 0.6 * HAND.q_open + 0.4 * HAND.q_closed
     tips = np.asarray(points_of(q))[len(HAND.links) :]
     center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
-    alone = resolved(surface, asked, _flags(trajectory=True)).goal
+    alone = resolved(surface, goal, _flags(trajectory=True)).goal
     np.testing.assert_allclose(
         alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5
     )
     # The fingers of a reference pose are known, and taken as they are.
-    both = resolved(surface, asked, _flags(pose=True, trajectory=True)).goal
-    tips = np.asarray(points_of(asked["pose"].q))[:, len(HAND.links) :]
+    both = resolved(surface, goal, _flags(pose=True, trajectory=True)).goal
+    tips = np.asarray(points_of(goal["pose"].q))[:, len(HAND.links) :]
     expected = np.array([1, 2, 3]) + (tips[:, 0] + tips[:, 1:].mean(1)) / 2
     np.testing.assert_allclose(both["heading"].position, expected, atol=1e-5)
 
 
 def test_trajectory_sets_the_wrist_of_a_pose():
-    asked, done = _resolve(False, True, True)
-    np.testing.assert_allclose(done.goal["pose"].position, asked["trajectory"].position[:, -1])
-    np.testing.assert_allclose(done.goal["pose"].q, asked["pose"].q)
+    requested, done = _resolve(False, True, True)
+    np.testing.assert_allclose(done.goal["pose"].position, requested["trajectory"].position[:, -1])
+    np.testing.assert_allclose(done.goal["pose"].q, requested["pose"].q)
 
 
 def _two_regions(graspable_x: float, avoid_x: float):
-    _, surface, asked = scene(1)
+    _, surface, goal = scene(1)
     x = np.where(surface.avoid, avoid_x, graspable_x)
     points = np.stack(
         [x, 0.001 * surface.points[..., 1], 0.001 * surface.points[..., 2]], -1
     ).astype(np.float32)
-    return surface._replace(points=points), asked
+    return surface._replace(points=points), goal
 
 
 @pytest.mark.parametrize("at_avoided", [True, False])
 def test_affordance_redirects_a_near_heading(at_avoided):
-    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
+    surface, goal = _two_regions(graspable_x=0.1, avoid_x=-0.1)
     where = np.tile(np.array([-0.1 if at_avoided else 0.1, 0.0, 0.0], np.float32), (4, 1))
     down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (4, 1))
     cross = np.tile(np.array([0.0, 1.0, 0.0], np.float32), (4, 1))
-    asked = asked.replace("heading", position=where, direction=down, cross=cross)
-    done = resolved(surface, asked, _flags(affordance=True))
+    goal = goal.replace("heading", position=where, direction=down, cross=cross)
+    done = resolved(surface, goal, _flags(affordance=True))
     assert np.all(np.asarray(done.redirected) == at_avoided)
     np.testing.assert_allclose(done.goal["heading"].position[:, 0], 0.1, atol=1e-3)
-    assert not np.any(resolved(surface, asked, _flags()).redirected)
+    assert not np.any(resolved(surface, goal, _flags()).redirected)
 
 
 def _redirected(
@@ -124,7 +127,7 @@ def _redirected(
     """The heading of a hand that comes along a direction to (-0.1, 0, 0), and of an object with
     these points.
     """
-    _, surface, asked = scene(1)
+    _, surface, goal = scene(1)
     rows = lambda v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
     # As many as in the other tests, so that one program does for all: the last of each region
     # counts several times.
@@ -133,13 +136,12 @@ def _redirected(
     surface = surface._replace(
         points=cloud, avoid=np.tile(np.arange(cloud.shape[1]) >= len(points), (4, 1))
     )
-    asked = asked.replace(
+    goal = goal.replace(
         "heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross)
     )
-    done = resolved(surface, asked, _flags(affordance=True))
-    assert np.all(done.redirected) and not np.any(
-        resolved(surface, done.goal, _flags(affordance=True)).redirected
-    )
+    done = resolved(surface, goal, _flags(affordance=True))
+    assert np.all(done.redirected)
+    assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
 
 
@@ -161,7 +163,8 @@ def test_redirection_ends_at_the_surface():
     surface = heading.position - 0.02 * heading.direction
     assert np.linalg.norm(ring - surface, axis=-1).min() < 1e-6
     # From above, 3 mm of the ring or more are before each point but those of its upper half.
-    assert surface[2] > -0.001 and np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
+    assert surface[2] > -0.001
+    assert np.allclose(heading.direction, [0, 0, -1], atol=1e-6)
 
 
 def test_redirection_is_the_smallest_rotation():
@@ -181,9 +184,8 @@ def test_redirection_ends_where_a_hand_closes():
     """Two plates across the fingers, one of 14 cm that is nearer, one of 6 cm: 12 cm are the
     most.
     """
-    wide, narrow = (
-        [[x, y, 0] for y in np.linspace(-half, half, 15)] for x, half in ((0.0, 0.07), (0.1, 0.03))
-    )
+    wide = [[0.0, y, 0] for y in np.linspace(-0.07, 0.07, 15)]
+    narrow = [[0.1, y, 0] for y in np.linspace(-0.03, 0.03, 15)]
     heading = _redirected([*wide, *narrow], [[-0.1, 0, 0]], [0, 0, -1], [0, 1, 0])
     np.testing.assert_allclose(heading.position[[0, 2]], [0.1, -0.02], atol=1e-6)
 
@@ -204,9 +206,10 @@ def test_redirected_headings_lead_to_the_graspable_region(seed):
     """For any cloud: a point of the region is 2 cm before the position, and the rules have nothing
     more to change.
     """
-    _, surface, asked = scene(seed)
-    done = resolved(surface, asked, _flags(affordance=True))
-    moved, heading = np.asarray(done.redirected), jax.device_get(done.goal["heading"])
+    _, surface, goal = scene(seed)
+    done = resolved(surface, goal, _flags(affordance=True))
+    moved = np.asarray(done.redirected)
+    heading = jax.device_get(done.goal["heading"])
     assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     before = heading.position - 0.02 * heading.direction
     away = np.where(
@@ -215,36 +218,34 @@ def test_redirected_headings_lead_to_the_graspable_region(seed):
     assert (away[moved] < 1e-5).all()
     np.testing.assert_allclose(np.linalg.norm(heading.direction, axis=-1), 1.0, atol=1e-5)
     np.testing.assert_allclose(np.sum(heading.direction * heading.cross, -1), 0.0, atol=1e-5)
-    for name, given_array in asked["heading"]._asdict().items():
+    for name, given_array in goal["heading"]._asdict().items():
         np.testing.assert_allclose(getattr(heading, name)[~moved], given_array[~moved], atol=1e-6)
 
 
 def test_parallel_cross_direction_is_replaced():
-    _, surface, asked = scene(3)
+    _, surface, goal = scene(3)
     for wobble in (0.0, 1e-7):
-        cross = asked["heading"].direction + np.float32([wobble, 0, 0])
-        heading = resolved(surface, asked.replace("heading", cross=cross), _flags()).goal["heading"]
+        cross = goal["heading"].direction + np.float32([wobble, 0, 0])
+        heading = resolved(surface, goal.replace("heading", cross=cross), _flags()).goal["heading"]
         np.testing.assert_allclose(np.sum(heading.cross * heading.direction, -1), 0.0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(heading.cross, axis=-1), 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("end_x", "aligned"), [(0.1, True), (-0.1, False)])
 def test_trajectory_and_affordance_must_agree(end_x, aligned):
-    surface, asked = _two_regions(graspable_x=0.1, avoid_x=-0.1)
-    path = asked["trajectory"].position.copy()
+    surface, goal = _two_regions(graspable_x=0.1, avoid_x=-0.1)
+    path = goal["trajectory"].position.copy()
     path[:, -1] = [end_x, 0.0, 0.05]
-    asked = asked.replace("trajectory", position=path)
+    goal = goal.replace("trajectory", position=path)
     both = _flags(affordance=True, trajectory=True)
-    assert np.all(np.asarray(resolved(surface, asked, both).aligned) == aligned)
-    assert np.all(resolved(surface, asked, _flags(trajectory=True)).aligned)
+    assert np.all(np.asarray(resolved(surface, goal, both).aligned) == aligned)
+    assert np.all(resolved(surface, goal, _flags(trajectory=True)).aligned)
 
 
-def test_explanations_name_what_is_overridden():
+def test_explanations_name_overridden_constraints():
     words = " ".join(explain(["affordance", "pose", "trajectory"]))
-    assert (
-        "only the fingers of the reference pose count" in words.lower()
-        and "overridden by the reference pose" in words
-    )
+    assert "only the fingers of the reference pose count" in words.lower()
+    assert "overridden by the reference pose" in words
     assert explain([]) == ["The heading guides the wrist."]
 
 
@@ -276,16 +277,16 @@ def all_of(avoid=None, **constraints):
     """Contradictions of a request for these constraints, and for an affordance if points are to be
     avoided.
     """
-    asked = constraints if avoid is None else {**constraints, "affordance": {}}
-    goal = goal_of(HAND, TaskConfig(), GraspRequest(asked))
+    requested = constraints if avoid is None else {**constraints, "affordance": {}}
+    goal = goal_of(HAND, TaskConfig(), GraspRequest(requested))
     return contradictions(
-        HAND, POINTS, np.zeros(len(POINTS), bool) if avoid is None else avoid, goal, asked
+        HAND, POINTS, np.zeros(len(POINTS), bool) if avoid is None else avoid, goal, requested
     )
 
 
 def only(avoid=None, **constraints):
-    (found,) = all_of(avoid, **constraints)
-    return found
+    (conflict,) = all_of(avoid, **constraints)
+    return conflict
 
 
 def test_agreeing_constraints_have_no_message():
@@ -307,25 +308,26 @@ def test_agreeing_constraints_have_no_message():
 def test_trajectory_to_avoid_region_is_refused():
     end = np.array([0.08, 0.03, 0.0])
     path = np.linspace(end + np.array([0, 0.2, 0]), end, 15)
-    found = only(AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))})
-    assert found.refused and (found.weaker, found.stronger) == ("affordance", "trajectory")
-    graspable = np.hypot(0.08 - POINTS[~AVOID][:, 0].max(), 0.03)
-    assert (
-        "3.0 cm from the avoid region" in found.message
-        and f"{100 * graspable:.1f} cm from the" in found.message
+    conflict = only(
+        AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))}
     )
+    assert conflict.refused
+    assert conflict.weaker == "affordance"
+    assert conflict.stronger == "trajectory"
+    graspable = np.hypot(0.08 - POINTS[~AVOID][:, 0].max(), 0.03)
+    assert "3.0 cm from the avoid region" in conflict.message
+    assert f"{100 * graspable:.1f} cm from the" in conflict.message
 
 
 def test_pose_off_the_trajectory_keeps_its_fingers():
-    pose, path = at((-0.06, 0.0, 0.0)), path_to((-0.06, 0.0, 0.0))
-    found = only(
+    pose = at((-0.06, 0.0, 0.0))
+    path = path_to((-0.06, 0.0, 0.0))
+    conflict = only(
         pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path
     )
-    assert (found.weaker, found.stronger, found.refused) == ("pose", "trajectory", False)
-    assert (
-        "5.0 cm and 0 degrees" in found.message
-        and "only the fingers of the pose count" in found.message
-    )
+    assert (conflict.weaker, conflict.stronger, conflict.refused) == ("pose", "trajectory", False)
+    assert "5.0 cm and 0 degrees" in conflict.message
+    assert "only the fingers of the pose count" in conflict.message
     turned = np.array([np.cos(0.5), np.sin(0.5), 0.0, 0.0])
     assert (
         "0.0 cm and 57 degrees"
@@ -336,9 +338,10 @@ def test_pose_off_the_trajectory_keeps_its_fingers():
 def test_pose_on_avoid_region_names_the_links():
     tip = HAND.keypoints[len(HAND.links) + 1]
     pose = {"q": np.zeros(20), "quaternion": NOT_TURNED}
-    found = only(AVOID, pose={**pose, "position": np.array([0.08, 0.0, 0.0]) - tip})
-    assert (found.weaker, found.stronger, found.refused) == ("affordance", "pose", False)
-    assert "index_distal" in found.message and "thumb" not in found.message
+    conflict = only(AVOID, pose={**pose, "position": np.array([0.08, 0.0, 0.0]) - tip})
+    assert (conflict.weaker, conflict.stronger, conflict.refused) == ("affordance", "pose", False)
+    assert "index_distal" in conflict.message
+    assert "thumb" not in conflict.message
     assert all_of(AVOID, pose={**pose, "position": np.array([-0.08, 0, 0]) - tip}) == []
 
 
@@ -346,17 +349,22 @@ def test_pose_on_avoid_region_names_the_links():
 def test_contradicting_heading_is_overridden(stronger):
     place = (-0.06, 0.0, 0.0)
     reference = {"pose": at(place)} if stronger == "pose" else {"trajectory": path_to(place)}
-    found = only(heading={"direction": -HEADING}, **reference)
-    assert (found.weaker, found.stronger) == ("heading", stronger)
-    assert "180 degrees" in found.message and f"The {stronger} overrides it" in found.message
+    conflict = only(heading={"direction": -HEADING}, **reference)
+    assert conflict.weaker == "heading"
+    assert conflict.stronger == stronger
+    assert "180 degrees" in conflict.message
+    assert f"The {stronger} overrides it" in conflict.message
 
 
 def test_heading_to_avoid_region_is_redirected():
-    found = only(
+    conflict = only(
         AVOID,
         heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])},
     )
-    assert (found.weaker, found.stronger, found.refused) == ("heading", "affordance", False)
-    assert (
-        "0.0 cm from the avoid region" in found.message and "redirects the heading" in found.message
+    assert (conflict.weaker, conflict.stronger, conflict.refused) == (
+        "heading",
+        "affordance",
+        False,
     )
+    assert "0.0 cm from the avoid region" in conflict.message
+    assert "redirects the heading" in conflict.message

@@ -34,7 +34,7 @@ def observed(time, hold, mass=0.5, friction=0.8):
 
 
 def test_values_by_hand():
-    found = observed(time=60, hold=100)
+    inputs = observed(time=60, hold=100)
     strength = tip_forces(HAND).sum()
     expected = {
         "mass": 0.5,
@@ -44,7 +44,7 @@ def test_values_by_hand():
         "stationary": 0.0,
         "hold_remaining": 90 / 200,
     }
-    assert found == pytest.approx(expected, rel=1e-6)
+    assert inputs == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(("time", "remaining"), [(0, 100), (50, 100), (51, 99), (150, 0), (175, 0)])
@@ -60,9 +60,10 @@ def test_the_hold_runs_down_once_the_table_is_gone(time, remaining):
     friction=st.floats(0.0, 10.0),
 )
 def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
-    found = observed(time, hold, mass, friction)
-    assert np.isfinite(list(found.values())).all()
-    assert 0.0 <= found["hold_remaining"] <= 1.0 and 0.0 <= found["load"] <= privileged.MOST_LOAD
+    inputs = observed(time, hold, mass, friction)
+    assert np.isfinite(list(inputs.values())).all()
+    assert 0.0 <= inputs["hold_remaining"] <= 1.0
+    assert 0.0 <= inputs["load"] <= privileged.MOST_LOAD
 
 
 @pytest.mark.parametrize(

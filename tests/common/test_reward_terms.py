@@ -12,7 +12,8 @@ from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.reward import reward_terms
 from tests.scenes import HAND, L, evaluated, near_targets, scene, scene_of
 
-TASK, X = TaskConfig(), np.array([1.0, 0.0, 0.0])
+TASK = TaskConfig()
+X = np.array([1.0, 0.0, 0.0])
 turned = partial(rotations.multiply, rotations.from_rotation_vector(0.2 * X))
 # Links of thumb and index finger
 PRESSING, HARD, SOFT, FREE = np.flatnonzero(np.isin(HAND.link_fingers, (0, 1)))[:4]
@@ -85,7 +86,7 @@ def base():
     state, surface, goal = scene(0)
     goal, force = near_targets(state, goal, 0), np.zeros((L, 3))
     force[[PRESSING, HARD, SOFT], 0] = 1.0, 12.0, 6.0  # of which the first is in contact
-    found = scene_of(TASK, state, surface, goal)
+    base_scene = scene_of(TASK, state, surface, goal)
     for path, value in {
         "state.object_position_initial": state.object_position
         + X,  # beyond 0.2 m, where the cost saturates
@@ -101,17 +102,17 @@ def base():
         "goal.values.fingers.allowed": np.arange(len(HAND.fingers)) < 2,
         "goal.values.force.limit": 8.0,
     }.items():
-        found = replaced(
-            found,
+        base_scene = replaced(
+            base_scene,
             path,
             lambda old, value=value: np.broadcast_to(value, old.shape).astype(old.dtype),
         )
-    return found, evaluated(reward_terms, found, RewardWeights())
+    return base_scene, evaluated(reward_terms, base_scene, RewardWeights())
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_quantity_changes_only_its_term(name, base):
-    found, before = base
-    after = evaluated(reward_terms, replaced(found, *CASES[name]), RewardWeights())
+    base_scene, before = base
+    after = evaluated(reward_terms, replaced(base_scene, *CASES[name]), RewardWeights())
     assert {other for other, value in after.items() if np.any(value != before[other])} == {name}
     assert np.all(after[name] != before[name])

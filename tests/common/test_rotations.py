@@ -24,7 +24,8 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
 @settings(max_examples=15, deadline=None)
 @given(seeds, seeds)
 def test_products_rotations_and_matrices_agree_with_scipy(a, b):
-    first, second = _random(a), _random(b)
+    first = _random(a)
+    second = _random(b)
     vectors = np.random.default_rng(a).normal(size=(8, 3)).astype(np.float32)
     np.testing.assert_allclose(
         np.abs(np.sum(rotations.multiply(_wxyz(first), _wxyz(second)) * _wxyz(first * second), -1)),
@@ -70,7 +71,7 @@ def test_euler_angles_are_intrinsic_xyz(seed):
     assert np.abs(other - far).max() <= np.pi + 1e-5
 
 
-def test_euler_angles_go_on_where_y_passes_ninety_degrees():
+def test_euler_angles_stay_continuous_beyond_ninety_degrees():
     """By hand: 95 degrees about y from a wrist at 89 stays (0, 95, 0), and is not (180, 85,
     180).
     """
@@ -93,12 +94,12 @@ def test_euler_angles_go_on_where_y_passes_ninety_degrees():
 @given(st.floats(-0.5, 0.5), st.sampled_from((1.0, -1.0)))
 def test_a_path_of_two_and_a_half_radians_about_y_is_followed_without_a_jump(x, sign):
     """Every angle of the steps is worked out by hand: x stays, y grows."""
-    wanted = np.stack([np.full(51, x), sign * np.linspace(0.0, 2.5, 51), np.zeros(51)], -1).astype(
+    angles = np.stack([np.full(51, x), sign * np.linspace(0.0, 2.5, 51), np.zeros(51)], -1).astype(
         np.float32
     )
-    near = wanted[0]
+    near = angles[0]
     for quaternion, expected in zip(
-        rotations.euler_to_quaternion(jnp.array(wanted)), wanted, strict=True
+        rotations.euler_to_quaternion(jnp.array(angles)), angles, strict=True
     ):
         near = rotations.quaternion_to_euler(quaternion, near)
         np.testing.assert_allclose(near, expected, atol=5e-3)
@@ -113,7 +114,8 @@ def test_the_shortest_rotation_carries_one_vector_to_the_other(seed):
         for v in rng.normal(size=(3, 8, 3)).astype(np.float32)
     )
     axis = np.cross(a, c) / np.linalg.norm(np.cross(a, c), axis=-1, keepdims=True)
-    b[0], b[1] = -a[0], a[1]
+    b[0] = -a[0]
+    b[1] = a[1]
     turn = np.asarray(rotations.shortest(a, b, axis))
     np.testing.assert_allclose(rotations.rotate(turn, a), b, atol=2e-5)
     expected = np.arccos(np.clip(np.sum(a * b, -1), -1.0, 1.0))
@@ -130,8 +132,10 @@ def test_axis_rotation_by_hand():
 
 def test_poses_compose_and_invert():
     rng = np.random.default_rng(3)
-    p, q = rng.normal(size=(8, 3)).astype(np.float32), _wxyz(_random(1))
-    p2, q2 = rng.normal(size=(8, 3)).astype(np.float32), _wxyz(_random(2))
+    p = rng.normal(size=(8, 3)).astype(np.float32)
+    q = _wxyz(_random(1))
+    p2 = rng.normal(size=(8, 3)).astype(np.float32)
+    q2 = _wxyz(_random(2))
     local = rotations.relative_pose(p, q, p2, q2)
     back = rotations.compose_pose(p, q, *local)
     np.testing.assert_allclose(back[0], p2, atol=1e-5)

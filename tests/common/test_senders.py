@@ -67,7 +67,8 @@ def test_names_and_connections_of_an_address_are_one_account(listening):
     accounts = [one.account for one in senders]
     assert accounts == ["127.0.0.1", "127.0.0.1", "127.0.0.1", "127.0.0.2"]
     connections = [one.name for one in senders]
-    assert connections[0] == connections[1] and len(set(connections)) == 3
+    assert connections[0] == connections[1]
+    assert len(set(connections)) == 3
 
 
 def test_foreign_clients_are_one_account(listening):
@@ -76,7 +77,8 @@ def test_foreign_clients_are_one_account(listening):
             with bare_session("client", connect=f"tcp/127.0.0.1:{port}") as session:
                 query = encode(Message())
                 list(session.get(KEYS.act_for(name), payload=query, timeout=5.0))
-    assert len(senders) == 2 and senders[0].account == senders[1].account
+    assert len(senders) == 2
+    assert senders[0].account == senders[1].account
 
 
 class Connections:
@@ -106,7 +108,8 @@ def test_invented_sources_are_few_peers_and_listings():
         invented.add(senders.of_query(query_of(f"invented {number}"), key))
         real = senders.of_query(query_of("real"), KEYS.act)
         assert real == Peer("10.0.0.7", "real")
-    assert len(invented) <= 64 and len({peer.account for peer in invented}) == 1
+    assert len(invented) <= 64
+    assert len({peer.account for peer in invented}) == 1
     assert connections.listings < 2500
 
 

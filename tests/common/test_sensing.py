@@ -37,7 +37,7 @@ rotations = Compiled(module)
 _draw_sensors = jax.jit(draw_parameters, static_argnums=(0, 1, 3))
 
 
-def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **given):
+def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **options):
     """One tracker that shows each pose at once, without errors, but for what is given."""
     bias = {"position_bias": position_bias, "rotation_bias": rotation_bias}
     fields = {
@@ -52,7 +52,7 @@ def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **give
     types = {"delay": np.int32, "latency": np.int32}
     arrays = {
         name: np.full(1, value, types.get(name, np.float32))
-        for name, value in {**fields, **given}.items()
+        for name, value in {**fields, **options}.items()
     }
     biases = {
         name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")
@@ -109,13 +109,13 @@ def shown(own, poses, room):
 PATH = np.array([np.concatenate(truth(step)) for step in range(STEPS)], np.float32)
 
 
-def test_a_perfect_tracker_shows_the_true_pose():
+def test_a_perfect_tracker_measures_the_true_pose():
     np.testing.assert_array_equal(shown(sensors(), PATH, 1), PATH)
 
 
 @settings(max_examples=12, deadline=None)
 @given(delay=st.integers(0, 12))
-def test_a_delay_of_k_steps_shows_the_pose_of_k_steps_ago(delay):
+def test_a_delay_of_k_steps_measures_the_pose_of_k_steps_ago(delay):
     expected = [np.concatenate(truth(step - delay)) for step in range(STEPS)]
     np.testing.assert_array_equal(shown(sensors(delay=delay), PATH, 13), expected)
 
@@ -124,19 +124,19 @@ def test_samples_are_held_until_the_next_one_arrives():
     """At one sample in 2.5 control steps, which begin 0.6 periods after the last: floor(n / 2.5 +
     0.6) rises at n = 1 (1.0), 4 (2.2), 6 (3.0), 9 (4.2), 11 (5.0); each is shown three steps
     later."""
-    found = np.asarray(shown(sensors(period=2.5, phase=0.6, delay=3), PATH, 4))[:15, 0]
-    np.testing.assert_array_equal(found, [0, 0, 0, 0, 1, 1, 1, 4, 4, 6, 6, 6, 9, 9, 11])
+    measured = np.asarray(shown(sensors(period=2.5, phase=0.6, delay=3), PATH, 4))[:15, 0]
+    np.testing.assert_array_equal(measured, [0, 0, 0, 0, 1, 1, 1, 4, 4, 6, 6, 6, 9, 9, 11])
 
 
 @settings(max_examples=12, deadline=None)
 @given(dropout=st.floats(0.0, 1.0), period=st.floats(1.0, 10.0))
-def test_what_is_lost_leaves_the_last_pose(dropout, period):
+def test_a_lost_sample_leaves_the_last_pose(dropout, period):
     """Every step shows what the step before it showed, or the present pose; all are lost at 1, none
     at 0.
     """
-    found = np.asarray(shown(sensors(dropout=dropout, period=period), PATH, 1))[:, 0]
-    held = found[1:] == found[:-1]
-    np.testing.assert_array_equal(found[1:][~held], PATH[1:, 0][~held])
+    measured = np.asarray(shown(sensors(dropout=dropout, period=period), PATH, 1))[:, 0]
+    held = measured[1:] == measured[:-1]
+    np.testing.assert_array_equal(measured[1:][~held], PATH[1:, 0][~held])
     assert held.mean() >= 1 - 1 / period - 2 / STEPS
     assert (
         held.all() if dropout == 1.0 else dropout > 0 or held.mean() <= 1 - 1 / period + 2 / STEPS
@@ -145,29 +145,29 @@ def test_what_is_lost_leaves_the_last_pose(dropout, period):
 
 def test_errors_have_their_declared_size():
     resting = np.broadcast_to(PATH[5], (4000, 7))
-    found = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), resting, 1))
-    away = found[:, :3] - resting[:, :3]
+    measured = np.asarray(shown(sensors(position_noise=0.005, rotation_noise=0.05), resting, 1))
+    away = measured[:, :3] - resting[:, :3]
     np.testing.assert_allclose(away.std(0), 0.005, rtol=0.05)
     np.testing.assert_allclose(away.mean(0), 0.0, atol=3e-4)
-    turn = rotations.multiply(found[:, 3:], rotations.conjugate(jnp.asarray(resting[:, 3:])))
+    turn = rotations.multiply(measured[:, 3:], rotations.conjugate(jnp.asarray(resting[:, 3:])))
     np.testing.assert_allclose(2.0 * np.std(turn[:, 1:], 0), 0.05, rtol=0.05)
-    np.testing.assert_allclose(np.linalg.norm(found[:, 3:], axis=1), 1.0, atol=1e-5)
-    assert not np.array_equal(found[0], found[1])
+    np.testing.assert_allclose(np.linalg.norm(measured[:, 3:], axis=1), 1.0, atol=1e-5)
+    assert not np.array_equal(measured[0], measured[1])
     again = shown(sensors(position_noise=0.005, rotation_noise=0.05), resting, 1)
-    np.testing.assert_array_equal(found, again)
+    np.testing.assert_array_equal(measured, again)
 
 
 def test_an_offset_is_that_of_every_sample():
     """The object lies turned by 0.1 rad about z; half a turn about x more takes its z axis down."""
     resting = np.broadcast_to(np.append([0.1, 0.2, 0.3], PATH[5, 3:]), (20, 7)).astype(np.float32)
-    found = np.asarray(
+    measured = np.asarray(
         shown(
             sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), resting, 1
         )
     )
-    np.testing.assert_allclose(found[:, :3], np.tile([0.11, 0.2, 0.28], (20, 1)), atol=1e-6)
-    np.testing.assert_array_equal(found, np.broadcast_to(found[0], found.shape))
-    down = rotations.rotate(jnp.asarray(found[0, 3:]), jnp.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(measured[:, :3], np.tile([0.11, 0.2, 0.28], (20, 1)), atol=1e-6)
+    np.testing.assert_array_equal(measured, np.broadcast_to(measured[0], measured.shape))
+    down = rotations.rotate(jnp.asarray(measured[0, 3:]), jnp.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-5)
     config = SensingConfig(position_bias=(0.004, 0.004), rotation_bias=(0.03, 0.03))
     drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 4000))
@@ -187,7 +187,7 @@ def test_resting_pose_is_the_mean_of_readings():
     )
     rows = rows.astype(np.float32)
 
-    own = sensors()
+    perfect = sensors()
 
     def means(table, settle):
         task = dataclasses.replace(TASK, sensing=SensingConfig(settle=settle))
@@ -195,21 +195,21 @@ def test_resting_pose_is_the_mean_of_readings():
 
         @jax.jit
         def track(tracker, time, pose, present):
-            return sensor.step(own, tracker, moment_of(task, time, pose, present))
+            return sensor.step(perfect, tracker, moment_of(task, time, pose, present))
 
         start = EpisodeStart(hand=HAND, task=task, pose=rows[:1], surface=None, goal=None)
-        tracker = sensor.begin(own, start)
-        found = []
+        tracker = sensor.begin(perfect, start)
+        estimates = []
         for step, row in enumerate(rows[1:], 1):
             present = jnp.array([step < table])
             tracker = track(tracker, jnp.array([step]), row[None], present)
-            found.append(np.asarray(tracker.first[0]))
-        return np.array(found)
+            estimates.append(np.asarray(tracker.first[0]))
+        return np.array(estimates)
 
-    found = means(9, 0.04)
-    np.testing.assert_allclose(found[:, 0], [0.006, 0.002, 0.002, 0.002, 0.002], atol=1e-6)
-    np.testing.assert_allclose(found[:, 4], [np.sin(0.01), 0.0, 0.0, 0.0, 0.0], atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(found[:, 3:], axis=1), 1.0, atol=1e-6)
+    estimates = means(9, 0.04)
+    np.testing.assert_allclose(estimates[:, 0], [0.006, 0.002, 0.002, 0.002, 0.002], atol=1e-6)
+    np.testing.assert_allclose(estimates[:, 4], [np.sin(0.01), 0.0, 0.0, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(estimates[:, 3:], axis=1), 1.0, atol=1e-6)
     np.testing.assert_allclose(means(2, 0.04)[:, 0], [0.006] * 5, atol=1e-6)  # the table is gone
     np.testing.assert_array_equal(means(9, 0.0), np.broadcast_to(rows[0], (5, 7)))
 
@@ -222,14 +222,19 @@ def test_trackers_are_drawn_from_their_ranges():
         (0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03)
     )
     drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 500))
-    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and longest(config, 0.01) == 11
-    assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
-    assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
-    assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
+    assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10}
+    assert longest(config, 0.01) == 11
+    assert drawn.period.min() == 1.0
+    assert 9.9 < drawn.period.max() <= 10.0
+    assert 0.1 <= drawn.dropout.min() < 0.11
+    assert 0.29 < drawn.dropout.max() <= 0.3
+    assert drawn.position_noise.max() <= 0.01
+    assert drawn.rotation_noise.min() >= 0.02
     assert set(np.unique(drawn.latency)) == {0, 1, 2, 3}
     assert len(np.unique(drawn.key, axis=0)) == 500
     perfect = jax.device_get(_draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
-    assert not any(np.any(field) for field in perfect[3:-1]) and (perfect.period == 1.0).all()
+    assert not any(np.any(field) for field in perfect[3:-1])
+    assert (perfect.period == 1.0).all()
 
 
 _push = jax.jit(push)
@@ -271,8 +276,8 @@ def readings_of(seed, state):
 def both(state, surface, goal, readings):
     """The full observation of a state, and the tracked one."""
     seen = get_sensor(TASK).seen(TASK, state, readings)
-    whole = observation.observe(scene_of(HAND, FULL, state, surface, goal))
-    return whole, observation.observe(scene_of(HAND, TASK, seen, surface, goal, readings))
+    full = observation.observe(scene_of(HAND, FULL, state, surface, goal))
+    return full, observation.observe(scene_of(HAND, TASK, seen, surface, goal, readings))
 
 
 def tracked(*given):
@@ -281,13 +286,14 @@ def tracked(*given):
 
 def named(row):
     """Parts of an observation by block and field."""
-    found, start = {}, 0
+    blocks = {}
+    start = 0
     for block, content in observation.fields(HAND, TASK).items():
         for field in content:
-            found[block, field.name] = row[start : start + field.size]
+            blocks[block, field.name] = row[start : start + field.size]
             start += field.size
     assert start == len(row)
-    return found
+    return blocks
 
 
 def test_tracked_observation_has_no_forces():
@@ -314,17 +320,18 @@ def test_tracked_observation_has_no_forces():
 def test_tracked_state_uses_the_tracked_pose():
     state, surface, goal = scene(2)
     readings = readings_of(2, state)
-    whole, own = (np.asarray(found)[1] for found in both(state, surface, goal, readings))
-    own, start = named(own), 0
+    full, observed = (np.asarray(vector)[1] for vector in both(state, surface, goal, readings))
+    observed, start = named(observed), 0
     for block, content in observation.fields(HAND, FULL).items():
         for field in content:
             if not field.privileged:
-                part = whole[start : start + field.size]
+                part = full[start : start + field.size]
                 np.testing.assert_allclose(
-                    own.pop((block, field.name)), part, atol=1e-5, err_msg=field.name
+                    observed.pop((block, field.name)), part, atol=1e-5, err_msg=field.name
                 )
             start += field.size
-    assert all(name.startswith("past") for _, name in own) and len(own) == 6
+    assert all(name.startswith("past") for _, name in observed)
+    assert len(observed) == 6
 
 
 def test_its_past_is_worked_out_by_hand():
@@ -341,10 +348,10 @@ def test_its_past_is_worked_out_by_hand():
         object_quaternion=rotations.multiply(jnp.asarray(quarter), present.object_quaternion),
     )
     state = state._replace(q=now.q)
-    found = named(np.asarray(tracked(state, surface, goal, push(readings, now)))[0])
+    observed = named(np.asarray(tracked(state, surface, goal, push(readings, now)))[0])
     past = {
         name.removeprefix("past "): part.reshape(TASK.history - 1, -1)
-        for (_, name), part in found.items()
+        for (_, name), part in observed.items()
         if "past" in name
     }
     np.testing.assert_allclose(past["q - q"], -0.1, atol=1e-6)
@@ -367,15 +374,14 @@ def test_wrist_velocity_is_the_last_displacement():
     np.testing.assert_allclose(
         seen.u_velocity, (readings.u[:, 0] - readings.u[:, 1]) / 0.01, rtol=1e-5
     )
-    assert (
-        not seen.contact_found.any()
-        and not seen.contact_force.any()
-        and not seen.object_velocity.any()
-    )
+    assert not seen.contact_found.any()
+    assert not seen.contact_force.any()
+    assert not seen.object_velocity.any()
     full = get_sensor(FULL).seen(FULL, state, readings)
     np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
     np.testing.assert_array_equal(full.contact_force, state.contact_force)
-    assert full.q_velocity.shape == (4, F) and full.contact_found.shape[1] == L
+    assert full.q_velocity.shape == (4, F)
+    assert full.contact_found.shape[1] == L
 
 
 @pytest.mark.parametrize(("latency", "faults"), [(0.07, 0), (0.08, 1)])

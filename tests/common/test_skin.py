@@ -43,15 +43,17 @@ def to_capsules(
     """(n,) distances of points to the surface of the nearest capsule of some links."""
     position, quaternion = mujoco_link_poses(hand, q)
     turns = Rotation.from_quat(quaternion, scalar_first=True)
-    found = []
+    distances = []
     for ends, radius, link in zip(
         hand.capsules, hand.capsule_radii, hand.capsule_links, strict=True
     ):
         if links is None or link in links:
             a, b = turns[int(link)].apply(ends - skin_of(hand).origins[link]) + position[link]
             share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-12), 0, 1)
-            found.append(np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - radius)
-    return np.min(found, 0)
+            distances.append(
+                np.linalg.norm(points - a - share[:, None] * (b - a), axis=-1) - radius
+            )
+    return np.min(distances, 0)
 
 
 def test_a_surface_net_of_a_ball_is_a_ball() -> None:
@@ -61,7 +63,8 @@ def test_a_surface_net_of_a_ball_is_a_ball() -> None:
     )
     points, faces = surface_net(values)
     mesh = trimesh.Trimesh(points - 8, faces, process=False)
-    assert mesh.is_volume and mesh.euler_number == 2
+    assert mesh.is_volume
+    assert mesh.euler_number == 2
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * 5.3**3, rel=0.06)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=-1) - 5.3).max() < 0.3
 
@@ -72,15 +75,14 @@ def test_nails_lie_on_the_skin_however_far_the_fingers_bend(share: float) -> Non
     half a millimetre.
     """
     hand = get_hand("human")
-    skin, (points, normals) = (
-        skin_of(hand),
-        posed(hand, share * np.array([joint.upper for joint in hand.joints])),
-    )
+    skin = skin_of(hand)
+    points, normals = posed(hand, share * np.array([joint.upper for joint in hand.joints]))
     flesh, nail = (skin.material == MATERIALS.index(kind) for kind in ("flesh", "nail"))
     below = cKDTree(points[flesh]).query(points[nail])[1]
     height = np.einsum("ni,ni->n", points[nail] - points[flesh][below], normals[flesh][below])
     rings = height.reshape(5, -1)[:, :84]  # of each nail the three rings on top
-    assert (rings.mean(1) > 1e-4).all() and (rings.mean(1) < 1e-3).all()
+    assert (rings.mean(1) > 1e-4).all()
+    assert (rings.mean(1) < 1e-3).all()
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -88,19 +90,21 @@ def test_a_skin_is_a_surface_with_weights(name: str) -> None:
     skin = skin_of(get_hand(name))
     assert 2000 < len(skin.faces) < 10_000
     np.testing.assert_allclose(skin.weights.sum(1), 1, atol=1e-5)
-    assert (skin.weights >= 0).all() and (skin.weights > 0).sum(1).max() <= 4
+    assert (skin.weights >= 0).all()
+    assert (skin.weights > 0).sum(1).max() <= 4
     np.testing.assert_allclose(np.linalg.norm(skin.normals, axis=-1), 1, atol=1e-5)
     corners = skin.points[skin.faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("fi,fi->f", flat, skin.normals[skin.faces].mean(1)) > 0).mean() > 0.995
     links, weights = skin.influences()
-    whole = np.zeros_like(skin.weights)
-    np.add.at(whole, (np.arange(len(links))[:, None], links), weights)
-    np.testing.assert_allclose(whole, skin.weights, atol=1e-6)
+    dense = np.zeros_like(skin.weights)
+    np.add.at(dense, (np.arange(len(links))[:, None], links), weights)
+    np.testing.assert_allclose(dense, skin.weights, atol=1e-6)
 
 
 def test_flesh_is_closed_and_fingers_have_no_webs() -> None:
-    hand, skin = get_hand("human"), skin_of(get_hand("human"))
+    hand = get_hand("human")
+    skin = skin_of(get_hand("human"))
     edges = np.concatenate([skin.faces[:, [0, 1]], skin.faces[:, [1, 2]], skin.faces[:, [2, 0]]])
     there, back = (sorted(map(tuple, part)) for part in (edges, edges[:, ::-1]))
     assert there == back  # each edge is passed as often one way as the other
@@ -116,7 +120,8 @@ def test_flesh_is_closed_and_fingers_have_no_webs() -> None:
     points, _ = posed(hand, bent)
     a, b, c = points[skin.parts()["flesh"]].swapaxes(0, 1)
     lengths = np.linalg.norm(np.concatenate([a - b, b - c, c - a]), axis=-1)
-    assert lengths.max() < 0.018 and np.mean(lengths > 0.010) < 2e-3
+    assert lengths.max() < 0.018
+    assert np.mean(lengths > 0.010) < 2e-3
 
 
 @pytest.mark.parametrize("closure", [0.0, 0.5, 1.0])
@@ -130,10 +135,11 @@ def test_flesh_lies_on_the_capsules_of_the_fingers(closure: float) -> None:
     skin = skin_of(hand)
     for finger in range(len(hand.fingers)):
         links = set(np.flatnonzero(hand.link_fingers == finger))
-        own = points[skin.weights[:, sorted(links)[1:]].max(1) > 0.8]
-        assert len(own) > 40
-        distance = to_capsules(hand, q, own, links)
-        assert distance.max() < 2e-3 and distance.min() > -2e-3 - 2e-3 * closure
+        flesh = points[skin.weights[:, sorted(links)[1:]].max(1) > 0.8]
+        assert len(flesh) > 40
+        distance = to_capsules(hand, q, flesh, links)
+        assert distance.max() < 2e-3
+        assert distance.min() > -2e-3 - 2e-3 * closure
 
 
 def test_normals_that_cancel_out_are_zero() -> None:
@@ -146,10 +152,12 @@ def test_normals_that_cancel_out_are_zero() -> None:
 
 @pytest.mark.parametrize("name", HANDS)
 def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
-    hand, skin = get_hand(name), skin_of(get_hand(name))
+    hand = get_hand(name)
+    skin = skin_of(get_hand(name))
     points, normals = skin.posed(skin.origins, np.broadcast_to(np.eye(3), (len(hand.links), 3, 3)))
     np.testing.assert_allclose(points, skin.points, atol=1e-6)
-    turn, shift = Rotation.from_rotvec([0.3, -1.0, 0.5]), np.array([0.1, 0.2, 0.3])
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
+    shift = np.array([0.1, 0.2, 0.3])
     moved, turned = skin.posed(
         turn.apply(skin.origins) + shift, np.broadcast_to(turn.as_matrix(), (len(hand.links), 3, 3))
     )
@@ -157,13 +165,13 @@ def test_a_skin_follows_the_wrist_and_its_links(name: str) -> None:
     np.testing.assert_allclose(turned, turn.apply(normals), atol=1e-5)
     # A tip's own points move with its frame alone.
     tip = hand.tip_links[1]
-    own = skin.weights[:, tip] > 0.999
+    of_tip = skin.weights[:, tip] > 0.999
     position, quaternion = mujoco_link_poses(hand, hand.q_closed)
     expected = Rotation.from_quat(quaternion[tip], scalar_first=True).apply(
-        skin.points[own] - skin.origins[tip]
+        skin.points[of_tip] - skin.origins[tip]
     )
     np.testing.assert_allclose(
-        posed(hand, hand.q_closed)[0][own], expected + position[tip], atol=5e-5
+        posed(hand, hand.q_closed)[0][of_tip], expected + position[tip], atol=5e-5
     )
 
 
@@ -190,9 +198,8 @@ def own(tmp_path, monkeypatch):
 
 def test_a_hands_meshes_are_its_surface_in_pictures_and_exports(own):
     skin = skin_of(own)
-    assert np.abs(np.sort(np.abs(skin.points[:8]), axis=None) - 0.02).max() < 1e-7 and set(
-        skin.parts()
-    ) == {"link"}
+    assert np.abs(np.sort(np.abs(skin.points[:8]), axis=None) - 0.02).max() < 1e-7
+    assert set(skin.parts()) == {"link"}
     drawn = posed_hand(own, own.q_open, np.zeros(3), Rotation.identity())
     np.testing.assert_array_equal(drawn.faces, skin.faces)
     motion = dataclasses.replace(episode().normalised(), hand=own.name, **hand_arrays(own))
@@ -237,7 +244,8 @@ def test_depth_of_meshes_and_capsules(own):
     )
     ball = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
     transforms = transforms_of(own, np.asarray(own.q_open, np.float32)[None])
-    field, upright = distance_field([ball]), np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
+    field = distance_field([ball])
+    upright = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
 
     def depth(*center):
         seen = np.array([center], np.float32), upright, np.zeros(1, int), field
@@ -269,7 +277,8 @@ def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_pat
         tmp_path / "own_claw.json",
         {"palm": (balls.vertices.astype("f4"), balls.faces.astype("i4"))},
     )
-    counts, draw = [], trimesh.sample.sample_surface
+    counts = []
+    draw = trimesh.sample.sample_surface
 
     def counted(mesh, count, seed):
         counts.append(count)
@@ -278,4 +287,5 @@ def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_pat
 
     monkeypatch.setattr(trimesh.sample, "sample_surface", counted)
     fresh = dataclasses.replace(own)
-    assert 0 < len(plausibility.mesh_points(fresh)[1]) <= 2048 and counts
+    assert 0 < len(plausibility.mesh_points(fresh)[1]) <= 2048
+    assert counts

@@ -41,15 +41,20 @@ def _compiled(function: Callable) -> Callable:
 
 
 FEATURES = jax.jit(functools.partial(features, HAND, TASK))
-OBSERVE, REWARD, ERRORS = _compiled(observe), _compiled(reward_terms), _compiled(errors)
-DECODE, GUIDANCE = _compiled(decode), _compiled(guidance_pose)
-WRIST, TO_JOINTS = jax.jit(wrist_pose), jax.jit(wrist_to_joints)
+OBSERVE = _compiled(observe)
+REWARD = _compiled(reward_terms)
+ERRORS = _compiled(errors)
+DECODE = _compiled(decode)
+GUIDANCE = _compiled(guidance_pose)
+WRIST = jax.jit(wrist_pose)
+TO_JOINTS = jax.jit(wrist_to_joints)
 HEADING_WRIST = jax.jit(functools.partial(heading_wrist_pose, HAND))
 CENTER = jax.jit(functools.partial(hand_center, HAND))
 
 
 def _blocks(observation: np.ndarray) -> dict[str, np.ndarray]:
-    out, start = {}, 0
+    out = {}
+    start = 0
     for name, size in layout(HAND, TASK):
         out[name] = np.asarray(observation)[:, start : start + size]
         start += size
@@ -115,7 +120,8 @@ def test_without_an_avoid_region_there_is_nothing_to_avoid():
         state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal
     ).by_constraint["affordance"]
     assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
-    assert not np.any(geometry.nearest) and not np.any(geometry.touching)
+    assert not np.any(geometry.nearest)
+    assert not np.any(geometry.touching)
 
 
 def test_observation_blocks_by_hand():
@@ -154,7 +160,7 @@ def test_normals_belong_to_the_nearest_points():
     before = np.asarray(OBSERVE(state, surface, goal))
     exact = surface._replace(normals=units(np.random.default_rng(0), 4, surface.points.shape[1]))
     task = dataclasses.replace(TASK, surface_normals=True)
-    found = np.asarray(
+    observed = np.asarray(
         jax.jit(lambda *given: observe(scene_of(HAND, task, *given)))(state, exact, goal)
     )
     described = fields(HAND, task)["state"]
@@ -163,11 +169,11 @@ def test_normals_belong_to_the_nearest_points():
     start = sum(field.size for field in described[: names.index("normal")])
     points = HAND.keypoints.shape[0]
     np.testing.assert_allclose(
-        np.delete(found, np.s_[start : start + 4 * points], 1), before, atol=1e-6
+        np.delete(observed, np.s_[start : start + 4 * points], 1), before, atol=1e-6
     )
     b = 2
-    normal = found[b, start : start + 3 * points].reshape(-1, 3)
-    height = found[b, start + 3 * points : start + 4 * points]
+    normal = observed[b, start : start + 3 * points].reshape(-1, 3)
+    height = observed[b, start + 3 * points : start + 4 * points]
     wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
     origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
     body = _rotation(state.object_quaternion[b])
@@ -305,7 +311,8 @@ def test_dropping_is_seen_five_centimetres_down():
 def test_fingers_integrate_actions_within_their_limits():
     state, surface, goal = scene(14)
     action = np.zeros((4, F + 6), np.float32)
-    action[:, 0], action[:, 1] = 1.0, 100.0
+    action[:, 0] = 1.0
+    action[:, 1] = 100.0
     target = DECODE(state, surface, goal, TASK.control, action).q_target
     np.testing.assert_allclose(
         target[:, 0],
@@ -380,7 +387,8 @@ def test_wrist_target_is_guidance_plus_residual():
         wrist_acceleration=0.0,
         wrist_angular_acceleration=0.0,
     )
-    zero, one = np.zeros((4, F + 6), np.float32), np.zeros((4, F + 6), np.float32)
+    zero = np.zeros((4, F + 6), np.float32)
+    one = np.zeros((4, F + 6), np.float32)
     one[:, F:] = 1.0
     still, pushed = (np.asarray(DECODE(state, surface, goal, far, a).u_target) for a in (zero, one))
     np.testing.assert_allclose(pushed - still, np.tile([0.02] * 3 + [0.1] * 3, (4, 1)), atol=1e-5)
@@ -399,11 +407,13 @@ def test_no_action_drives_the_wrist_beyond_its_limits():
     state, surface, goal = scene(17)
     state = state._replace(table=np.array([True, False, True, False]))
     share = np.where(state.table, 1.0, 1 / 3)
-    wrist, (mass, inertia) = HAND.wrist, HAND.wrist_inertia
+    wrist = HAND.wrist
+    mass, inertia = HAND.wrist_inertia
     for scale in (0.0, 1.0, -30.0):
         action = np.full((4, F + 6), scale, np.float32)
         target = np.asarray(DECODE(state, surface, goal, TASK.control, action).u_target)
-        lead, speed = target - state.u, state.u_velocity
+        lead = target - state.u
+        speed = state.u_velocity
         for part, kp, kv, inert, most, farthest in (
             (slice(0, 3), wrist.slide_kp, wrist.slide_kv, mass, 15.0, 0.04),
             (slice(3, 6), wrist.hinge_kp, wrist.hinge_kv, inertia, 150.0, 0.3),
@@ -445,31 +455,37 @@ def test_a_wrist_at_rest_starts_towards_its_guidance():
 def test_metrics_against_numpy():
     state, surface, goal = scene(18)
     geometry = FEATURES(state, surface, goal)
-    found, weights = {}, {}
+    expected_metrics = {}
+    weights = {}
     for name, (numerator, denominator) in ERRORS(state, surface, goal).items():
-        found[name], weights[name] = np.asarray(numerator), np.asarray(denominator)
+        expected_metrics[name] = np.asarray(numerator)
+        weights[name] = np.asarray(denominator)
     b = 0
     wrist_position, wrist_quaternion = (np.asarray(x)[b] for x in WRIST(state))
-    wrist, body = _rotation(wrist_quaternion), _rotation(state.object_quaternion[b])
-    v, target = wrist.apply(grasp_frame(HAND).heading), body.apply(goal["heading"].direction[b])
+    wrist = _rotation(wrist_quaternion)
+    body = _rotation(state.object_quaternion[b])
+    v = wrist.apply(grasp_frame(HAND).heading)
+    target = body.apply(goal["heading"].direction[b])
     np.testing.assert_allclose(
-        found["heading_rad"][b], np.arccos(np.clip(v @ target, -1, 1)), atol=1e-4
+        expected_metrics["heading_rad"][b], np.arccos(np.clip(v @ target, -1, 1)), atol=1e-4
     )
     points = np.asarray(points_of(state.q[b]))
     center = wrist.apply(np.asarray(CENTER(points))) + wrist_position
     off = center - body.apply(goal["heading"].position[b]) - state.object_position[b]
     np.testing.assert_allclose(
-        found["heading_m"][b], np.linalg.norm(off - (off @ target) * target), atol=1e-4
+        expected_metrics["heading_m"][b], np.linalg.norm(off - (off @ target) * target), atol=1e-4
     )
     pose = body.apply(goal["pose"].position[b]) + state.object_position[b]
-    np.testing.assert_allclose(found["pose_m"][b], np.linalg.norm(wrist_position - pose), atol=1e-4)
+    np.testing.assert_allclose(
+        expected_metrics["pose_m"][b], np.linalg.norm(wrist_position - pose), atol=1e-4
+    )
     base = _rotation(state.base_quaternion[b])
     turn = base.inv() * body * _rotation(goal["pose"].quaternion[b])
     hinges = _joint_differences(turn, state.u[b, 3:])
     expected = np.abs(np.concatenate([state.q[b] - goal["pose"].q[b], hinges])).mean()
-    np.testing.assert_allclose(found["pose_rad"][b], expected, atol=1e-3)
+    np.testing.assert_allclose(expected_metrics["pose_rad"][b], expected, atol=1e-3)
     links = np.sum(np.asarray(geometry.by_constraint["affordance"].touching)[b])
-    np.testing.assert_allclose(found["affordance_ratio"][b], links)
+    np.testing.assert_allclose(expected_metrics["affordance_ratio"][b], links)
     np.testing.assert_allclose(
         weights.pop("affordance_ratio")[b], np.sum(np.asarray(geometry.touching)[b])
     )
@@ -527,13 +543,11 @@ def test_an_error_is_divided_by_the_steps_that_were_summed(steps):
     """
     one = np.ones(1)
     step = {spec.name: (0.2 * one, one) for spec in metrics.specs(TASK)}
-    sums, accumulate = (
-        metrics.empty_sums(TASK, 1),
-        jax.jit(functools.partial(metrics.accumulate, TASK)),
-    )
+    sums = metrics.empty_sums(TASK, 1)
+    accumulate = jax.jit(functools.partial(metrics.accumulate, TASK))
     for _ in range(steps):
         sums = accumulate(sums, step, approach=one > 0, hold=one < 0)
-    found = metrics.episode_errors(TASK, sums)
-    np.testing.assert_allclose(found["trajectory_m"], 0.2, rtol=1e-5)
-    np.testing.assert_allclose(found["trajectory_rad"], 0.2, rtol=1e-5)
-    np.testing.assert_allclose(found["heading_m"], 0.0)
+    errors = metrics.episode_errors(TASK, sums)
+    np.testing.assert_allclose(errors["trajectory_m"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(errors["trajectory_rad"], 0.2, rtol=1e-5)
+    np.testing.assert_allclose(errors["heading_m"], 0.0)

@@ -22,7 +22,9 @@ from congrasp.common.task.sampling.trajectories import HUMAN, PAPER, make_trajec
 from tests.scenes import quaternions
 
 HAND = get_hand("human")
-COUNT, WAYPOINTS = 64, 15
+COUNT = 64
+WAYPOINTS = 15
+MANY = 4000
 
 
 def _make(position, quaternion, style):
@@ -95,8 +97,8 @@ def test_waypoints_are_evenly_spaced_and_leave_the_straight_line(poses, made):
 # --- disturbances ---
 
 
-MANY = 4000
-fingers_off, wrist_off = jax.jit(disturbed_fingers, static_argnums=0), jax.jit(disturbed_wrist)
+fingers_off = jax.jit(disturbed_fingers, static_argnums=0)
+wrist_off = jax.jit(disturbed_wrist)
 
 
 def _uniform(batch, numbers):
@@ -108,24 +110,27 @@ def test_zero_disturbance_changes_nothing():
     np.testing.assert_allclose(fingers_off(HAND, q, jnp.zeros(2), _uniform(2, 21)), q, atol=1e-6)
     path = jnp.arange(18.0).reshape(2, 3, 3)
     turns = jnp.tile(jnp.array([0.5, 0.5, -0.5, 0.5]), (2, 3, 1))
-    for found, given in zip(
+    for disturbed, original in zip(
         wrist_off(path, turns, jnp.zeros(2), _uniform(2, 15)), (path, turns), strict=True
     ):
-        np.testing.assert_allclose(found, given, atol=1e-6)
+        np.testing.assert_allclose(disturbed, original, atol=1e-6)
 
 
 def test_fingers_are_off_by_closure_and_joint():
     middle = 0.5 * (HAND.lower + HAND.upper)
     q = jnp.tile(jnp.array(middle), (MANY, 1))
-    found = np.asarray(fingers_off(HAND, q, jnp.ones(MANY), _uniform(MANY, fingers_numbers(HAND))))
-    assert np.all(found >= HAND.lower) and np.all(found <= HAND.upper)
+    disturbed = np.asarray(
+        fingers_off(HAND, q, jnp.ones(MANY), _uniform(MANY, fingers_numbers(HAND)))
+    )
+    assert np.all(disturbed >= HAND.lower)
+    assert np.all(disturbed <= HAND.upper)
     wide = np.argmax(HAND.upper - HAND.lower)  # 2.1 rad: clipping hardly matters
     way = middle[wide] - HAND.q_open[wide]
     np.testing.assert_allclose(
-        found[:, wide].mean(), HAND.q_open[wide] + np.mean(CLOSURE) * way, atol=0.03
+        disturbed[:, wide].mean(), HAND.q_open[wide] + np.mean(CLOSURE) * way, atol=0.03
     )
     spread = np.sqrt(JOINTS**2 + (CLOSURE[1] - CLOSURE[0]) ** 2 / 12 * way**2)
-    assert found[:, wide].std() == pytest.approx(spread, rel=0.1)
+    assert disturbed[:, wide].std() == pytest.approx(spread, rel=0.1)
 
 
 def test_disturbed_path_moves_rigidly():

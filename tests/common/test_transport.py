@@ -3,7 +3,6 @@ and end.
 """
 
 import contextlib
-import functools
 import os
 import signal
 import socket
@@ -25,10 +24,42 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_session import STAMP, LostSamples
 from congrasp.common.transport.zenoh_transport import MessageLimits, ZenohTransport
 from congrasp.common.wire.codec import Message, encode
+from tests.modules import fresh_copy
 from tests.socket_transport import SocketListener, SocketTransport
 from tests.waits import eventually, together
 
 KEYS = Keys("test")
+BUSY_PROCESS = """
+    import contextlib, socket, sys, threading, time
+    from congrasp.common.transport.keys import Keys
+    from congrasp.common.transport.zenoh_transport import ZenohTransport
+    from congrasp.common.wire.codec import Message
+    keys = Keys("test")
+    address = "127.0.0.1", int(sys.argv[1].rpartition(":")[2])
+    server = ZenohTransport(listen=[sys.argv[1]])
+    client = ZenohTransport(connect=[sys.argv[1]])
+    server.serve(keys.act, lambda key, message: message, workers=2)
+    server.watch_alive(keys.everyone, lambda key, alive: None)
+    client.declare_alive(keys.alive("actor", "a", "01"))
+    subscription = server.subscribe(keys.logs, depth=1)
+    client.publish(keys.log("event", "actor", "a"), Message())
+    client.query(keys.act, Message(), timeout=60)
+    def ask():
+        while True:
+            with contextlib.suppress(Exception):
+                client.query(keys.act, Message(), timeout=60)
+    for _ in range(3):
+        threading.Thread(target=ask, daemon=True).start()
+    print("ready", flush=True)
+    {end}
+"""
+SILENT_CONNECTION = (
+    "silent = socket.create_connection(address); "
+    "later = ZenohTransport(connect=[sys.argv[1]]); "
+    "sys.slow = type('Slow', (), {'__del__': lambda slow, sleep=time.sleep: sleep(4)})(); "
+    "sys.exit(3)"
+)
+"""Delays the closing of the listener; it returns while the interpreter shuts down slowly."""
 
 
 @pytest.fixture(params=["memory", "zenoh", "from outside"])
@@ -127,7 +158,8 @@ def test_errors_travel_in_words(pair):
         client.query(KEYS.act, Message(meta={"bug": False}), timeout=60)
     with pytest.raises(RefusedError, match="ValueError") as caught:
         client.query(KEYS.act, Message(meta={"bug": True}), timeout=60)
-    assert "secret" not in str(caught.value) and type(caught.value) is RefusedError
+    assert "secret" not in str(caught.value)
+    assert type(caught.value) is RefusedError
     with pytest.raises(OverloadedError, match=r"^Ask later\.$"):
         client.query(KEYS.act, Message(meta={"bug": False, "busy": True}), timeout=60)
 
@@ -190,7 +222,8 @@ def test_query_after_the_server_closed_fails_at_once(pair):
 
 def test_closing_waits_for_handlers_that_still_work(pair):
     server, client = pair
-    began, ended = threading.Event(), threading.Event()
+    began = threading.Event()
+    ended = threading.Event()
 
     def handler(key, message):
         began.set()
@@ -229,9 +262,9 @@ def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
     server.publish(KEYS.log("metrics", "learner", "0"), Message(meta={"n": -1}))
     last = None
     while last != -1:
-        found = subscription.receive(60)
-        assert found is not None
-        last = found[1].meta["n"]
+        newest = subscription.receive(60)
+        assert newest is not None
+        last = newest[1].meta["n"]
     dropped = subscription.dropped
     for n in range(10):
         server.publish(KEYS.log("event", "learner", "0"), Message({"x": np.zeros(3)}, {"n": n}))
@@ -268,9 +301,10 @@ def test_closed_subscription_lets_its_reader_go(pair):
     assert time.monotonic() - start < 15
 
 
-def test_tokens_show_who_is_there(pair):
+def test_tokens_list_the_live_peers(pair):
     server, client = pair
-    early, late = KEYS.alive("actor", "a", "01"), KEYS.alive("actor", "b", "02")
+    early = KEYS.alive("actor", "a", "01")
+    late = KEYS.alive("actor", "b", "02")
     seen = []
     client.declare_alive(early)
     server.watch_alive(KEYS.everyone, lambda key, alive: seen.append((key, alive)))
@@ -283,7 +317,8 @@ def test_tokens_show_who_is_there(pair):
 
 def test_memory_copies_nothing():
     hub = MemoryHub()
-    server, client = MemoryTransport(hub), MemoryTransport(hub)
+    server = MemoryTransport(hub)
+    client = MemoryTransport(hub)
     server.serve(KEYS.act, lambda key, message: message)
     message = Message({"x": object()})
     assert client.query(KEYS.act, message, timeout=60) is message
@@ -372,12 +407,14 @@ def test_damaged_and_oversized_messages_are_refused():
             lambda key, message: message,
             on_damage=lambda key, error: damaged.append(str(error)),
         )
-        session = client._session(KEYS.act)
-        whole = encode(Message({"x": np.zeros(8)}))
-        for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
+        session = client.session(KEYS.act)
+        intact = encode(Message({"x": np.zeros(8)}))
+        for payload in (b"", intact[:-1], b"\xff" * 8 + intact[8:], intact[:-1] + b"\x01"):
             reply = next(iter(session.get(KEYS.act, payload=payload, timeout=60)))
-            assert reply.err is not None and b"message" in reply.err.payload.to_bytes().lower()
-        assert len(damaged) == 4 and "checksum" in damaged[3]
+            assert reply.err is not None
+            assert b"message" in reply.err.payload.to_bytes().lower()
+        assert len(damaged) == 4
+        assert "checksum" in damaged[3]
         # Zenoh drops what is longer than the receiver takes, and the link goes on.
         assert not [r for r in session.get(KEYS.act, payload=bytes(2 << 20), timeout=0.5) if r.ok]
         assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=60).meta == {"n": 1}
@@ -400,41 +437,6 @@ def test_peer_that_comes_back_is_found_again():
             server.watch_alive(KEYS.everyone, lambda key, alive: seen.append(alive))
             eventually(lambda: _answers(client, KEYS.act))
             eventually(lambda: seen == [True])
-
-
-BUSY_PROCESS = """
-    import contextlib, socket, sys, threading, time
-    from congrasp.common.transport.keys import Keys
-    from congrasp.common.transport.zenoh_transport import ZenohTransport
-    from congrasp.common.wire.codec import Message
-    keys = Keys("test")
-    address = "127.0.0.1", int(sys.argv[1].rpartition(":")[2])
-    server = ZenohTransport(listen=[sys.argv[1]])
-    client = ZenohTransport(connect=[sys.argv[1]])
-    server.serve(keys.act, lambda key, message: message, workers=2)
-    server.watch_alive(keys.everyone, lambda key, alive: None)
-    client.declare_alive(keys.alive("actor", "a", "01"))
-    subscription = server.subscribe(keys.logs, depth=1)
-    client.publish(keys.log("event", "actor", "a"), Message())
-    client.query(keys.act, Message(), timeout=60)
-    def ask():
-        while True:
-            with contextlib.suppress(Exception):
-                client.query(keys.act, Message(), timeout=60)
-    for _ in range(3):
-        threading.Thread(target=ask, daemon=True).start()
-    print("ready", flush=True)
-    {end}
-"""
-
-
-SILENT_CONNECTION = (
-    "silent = socket.create_connection(address); "
-    "later = ZenohTransport(connect=[sys.argv[1]]); "
-    "sys.slow = type('Slow', (), {'__del__': lambda slow, sleep=time.sleep: sleep(4)})(); "
-    "sys.exit(3)"
-)
-"""Delays the closing of the listener; it returns while the interpreter shuts down slowly."""
 
 
 @pytest.mark.parametrize(
@@ -488,7 +490,7 @@ def test_admission_sends_requests_away_unread(pair):
         ("", "(acc: (worker_threads: 64), )"),
     ],
 )
-def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_s(given, merged):
+def test_listener_threads_are_merged_into_the_users_settings(given, merged):
     code = "import os, congrasp.common.transport.zenoh_session; print(os.environ['ZENOH_RUNTIME'])"
     env = {**os.environ, "ZENOH_RUNTIME": given}
     assert (
@@ -496,7 +498,7 @@ def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_
     )
 
 
-def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
+def test_listener_threads_start_with_the_users_settings():
     script = (
         "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as "
         "T; "
@@ -510,7 +512,8 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     threads, settings = subprocess.run(
         command, capture_output=True, env=env, check=True
     ).stdout.split(b" ", 1)
-    assert int(threads) > zenoh_session._CLOSERS and b"tx: (worker_threads: 2)" in settings
+    assert int(threads) > zenoh_session.CLOSERS
+    assert b"tx: (worker_threads: 2)" in settings
 
 
 @pytest.mark.parametrize(
@@ -538,31 +541,26 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
         ("AbstractRuntimeParam(app: (worker_threads: 2, max_blocking_threads: 9)) // mine", True),
     ],
 )
-def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sound):
-    monkeypatch.setattr(zenoh_session, "_RUNTIME", given)
+def test_thread_settings_that_panic_zenoh_are_refused(monkeypatch, given, sound):
+    monkeypatch.setenv("ZENOH_RUNTIME", given)
+    session = fresh_copy(zenoh_session)
     with (
         contextlib.nullcontext()
         if sound
         else pytest.raises(CongraspError, match=r"ZENOH_RUNTIME is '.*Unset it")
     ):
-        zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
+        session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
 
 
 @pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
-def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free(
-    monkeypatch, caplog, hard, files, warnings
-):
+def test_a_listener_raises_its_file_limit_or_warns_once(monkeypatch, caplog, hard, files, warnings):
     """Zenoh panics in a process that has no file left."""
     limits = [(1024, hard)]
     monkeypatch.setattr(platforms.resource, "getrlimit", lambda kind: limits[-1])
     monkeypatch.setattr(platforms.resource, "setrlimit", lambda kind, limit: limits.append(limit))
-    monkeypatch.setattr(
-        zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__)
-    )
+    session = fresh_copy(zenoh_session)
     for _ in range(2):
-        settings = zenoh_session.configuration(
-            "policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None
-        )
+        settings = session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
     taken = [
         int(settings.get_json(f"transport/unicast/{name}"))
         for name in ("accept_pending", "max_sessions")

@@ -26,6 +26,14 @@ from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 
 KEYS = Keys("test")
+TAKER = """
+import json, sys
+from congrasp.common.transport import ports
+ports._FIRST_FREE_PORT = {lowest}
+ports._FREE_PORTS = 61  # sixty to choose from, so that one would soon be chosen twice
+for line in sys.stdin:
+    print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
+"""
 
 
 @pytest.fixture
@@ -49,7 +57,7 @@ def test_every_role_opens_the_flows_of_all_that_it_may_do():
 
 
 @pytest.mark.parametrize("url", ["carrier-pigeon/loft", "127.0.0.1:7447", ""])
-def test_an_unknown_scheme_is_named_with_those_that_are_known(url):
+def test_an_unknown_scheme_lists_the_known_ones(url):
     with pytest.raises(
         CongraspError, match=rf"'{url}' is not an endpoint\. Write it like tcp/.*memory, tcp, tls"
     ):
@@ -82,7 +90,7 @@ def test_within_a_process_a_name_is_enough():
             assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
 
 
-def test_who_connects_waits_for_the_listener(tmp_path):
+def test_a_connection_waits_for_the_listener(tmp_path):
     for url in ("memory/late", f"socket/{tmp_path}/late"):
         opened = []
         late = threading.Timer(
@@ -112,7 +120,7 @@ def test_certificates_follow_from_the_role(certs):
         urls.connect(url, "observer", certs=certs / "actor.1")
 
 
-def test_a_client_without_cryptography_leaves_the_judgement_to_its_peer(certs, monkeypatch):
+def test_without_cryptography_a_client_does_not_check_certificates(certs, monkeypatch):
     monkeypatch.setattr(urls.importlib.util, "find_spec", lambda name: None)
     assert urls.find_credentials(str(certs / "actor.1"), "client") == Credentials(
         certs / "actor.1", "client"
@@ -166,24 +174,16 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
         hub.publish_weights(bundle(0), 0)
         actor = start(url)
         (message,) = eventually(lambda: rollouts.next_batch(1, 0.5))
-        assert (message.arrays["reward"] == 3.0).all() and message.meta["actor"] == "a"
+        assert (message.arrays["reward"] == 3.0).all()
+        assert message.meta["actor"] == "a"
         assert hub.status()["counters"]["accepted"] == 1
         actor.join(10)
-        assert not actor.is_alive() and getattr(actor, "exitcode", 0) == 0
+        assert not actor.is_alive()
+        assert getattr(actor, "exitcode", 0) == 0
         rollouts.close()
 
 
-TAKER = """
-import json, sys
-from congrasp.common.transport import ports
-ports._FIRST_FREE_PORT = {lowest}
-ports._FREE_PORTS = 61  # sixty to choose from, so that one would soon be chosen twice
-for line in sys.stdin:
-    print(json.dumps([ports.free_port(1) for _ in range(int(line))]), flush=True)
-"""
-
-
-def test_no_port_is_given_twice_while_its_process_lives():
+def test_a_free_port_is_reserved_while_its_process_lives():
     # Above those that other tests take
     script = TAKER.format(lowest=30_000 + 61 * (os.getpid() % 40))
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -200,12 +200,14 @@ def test_no_port_is_given_twice_while_its_process_lives():
         return json.loads(process.stdout.readline())
 
     with contextlib.ExitStack() as stack:
-        one, other = taker(), taker()
-        taken, given = take(one, 20), take(other, 20)
-        assert len({*taken, *given}) == 40
+        one = taker()
+        other = taker()
+        taken = take(one, 20)
+        ports = take(other, 20)
+        assert len({*taken, *ports}) == 40
         one.stdin.close()
         assert one.wait(20) == 0
         # Twenty were left: those of the process that ended are free again.
-        assert len({*given, *take(other, 30)}) == 50
+        assert len({*ports, *take(other, 30)}) == 50
         other.stdin.close()
         assert other.wait(20) == 0

@@ -2,6 +2,7 @@
 understands.
 """
 
+import itertools
 import json
 import pathlib
 import re
@@ -29,13 +30,14 @@ VERSIONS = ("1.29", "1.37")  # of Kubernetes: the oldest and the newest
 
 def manifests(text=None):
     files = [text] if text else [path.read_text() for path in KUBERNETES.glob("*.yaml")]
-    found = [
-        document
-        for file in files
-        for document in yaml.safe_load_all(file)
-        if "apiVersion" in document
+    documents = []
+    for file in files:
+        for document in yaml.safe_load_all(file):
+            if "apiVersion" in document:
+                documents.append(document)
+    return [
+        document for document in documents if not document["apiVersion"].startswith("kustomize")
     ]
-    return [document for document in found if not document["apiVersion"].startswith("kustomize")]
 
 
 def compose_commands():
@@ -67,11 +69,8 @@ def kubernetes_commands():
 def unit_commands():
     for unit in UNITS:
         text = unit.read_text().replace("\\\n", "")
-        values = dict(
-            pair.split("=", 1)
-            for line in re.findall("^Environment=(.*)", text, re.M)
-            for pair in line.split()
-        )
+        pairs = " ".join(re.findall("^Environment=(.*)", text, re.M)).split()
+        values = dict(pair.split("=", 1) for pair in pairs)
         command = re.search("^ExecStart=(.*)", text, re.M)[1]
         for name, value in values.items():
             command = command.replace(f"${{{name}}}", value).replace(f"${name}", value)
@@ -105,11 +104,11 @@ def test_compose_file_fits_the_schema_of_compose():
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_manifests_fit_the_schemas_of_kubernetes(version):
-    found = manifests()
-    for document in found:
+    documents = manifests()
+    for document in documents:
         kubernetes_validate.validate(document, version, strict=True)
     assert {"StatefulSet", "Deployment", "Service", "HorizontalPodAutoscaler", "NetworkPolicy"} < {
-        document["kind"] for document in found
+        document["kind"] for document in documents
     }
 
 
@@ -121,10 +120,11 @@ def test_a_mistake_in_a_manifest_is_found():
 
 
 def test_manifests_name_one_another_rightly():
-    found = manifests()
-    names = {(document["kind"], document["metadata"]["name"]) for document in found}
-    labels, ports = {}, {}
-    for document in found:
+    documents = manifests()
+    names = {(document["kind"], document["metadata"]["name"]) for document in documents}
+    labels = {}
+    ports = {}
+    for document in documents:
         if document["kind"] in ("StatefulSet", "Deployment"):
             template = document["spec"]["template"]
             labels[document["metadata"]["name"]] = template["metadata"]["labels"]
@@ -140,7 +140,7 @@ def test_manifests_name_one_another_rightly():
             }
             assert mounted == {volume["name"] for volume in template["spec"]["volumes"]} | claims
             assert template["spec"]["securityContext"]["runAsNonRoot"]
-    for document in found:
+    for document in documents:
         if document["kind"] == "Service":
             assert document["spec"]["selector"] == labels[document["metadata"]["name"]]
             assert {port["port"] for port in document["spec"]["ports"]} <= ports[
@@ -197,9 +197,8 @@ def test_units_are_valid_and_confined(tmp_path):
         timeout=60,
         check=False,
     )
-    assert done.returncode == 0 and not any(copy.name in done.stderr for copy in copies), (
-        done.stderr
-    )
+    assert done.returncode == 0, done.stderr
+    assert not any(copy.name in done.stderr for copy in copies), done.stderr
     for copy in copies:
         confined = [
             "systemd-analyze",
@@ -267,15 +266,15 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path, variables, port):
     )
     for rank in range(2):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
-        given = load(arguments[0])(arguments[1:]).keywords
-        options = given["options"]
-        assert (options.rank, options.ranks, options.coordinator) == (rank, 2, f"node-7:{port}")
+        keywords = load(arguments[0])(arguments[1:]).keywords
+        options = keywords["options"]
+        assert options.rank == rank
+        assert options.ranks == 2
+        assert options.coordinator == f"node-7:{port}"
         assert options.listen == f"tcp/127.0.0.1:{port + 2}"
-        assert (
-            options.run_dir == tmp_path / "a run"
-            and given["config"].updates == 9
-            and options.inside
-        )
+        assert options.run_dir == tmp_path / "a run"
+        assert keywords["config"].updates == 9
+        assert options.inside
 
 
 @pytest.mark.parametrize(
@@ -310,7 +309,8 @@ def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, 
         ["bash", "-c", task["run"]], env={**environment, "PATH": path}, check=True, timeout=60
     )
     command, *rest = (tmp_path / "said").read_text().splitlines()
-    assert command == words[0] and words[1] in rest
+    assert command == words[0]
+    assert words[1] in rest
     load(command)(rest)
     check = [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash", "-"]
     for part in ("setup", "run"):
@@ -330,27 +330,29 @@ WORDS = {"min", "max", "sum", "by", "le", "rate", "histogram_quantile", "outcome
 
 
 def test_every_expression_names_metrics_that_are_exposed():
-    learner, actor, server, port = (
-        LearnerMetrics(lambda: STATUS),
-        ActorMetrics(),
-        ServerMetrics(),
-        free_port(),
-    )
+    learner = LearnerMetrics(lambda: STATUS)
+    actor = ActorMetrics()
+    server = ServerMetrics()
+    port = free_port()
     learner.update(dict.fromkeys(UPDATE, 1.0))
     server.health = lambda: {"ready": True, "version": 5, "queue": 2}
     server.answer("answered", 0.01)
     server.batch(3)
     with exposed(port, "127.0.0.1", learner, actor, server):
-        found = scrape(port)
-    names, labels = {name for name, *_ in found}, {label for _, *rest in found for label in rest}
-    expressions = [
-        target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])
-    ]
+        metrics = scrape(port)
+    names = {name for name, *_ in metrics}
+    labels = set()
+    for _, *of_metric in metrics:
+        labels.update(of_metric)
+    expressions = []
+    for panel in DASHBOARD["panels"]:
+        expressions += [target["expr"] for target in panel.get("targets", [])]
     assert len(expressions) > 20
     for expression in expressions:
         bare = re.sub(r"\{[^}]*\}|\[[^]]*\]", "", expression)
         used = set(re.findall(r"[a-z_]+", bare)) - WORDS
-        assert used and used <= names, expression
+        assert used, expression
+        assert used <= names, expression
         for value in re.findall(r'(?:figure|outcome|role)="([^"]+)"', expression):
             assert value in labels, expression
         assert all(
@@ -363,11 +365,10 @@ def test_the_panels_do_not_overlap():
     taken = set()
     for panel in DASHBOARD["panels"]:
         at = panel["gridPos"]
-        cells = {
-            (x, y)
-            for x in range(at["x"], at["x"] + at["w"])
-            for y in range(at["y"], at["y"] + at["h"])
-        }
-        assert not cells & taken and max(x for x, _ in cells) < 24
+        columns = range(at["x"], at["x"] + at["w"])
+        rows = range(at["y"], at["y"] + at["h"])
+        cells = set(itertools.product(columns, rows))
+        assert not cells & taken
+        assert max(x for x, _ in cells) < 24
         taken |= cells
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])

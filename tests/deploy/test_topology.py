@@ -61,7 +61,8 @@ def hosts():
             pytest.skip("network namespaces cannot be made here: that needs root and iproute2")
         ip("-n", names["switch"], "link", "set", "bridge", "up")
         for number, (host, address) in enumerate(HOSTS.items()):
-            port, name = f"port{number}", names[host]
+            port = f"port{number}"
+            name = names[host]
             ip(
                 "-n",
                 name,
@@ -93,7 +94,8 @@ class Cluster:
     """The services as processes; volumes are folders."""
 
     def __init__(self, hosts: dict[str, list[str]], folder: pathlib.Path):
-        self._hosts, self._folder = hosts, folder
+        self._hosts = hosts
+        self._folder = folder
         self.processes: dict[str, subprocess.Popen[str]] = {}
 
     def words(self, service: str, words: list[str]) -> list[str]:
@@ -109,7 +111,7 @@ class Cluster:
             paths[volume["target"]] = path
         values = [re.sub(r"\$\{\w+:-(\w+)\}", r"\1", word) for word in words]
         pattern = "(?<![^= ])(" + "|".join(paths) + ")(?=/| |$)"
-        return [re.sub(pattern, lambda found: str(paths[found[1]]), word) for word in values]
+        return [re.sub(pattern, lambda match: str(paths[match[1]]), word) for word in values]
 
     def run(self, host: str, words: list[str]) -> subprocess.CompletedProcess[str]:
         """A command on a host, to its end."""
@@ -151,8 +153,8 @@ class Cluster:
 def test_a_run_on_three_hosts(hosts, tmp_path):
     cluster = Cluster(hosts, tmp_path)
     (script,) = cluster.words("certs", SERVICES["certs"]["command"])
-    made = cluster.run("learner", ["sh", "-c", script.replace("|| congrasp", f"|| {CONGRASP}")])
-    assert made.returncode == 0, made.stderr
+    output = cluster.run("learner", ["sh", "-c", script.replace("|| congrasp", f"|| {CONGRASP}")])
+    assert output.returncode == 0, output.stderr
     run_dir = tmp_path / "runs" / "quickstart"
     try:
         cluster.start("learner", "learner", *TINY)
@@ -169,21 +171,20 @@ def test_a_run_on_three_hosts(hosts, tmp_path):
             for name in ("recorder", "server"):
                 cluster.restart_ended(name, name)
             trained = (run_dir / "version").exists() and int((run_dir / "version").read_text()) >= 1
-            if trained and (asked := cluster.run("server", health)).returncode == 0:
+            if trained and (answered := cluster.run("server", health)).returncode == 0:
                 break
-            assert cluster.processes["learner"].poll() is None and time.monotonic() < deadline, (
-                cluster.logs()
-            )
+            assert cluster.processes["learner"].poll() is None, cluster.logs()
+            assert time.monotonic() < deadline, cluster.logs()
             time.sleep(1.0)
-        answer = json.loads(asked.stdout)
-        assert answer["ready"] and answer["hand"] == "human"
+        answer = json.loads(answered.stdout)
+        assert answer["ready"]
+        assert answer["hand"] == "human"
         observer = ["--certs", str(tmp_path / "certs" / "observer.0")]
         status = ["status", "--connect", "tls/learner:7447", *observer, "--json"]
-        found = json.loads(cluster.run("actor", [*shlex.split(CONGRASP), *status]).stdout)
-        roles = sorted(role["role"] for role in found["roles"])
-        assert (
-            roles == ["actor", "actor", "learner", "recorder", "server"] and found["warnings"] == []
-        )
+        run_status = json.loads(cluster.run("actor", [*shlex.split(CONGRASP), *status]).stdout)
+        roles = sorted(role["role"] for role in run_status["roles"])
+        assert roles == ["actor", "actor", "learner", "recorder", "server"]
+        assert run_status["warnings"] == []
         stranger = ["query", "--health", "--connect", "tls/server:7457", "--timeout", "3"]
         assert cluster.run("actor", [*shlex.split(CONGRASP), *stranger]).returncode != 0
     finally:

@@ -4,6 +4,7 @@ run.
 
 import importlib
 import inspect
+import itertools
 import os
 import pathlib
 import re
@@ -39,8 +40,8 @@ def command_lines():
     for page in PAGES:
         for block in blocks(page, "sh", "text", "console"):
             for line in block.replace("\\\n", " ").splitlines():
-                if found := re.match(r"^(?:\$ )?(?:\.venv/bin/)?congrasp (.*)", line):
-                    yield pytest.param(found[1], id=f"{page.stem}: {found[1][:60]}")
+                if match := re.match(r"^(?:\$ )?(?:\.venv/bin/)?congrasp (.*)", line):
+                    yield pytest.param(match[1], id=f"{page.stem}: {match[1][:60]}")
 
 
 def commands_of_modules():
@@ -106,7 +107,7 @@ def test_every_help_page_ends_with_examples_that_parse(command):
         parse_errors.parse(name, main.load(name), rest)
 
 
-def test_help_pages_speak_to_people(capsys):
+def test_help_pages_show_no_parser_internals(capsys):
     """Of every command, its options as they are typed: nothing of the parser's own types and
     headings.
     """
@@ -130,13 +131,16 @@ def test_help_pages_speak_to_people(capsys):
                 assert noise not in page, (words, noise)
 
 
-def test_the_mug_is_what_its_code_makes(tmp_path):
+def test_the_example_mug_equals_the_output_of_its_code(tmp_path):
     runpy.run_path(str(ROOT / "examples" / "make_mug.py"))["main"](tmp_path)
     for name in ("mug.obj", "handle.obj"):
-        made, shipped = (trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples"))
-        assert (ROOT / "examples" / name).stat().st_size < 200_000 and shipped.is_watertight
-        np.testing.assert_allclose(made.vertices, shipped.vertices, atol=2e-5)
-        np.testing.assert_array_equal(made.faces, shipped.faces)
+        generated, shipped = (
+            trimesh.load(folder / name) for folder in (tmp_path, ROOT / "examples")
+        )
+        assert (ROOT / "examples" / name).stat().st_size < 200_000
+        assert shipped.is_watertight
+        np.testing.assert_allclose(generated.vertices, shipped.vertices, atol=2e-5)
+        np.testing.assert_array_equal(generated.faces, shipped.faces)
 
 
 @pytest.mark.timeout(600)
@@ -160,7 +164,8 @@ def test_the_commands_of_the_tutorials_run(tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     pages = [ROOT / "docs" / "tutorials" / f"{name}.md" for name in ("my-object", "constraints")]
-    lines = "".join(text for page in pages for text in blocks(page, "sh")).splitlines()
+    text = "".join(itertools.chain.from_iterable(blocks(page, "sh") for page in pages))
+    lines = text.splitlines()
     assert len(lines) == 4
     for line in lines:
         program, *arguments = shlex.split(line, comments=True)
@@ -179,13 +184,16 @@ def test_the_loop_of_the_robots_page_runs_as_printed_with_numpy_and_zenoh_alone(
         done = run_in_base_install(code.replace("127.0.0.1:7457", f"127.0.0.1:{port}"))
     assert done.returncode == 0, done.stderr
     counted = dict(re.findall(r"(\w+)=(\d+)", done.stdout))
-    assert done.stdout.startswith("open Counters(") and counted["steps"] == "251"
-    assert int(counted["follow"]) >= 200 and int(counted["fallback"]) == 1
+    assert done.stdout.startswith("open Counters(")
+    assert counted["steps"] == "251"
+    assert int(counted["follow"]) >= 200
+    assert int(counted["fallback"]) == 1
 
 
 def example_lines():
     pages = (ROOT / "docs" / name for name in ("robots.md", "ros2.md"))
-    text = "".join(block for page in pages for block in blocks(page, "sh")).replace("\\\n", " ")
+    text = "".join(itertools.chain.from_iterable(blocks(page, "sh") for page in pages))
+    text = text.replace("\\\n", " ")
     return [line for line in text.splitlines() if line.startswith("python examples/")]
 
 

@@ -59,11 +59,11 @@ def gallery_claims():
 
 def readme_claims():
     """Commands of README, with the claims of the gallery for the same grasp."""
-    known = {claim.same_grasp: claim for claim in gallery_claims()}
+    gallery = {claim.same_grasp: claim for claim in gallery_claims()}
     claims = []
     for line in LINE.findall(README.read_text()):
         claim = Claim(tuple(shlex.split(line, comments=True)))
-        claims.append(known.get(claim.same_grasp, claim))
+        claims.append(gallery.get(claim.same_grasp, claim))
     return claims
 
 

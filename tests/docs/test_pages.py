@@ -73,8 +73,8 @@ def test_a_users_page_is_short(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_a_page_is_written_in_plain_english(page):
-    found = {match[0].lower() for match in BANNED.finditer(prose(page))}
-    assert not found
+    banned = {match[0].lower() for match in BANNED.finditer(prose(page))}
+    assert not banned
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -82,11 +82,9 @@ def test_extras_exist(page):
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
-    named = {
-        name
-        for names in re.findall(r"(?:congrasp|\.)\[([\w,]+)\]", page.read_text())
-        for name in names.split(",")
-    }
+    named = set()
+    for names in re.findall(r"(?:congrasp|\.)\[([\w,]+)\]", page.read_text()):
+        named.update(names.split(","))
     assert named <= extras.keys()
 
 
@@ -114,7 +112,8 @@ def test_links_lead_somewhere(page):
 
 def test_the_functions_that_the_architecture_lists_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
-    file, found = "", 0
+    file = ""
+    functions = 0
     for path, name in re.findall(r"^(\S+/\S*)? +(?:(?:[A-Z]\w+)\.)?(\w+) {2,}\S.*$", page, re.M):
         file = path or file
         if file:
@@ -126,8 +125,8 @@ def test_the_functions_that_the_architecture_lists_exist():
                 file,
                 name,
             )
-            found += 1
-    assert found >= 20
+            functions += 1
+    assert functions >= 20
 
 
 def glossary():
@@ -151,7 +150,8 @@ def test_glossary_has_the_terms_of_task_and_training():
 @pytest.mark.parametrize(("term", "text"), glossary().items())
 def test_a_term_is_explained_in_few_sentences(term, text):
     sentences = re.findall(r"[.:?](?:\s|$)", text)
-    assert text and len(sentences) <= 3, term
+    assert text, term
+    assert len(sentences) <= 3, term
 
 
 def test_pages_link_to_the_glossary():
@@ -159,4 +159,5 @@ def test_pages_link_to_the_glossary():
     for page in PAGES:
         linked.update(re.findall(r"\]\([^)\s]*glossary\.md#([\w-]+)\)", page.read_text()))
     anchors = {slug(term) for term in glossary()}
-    assert linked and linked <= anchors
+    assert linked
+    assert linked <= anchors

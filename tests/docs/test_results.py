@@ -23,9 +23,11 @@ def test_pages_show_the_results():
 @pytest.mark.parametrize("hand", pretrained_hands())
 def test_every_shipped_policy_has_figures(hand):
     policy = RESULTS[hand].about["policy"]
-    assert (policy["hand"], policy["method"]) == (hand, "ours")
+    assert policy["hand"] == hand
+    assert policy["method"] == "ours"
     assert {row.hand for row in RESULTS[hand].rows} == {hand}
-    assert RESULTS[hand].about["exam"] == "figures" and hand in RESULTS[hand].about["heading_rules"]
+    assert RESULTS[hand].about["exam"] == "figures"
+    assert hand in RESULTS[hand].about["heading_rules"]
 
 
 @pytest.mark.parametrize("name", RESULTS)
@@ -47,17 +49,13 @@ def test_a_table_is_written_between_its_marks_and_nothing_else_changes():
     results = RESULTS["human"]
     page = "Before.\n\n" + MARKS.format(kind="rates", text="old\n") + "\nAfter.\n"
     new = filled(page, {"human": results})
-    assert (
-        new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |")
-        and "old" not in new
-    )
+    assert new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |")
+    assert "old" not in new
     assert new.endswith("<!-- end of results -->\n\nAfter.\n")
     assert filled(new, {"human": results}) == new
     row = results.rows[0]
-    assert (
-        f"| {row.episodes} ({row.independent:.0f}) |" in new
-        and f"{100 * row.success:.1f} % (" in new
-    )
+    assert f"| {row.episodes} ({row.independent:.0f}) |" in new
+    assert f"{100 * row.success:.1f} % (" in new
     other = dataclasses.replace(results, rows=[dataclasses.replace(row, success=0.123)])
     assert "12.3 % (" in filled(page, {"human": other}) != new
 

@@ -7,6 +7,6 @@ from tests.cluster import Cluster
 
 @pytest.fixture
 def cluster(tmp_path):
-    made = Cluster(tmp_path)
-    yield made
-    made.close()
+    processes = Cluster(tmp_path)
+    yield processes
+    processes.close()

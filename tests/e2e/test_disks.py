@@ -43,14 +43,17 @@ def publish_noise(transport):
     transport.publish(Keys(CONFIG.name).log("metrics", "test", "0"), Message(meta=meta))
 
 
-def test_training_goes_on_over_a_full_disk(disk, tmp_path):
+def test_training_continues_on_a_full_disk(disk, tmp_path):
     config = dataclasses.replace(CONFIG, updates=12, checkpoint_every=2)
     run_dir = disk / "run"
     create_run(run_dir, config)
     hub = MemoryHub()
     journal = tmp_path / "actor.jsonl"
     actor = MadeUpActor(MemoryTransport(hub), journal=lambda run_id: Journal(journal))
-    said, complaints, filler, warnings = [], [], [], []
+    lines = []
+    complaints = []
+    filler = []
+    warnings = []
     with MemoryTransport(hub) as transport:
         recorder = Recorder(transport, config.name, run_dir / LOGS, warn=complaints.append)
 
@@ -72,21 +75,23 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
             outputs=Outputs(
                 recorder=recorder,
                 on_update=on_update,
-                on_event=lambda level, text: said.append((level, text)),
+                on_event=lambda level, text: lines.append((level, text)),
             ),
         )
     actor.join(10.0)
-    assert last.version == 12 and actor.ended == "The run is finished."
-    errors = [text for level, text in said if level == "error"]
+    assert last.version == 12
+    assert actor.ended == "The run is finished."
+    errors = [text for level, text in lines if level == "error"]
     # Although every update tries again
     (error,) = (text for text in errors if "checkpoint_" in text)
     assert "checkpoint_000000004.safetensors could not be written" in error
     assert "A kill now would lose 2 update(s), those since update 2." in error
     (warning,) = (text for text in warnings if "checkpoint_000000005" in text)
     assert "A kill now would lose 3 update(s), those since update 2." in warning
-    assert ("info", "Checkpoints can be written again; the newest is of update 8.") in said
+    assert ("info", "Checkpoints can be written again; the newest is of update 8.") in lines
     assert not any("\n" in text for text in errors)
-    assert complaints == [recorder.error] and "No space left" in recorder.error
+    assert complaints == [recorder.error]
+    assert "No space left" in recorder.error
     assert (run_dir / "checkpoints" / "latest").resolve().name == "checkpoint_000000012.safetensors"
     assert int((run_dir / "version").read_text()) == 12
     assert len(read_metrics(run_dir)["learner/0/kl"][0]) >= 1  # what was recorded before
@@ -95,25 +100,28 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     assert report.holes or report.counts["used"] == 24
 
 
-def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
+def test_a_journal_counts_lines_lost_on_a_full_disk(disk):
     complaints = []
     journal = Journal(disk / AUDIT / "x.jsonl", complaints.append)
     journal.write(line=0)
     filler = fill(disk)
     for line in range(1, 400):
         journal.write(line=line)
-    assert len(complaints) == 1 and "No space left" in complaints[0]
+    assert len(complaints) == 1
+    assert "No space left" in complaints[0]
     filler.unlink()
     journal.write(line=400)
     journal.write(line=401)
     journal_lines = read_journal(disk / AUDIT / "x.jsonl")
     *before, after, last = journal_lines.intact
     assert [entry["line"] for entry in before] == [*range(len(before))]
-    assert (after, last) == ({"line": 400}, {"line": 401})
-    assert (journal_lines.lost, journal_lines.damaged) == (400 - len(before), 0)
+    assert after == {"line": 400}
+    assert last == {"line": 401}
+    assert journal_lines.lost == 400 - len(before)
+    assert journal_lines.damaged == 0
 
 
-def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
+def test_a_failed_last_checkpoint_is_an_error(disk):
     config = dataclasses.replace(CONFIG, updates=3, checkpoint_every=2)
     create_run(disk / "run", config)
     hub = MemoryHub()

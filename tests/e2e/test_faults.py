@@ -5,6 +5,7 @@ Every test ends with the audit of `Cluster.stop`: nothing that was accepted is l
 corrupted, and nothing was learnt from that is older than the cap.
 """
 
+import itertools
 import random
 import signal
 import time
@@ -30,7 +31,7 @@ def actors(status):
 def taken_up(folder):
     """Rollouts that sessions of the learner took up from those before them."""
     lines = read_journal(folder / AUDIT / "learner-0.jsonl").intact
-    return [tuple(rollout) for line in lines for rollout in line.get("taken", ())]
+    return list(map(tuple, itertools.chain(*(line.get("taken", ()) for line in lines))))
 
 
 def stop_with_rollouts(cluster, learner):
@@ -66,28 +67,29 @@ def test_a_killed_learner_costs_no_rollout(cluster):
     # What a learner refused as stale before it died is a gap for the next one.
     assert final["counters"]["missing"] <= counts["made"] - counts["accepted"]
     assert_books_balance(final)
-    made, unknown = 0, 0
+    finished = 0
+    unknown = 0
     for name in ("a", "b"):
         outcomes = cluster.outcomes(name)
         assert sorted(entry["sequence"] for entry in outcomes) == list(range(len(outcomes)))
-        asked = {entry["sequence"] for entry in outcomes if entry["outcome"] == "unknown"}
+        undecided = {entry["sequence"] for entry in outcomes if entry["outcome"] == "unknown"}
         taken = {
             entry["sequence"] for entry in outcomes if entry["outcome"] in ("accepted", "duplicate")
         }
-        assert len(asked) <= 2  # on their way when the learner ended
+        assert len(undecided) <= 2  # on their way when the learner ended
         assert {
             sequence for actor, _, sequence in final["history"] if actor == name
-        } <= taken | asked
-        made, unknown = made + len(outcomes), unknown + len(asked)
+        } <= taken | undecided
+        finished, unknown = finished + len(outcomes), unknown + len(undecided)
     ledger = final["counters"]
     assert (
-        made - unknown
+        finished - unknown
         <= sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing"))
-        <= made
+        <= finished
     )
 
 
-def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together(cluster):
+def test_acknowledged_rollouts_survive_the_death_of_all_processes(cluster):
     """No process is left that could send anything again; others continue in their place."""
     cluster.options["pause"] = 0.05
     learner = cluster.start_learner(every=2)
@@ -129,7 +131,7 @@ def test_an_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     assert len({incarnation for incarnation, _ in history}) == 2
 
 
-def test_a_stopped_actor_is_noticed_holds_no_other_up_and_comes_back(cluster):
+def test_a_suspended_actor_blocks_no_other_and_returns(cluster):
     """Its connection stays open and silent."""
     learner = cluster.start_learner()
     actor = cluster.start_actor("a")

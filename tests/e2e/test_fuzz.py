@@ -51,7 +51,7 @@ from congrasp.services.record.reader import read_episodes, read_metrics
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
-from congrasp.services.serve.server import PolicyServer
+from congrasp.services.serve.server import checked_timeout
 from congrasp.services.train.command import untrained
 from tests.episodes import episode, episode_message
 from tests.rollouts import bundle, learner_hub, rollout
@@ -61,7 +61,8 @@ SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "4")) / 2
 SEED = int(os.environ.get("CONGRASP_FUZZ_SEED", "0"))
 KEYS = Keys("chaos")
 FORM = RolloutForm(3, 2, 32, 4, half=True)
-GROWTH, LONGEST = 150 << 20, 20.0  # bytes of memory; seconds of one message or file
+GROWTH = 150 << 20  # bytes of memory
+LONGEST = 20.0  # seconds of one message or file
 pytestmark = pytest.mark.timeout(240 + 2 * SECONDS)
 ODD = [
     None,
@@ -157,7 +158,8 @@ def odd_bytes(rng, data):
 
 def mutated(rng, message):
     """The bytes of a message with something odd in it, whose checksum is mostly right."""
-    arrays, meta = dict(message.arrays), dict(message.meta)
+    arrays = dict(message.arrays)
+    meta = dict(message.meta)
     with contextlib.suppress(CongraspError, ValueError, OverflowError, UnicodeEncodeError):
         for _ in range(rng.randrange(3)):
             meta = odd_tree(rng, meta)
@@ -175,22 +177,23 @@ def mutated(rng, message):
 @contextlib.contextmanager
 def no_tracebacks():
     """Fails if anything is logged with a traceback, or a thread dies, while the block runs."""
-    found = []
+    tracebacks = []
 
     class Handler(logging.Handler):
         def emit(self, record):
             if record.exc_info:
-                found.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
+                tracebacks.append(f"{record.getMessage()}: {record.exc_info[1]!r}")
 
-    handler, before = Handler(), threading.excepthook
+    handler = Handler()
+    before = threading.excepthook
     logging.getLogger().addHandler(handler)
-    threading.excepthook = lambda arguments: found.append(repr(arguments.exc_value))
+    threading.excepthook = lambda arguments: tracebacks.append(repr(arguments.exc_value))
     try:
         yield
     finally:
         logging.getLogger().removeHandler(handler)
         threading.excepthook = before
-    assert not found, found[:3]
+    assert not tracebacks, tracebacks[:3]
 
 
 def memory():
@@ -204,18 +207,18 @@ def memory():
 def requests():
     """A valid message for every key that is asked, and for every one that is published under."""
     who = {"actor": "NAME", "incarnation": "01"}
-    made = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
-    named = {**made.arrays, "episode/success": np.ones(1, np.float32)}
-    asked = {
+    sample_rollout = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
+    named = {**sample_rollout.arrays, "episode/success": np.ones(1, np.float32)}
+    queries = {
         KEYS.config: Message(),
         KEYS.status: Message(),
         KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
         KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
-        KEYS.rollout("NAME"): Message(named, made.meta),
+        KEYS.rollout("NAME"): Message(named, sample_rollout.meta),
         KEYS.act: Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
         KEYS.health: Message(),
     }
-    told = {
+    publications = {
         KEYS.log("metrics", "actor", "NAME"): Message(
             meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}
         ),
@@ -230,7 +233,7 @@ def requests():
             meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}
         ),
     }
-    return list(asked.items()), list(told.items())
+    return list(queries.items()), list(publications.items())
 
 
 LAYOUT = Layout(get_hand("human"), TaskConfig(surface_points=8, trajectory_points=3))
@@ -244,7 +247,7 @@ def served(endpoint, folder):
     """
 
     def act(key, request):
-        PolicyServer._deadline(request.meta.get("timeout", 1.0))
+        checked_timeout(request.meta.get("timeout", 1.0))
         LAYOUT.parse(request)
         return Message()
 
@@ -262,19 +265,22 @@ def served(endpoint, folder):
 
 
 def test_mutated_messages_at_every_key(tmp_path):
-    rng, endpoint = random.Random(SEED), f"tcp/127.0.0.1:{free_port()}"
-    asked, told = requests()
+    rng = random.Random(SEED)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    queries, publications = requests()
     with (
         no_tracebacks(),
         served(endpoint, tmp_path) as (hub, rollouts, recorder),
         ZenohTransport(connect=[endpoint]) as raw,
     ):
-        began, first, sent = time.monotonic(), 0, 0
+        began = time.monotonic()
+        first = 0
+        sent = 0
         while (now := time.monotonic()) < began + SECONDS:
-            key, message = rng.choice(asked if rng.random() < 0.7 else told)
+            key, message = rng.choice(queries if rng.random() < 0.7 else publications)
             name = f"{rng.randrange(2000)}.x"
             meta = {k: name if v == "NAME" else v for k, v in message.meta.items()}
-            session = raw._session(key)
+            session = raw.session(key)
             data, key = mutated(rng, Message(message.arrays, meta)), key.replace("NAME", name)
             if "/log/" in key or "announce" in key:
                 session.put(key, data, attachment=rng.choice([None, b"", rng.randbytes(16)]))
@@ -283,14 +289,22 @@ def test_mutated_messages_at_every_key(tmp_path):
                 assert time.monotonic() - now < 2 * LONGEST, key
                 for answer in answers:
                     text = b"" if answer.ok else answer.err.payload.to_bytes()
-                    assert b"failed on" not in text and len(text) < 1500 and b"\n" not in text, (
+                    assert b"failed on" not in text, (
+                        key,
+                        text,
+                    )
+                    assert len(text) < 1500, (
+                        key,
+                        text,
+                    )
+                    assert b"\n" not in text, (
                         key,
                         text,
                     )
             sent += 1
             if sent % 50 == 0:
-                shown = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
-                token = raw._session(KEYS.status).liveliness().declare_token(shown)
+                token_key = f"congrasp/chaos/alive/{rng.choice(['actor', 'server'])}/{name}/x"
+                token = raw.session(KEYS.status).liveliness().declare_token(token_key)
                 token.undeclare() if rng.random() < 0.5 else None
                 assert hub.status()["run"] == "chaos"
             if not first and time.monotonic() > began + SECONDS / 3:
@@ -310,7 +324,9 @@ def test_mutated_messages_at_every_key(tmp_path):
             Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
             timeout=10.0,
         )
-        assert not recorder.error and recorder.messages and recorder.damaged
+        assert not recorder.error
+        assert recorder.messages
+        assert recorder.damaged
     print(
         f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out"
     )
@@ -326,7 +342,8 @@ def resealed(data):
     """The message with the checksum of its damaged data, as one who means harm would write it."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         length = int.from_bytes(data[:8], "little")
-        header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
+        header = json.loads(data[8 : 8 + length])
+        section = data[8 + length :]
         header = {
             "__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]},
             **header,
@@ -374,7 +391,8 @@ def _files(folder):
     for i in range(5):
         journal.write(actor="a", made=i)
     journal.close()
-    writer, convert = LogWriter(folder, "log"), Converter()
+    writer = LogWriter(folder, "log")
+    convert = Converter()
     for key, message in requests()[1][:4]:
         writer.write(*convert(key.replace("NAME", "a"), message, 10**18))
     writer.close()
@@ -406,7 +424,10 @@ def test_mutated_files_at_every_loader(tmp_path):
         load(path)
     # A process reads each pickle
     often = [0.1 if path.name == "pickle" else 1.0 for path in loaders]
-    began, first, count, refused = time.monotonic(), 0, 0, 0
+    began = time.monotonic()
+    first = 0
+    count = 0
+    refused = 0
     with no_tracebacks():
         while (now := time.monotonic()) < began + SECONDS or count < 50 * len(loaders):
             (path,) = rng.choices(list(loaders), often)
@@ -416,12 +437,13 @@ def test_mutated_files_at_every_loader(tmp_path):
                 loaders[path](path)
             except CongraspError as error:
                 refused += 1
-                assert "\n" not in str(error) and len(str(error)) < 3000
+                assert "\n" not in str(error)
+                assert len(str(error)) < 3000
             except Exception as error:
-                kept = tmp_path / "failed"
-                kept.write_bytes(data)
+                failures = tmp_path / "failed"
+                failures.write_bytes(data)
                 raise AssertionError(
-                    f"{path.name}, seed {SEED}, number {count}: {error!r}, see {kept}"
+                    f"{path.name}, seed {SEED}, number {count}: {error!r}, see {failures}"
                 ) from error
             assert time.monotonic() - now < LONGEST, path.name
             count += 1

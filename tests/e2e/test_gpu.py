@@ -52,7 +52,7 @@ def test_the_shipped_policy_grasps_on_warp_as_on_a_cpu(tmp_path):
         assert row["diverged"] < 0.005, name
 
 
-def test_training_on_the_device_stops_and_goes_on(tmp_path):
+def test_training_on_the_device_stops_and_resumes(tmp_path):
     """Learner and actor in one process, rollouts that stay on the device, and a second start from
     the checkpoint.
     """
@@ -63,7 +63,8 @@ def test_training_on_the_device_stops_and_goes_on(tmp_path):
     first = bundles.load(tmp_path / "run" / POLICY_FILE)
     congrasp(*run, "--resume", "--updates", 5)
     second = bundles.load(tmp_path / "run" / POLICY_FILE)
-    assert second.version > first.version and second.run_id == first.run_id
+    assert second.version > first.version
+    assert second.run_id == first.run_id
     assert second.transitions * 3 == first.transitions * 5
 
 

@@ -60,7 +60,7 @@ def _updates(link, run, parameters, count):
         assert (pulled.arrays["actor/w"] == version).all()
 
 
-def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
+def test_peers_that_read_no_answers_block_no_other(tmp_path):
     """With answers that wait for their readers, both workers of the server would stand still for
     seconds.
     """
@@ -77,7 +77,7 @@ def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
             time.sleep(0.01)
 
 
-def test_peers_that_ask_for_weights_without_end_are_put_off():
+def test_endless_requests_for_weights_are_deferred():
     with (
         learner(900_000) as (endpoint, run),
         urls.connect(endpoint, "actor") as transport,
@@ -86,10 +86,10 @@ def test_peers_that_ask_for_weights_without_end_are_put_off():
     ):
         link.config(10)
         _updates(link, run, 900_000, 20)
-        assert run.hub._pull_limit.rejected > 0
+        assert run.hub.pull_limit.rejected > 0
 
 
-def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
+def test_an_actor_on_a_slow_link_blocks_no_other():
     """300 kB/s: the weights take three seconds, in which the other's updates go on."""
     pulled = []
 
@@ -119,7 +119,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
 
 
 @pytest.mark.parametrize("flow", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_silent_connections_keep_nobody_out(flow):
+def test_silent_connections_exclude_no_other(flow):
     """Connections that show nothing for seconds are closed, and hundreds of them are not too
     many.
     """
@@ -132,7 +132,8 @@ def test_silent_connections_keep_nobody_out(flow):
 
 def _grown(honest):
     """Bytes by which this process grows while it does something 150 times."""
-    process, most = psutil.Process(), 0
+    process = psutil.Process()
+    most = 0
     before = process.memory_info().rss
     for _ in range(150):
         honest()
@@ -141,7 +142,7 @@ def _grown(honest):
     return most
 
 
-def test_what_is_too_long_is_refused_before_it_is_in_memory():
+def test_too_long_messages_are_refused_before_they_are_in_memory():
     """Four times 60 MB at a time: a policy server is sent no more than two."""
     with policy_server() as endpoint, urls.connect(endpoint, "client") as client:
         ask = lambda: client.query(KEYS.act_for("c"), Message(), timeout=5)  # noqa: E731
@@ -152,7 +153,8 @@ def test_what_is_too_long_is_refused_before_it_is_in_memory():
 
 def test_rollouts_that_no_actor_makes_are_refused_before_they_are_in_memory(tmp_path):
     """A learner knows how long its run's rollouts are."""
-    endpoint, key = local_url(), tmp_path / "key"
+    endpoint = local_url()
+    key = tmp_path / "key"
     key.write_text(KEYS.rollout("huge"))
     with urls.listen(endpoint, "learner", longest_rollout=1 << 20) as transport:
         taken = []

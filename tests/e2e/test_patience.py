@@ -159,7 +159,8 @@ def test_a_process_without_a_learner_waits_and_ends_with_its_reason(tmp_path, ro
             if url in line and not waiting.is_set():
                 waiting.set()
                 process.send_signal(signal.SIGTERM)
-    assert waiting.is_set() and process.returncode == 128 + signal.SIGTERM, lines
+    assert waiting.is_set(), lines
+    assert process.returncode == 128 + signal.SIGTERM, lines
     assert f"The {'server' if role == 'serve' else role} ends: stopped by SIGTERM." in lines[-1]
 
 
@@ -174,4 +175,5 @@ def test_patience_limits_the_wait(tmp_path, role):
         cwd=tmp_path,
         check=False,
     )
-    assert done.returncode == 4 and url in done.stderr.splitlines()[-1], done.stderr
+    assert done.returncode == 4, done.stderr
+    assert url in done.stderr.splitlines()[-1], done.stderr

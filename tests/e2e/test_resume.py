@@ -22,17 +22,22 @@ from tests.children import python
 from tests.learner.made_up_actor import random_steps
 from tests.learner.test_process import CONFIG
 
-UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
+UPDATES = 8
+EVERY = 3
+KILLED_AFTER = 5
 # The stream is fixed by `feed` alone: what a write-ahead log takes up would be used in another
 # order.
 RUN = dataclasses.replace(CONFIG, updates=UPDATES, checkpoint_every=EVERY, write_ahead=False)
-STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.rollouts_per_update
+STEPS = RUN.rollout_steps
+WORLDS = RUN.environments
+BATCH = RUN.rollouts_per_update
 
 
 def rollout(number, bundle):
     """The same whatever policy is asked for it."""
-    rng, meta = np.random.default_rng(number), bundle.meta
-    sizes = (sum(width for _, width in meta[name]) for name in ("layout", "privileged"))
+    rng = np.random.default_rng(number)
+    meta = bundle.meta
+    sizes = (sum(dict(meta[name]).values()) for name in ("layout", "privileged"))
     arrays = random_steps(rng, STEPS, WORLDS, *sizes) | {
         "action": rng.normal(size=(STEPS, WORLDS, meta["action_size"])).astype(np.float32),
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
@@ -46,13 +51,15 @@ def rollout(number, bundle):
 
 def feed(hub, ended):
     """Sends every update the rollouts of its number, and no others."""
-    keys, known, transport = Keys(RUN.name), None, MemoryTransport(hub)
+    keys = Keys(RUN.name)
+    version = None
+    transport = MemoryTransport(hub)
     while not ended.is_set():
         try:
             bundle = transport.query(
                 keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5
             )
-            if not bundle.arrays or bundle.meta["version"] == known:
+            if not bundle.arrays or bundle.meta["version"] == version:
                 time.sleep(0.005)
                 continue
             update = bundle.meta["transitions"] // (BATCH * STEPS * WORLDS)
@@ -65,14 +72,15 @@ def feed(hub, ended):
                     not in arrived
                 ):
                     time.sleep(0.005)
-            known = bundle.meta["version"]
+            version = bundle.meta["version"]
         except TransportError:
             time.sleep(0.01)
 
 
 def train(run_dir, resume=False, killed_after=0):
     """A session of the learner; with `killed_after`, it ends by SIGKILL right after that update."""
-    hub, ended = MemoryHub(), threading.Event()
+    hub = MemoryHub()
+    ended = threading.Event()
     feeder = threading.Thread(target=feed, args=(hub, ended), daemon=True)
     feeder.start()
     with MemoryTransport(hub) as transport:
@@ -124,14 +132,18 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         "value",
     }
     assert "optimizer/hyperparams/learning_rate" in arrays
-    assert arrays.keys() == straight_arrays.keys() and len(arrays) > 20
+    assert arrays.keys() == straight_arrays.keys()
+    assert len(arrays) > 20
     for name, array in arrays.items():
         assert array.dtype == straight_arrays[name].dtype
         assert array.tobytes() == straight_arrays[name].tobytes(), name
-    assert (arrays["version"], arrays["transitions"]) == (UPDATES, UPDATES * BATCH * STEPS * WORLDS)
-    books, straight_books = meta["hubs"][0]["counters"], straight_meta["hubs"][0]["counters"]
+    assert arrays["version"] == UPDATES
+    assert arrays["transitions"] == UPDATES * BATCH * STEPS * WORLDS
+    books = meta["hubs"][0]["counters"]
+    straight_books = straight_meta["hubs"][0]["counters"]
     lost = (KILLED_AFTER - EVERY) * BATCH
-    assert (books["undone"], straight_books["undone"]) == (lost, 0)
+    assert books["undone"] == lost
+    assert straight_books["undone"] == 0
     # All else as if nothing had happened; how many rollouts were sent again depends on how slow the
     # answers were.
     assert {**books, "undone": 0, "duplicate": straight_books["duplicate"]} == straight_books

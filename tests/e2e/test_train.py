@@ -16,7 +16,8 @@ from congrasp.services.record.reader import read_episodes, read_metrics, read_ro
 from tests.benchmarks.faults import Run
 
 pytestmark = pytest.mark.timeout(600)
-ENVIRONMENTS, STEPS = 8, 40
+ENVIRONMENTS = 8
+STEPS = 40
 # With objects, environments and networks of the suite's sizes, whose programs are compiled already.
 SMALL = (
     *(
@@ -83,16 +84,16 @@ def kill_an_actor_and_the_learner(run: Run, count: int) -> None:
 
 @pytest.fixture
 def start(tmp_path):
-    made = []
+    processes = []
 
     def run(actors: int, updates: int) -> Run:
         options = ["--updates", str(updates), *SMALL]
-        made.append(Run(tmp_path / f"run{len(made)}", actors, options, subprocess.PIPE))
-        made[-1].start()
-        return made[-1]
+        processes.append(Run(tmp_path / f"run{len(processes)}", actors, options, subprocess.PIPE))
+        processes[-1].start()
+        return processes[-1]
 
     yield run
-    for one in made:
+    for one in processes:
         if one.alive:
             one.kill()
         one.close()
@@ -108,9 +109,11 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
     assert run.process.returncode == 128 + signal.SIGINT, output
     _, alive = psutil.wait_procs(family, timeout=5)
     assert not alive
-    assert "actor-0 was killed by SIGKILL" in output and "learner was killed by SIGKILL" in output
+    assert "actor-0 was killed by SIGKILL" in output
+    assert "learner was killed by SIGKILL" in output
     report = audit(run.run_dir)
-    assert report.exit_code == 0 and report.counts["used"] >= 4
+    assert report.exit_code == 0
+    assert report.counts["used"] >= 4
     assert [file.stem for file in (run.run_dir / "references").iterdir()] == ["actor-0"]
     assert any((run.run_dir / "tensorboard").iterdir())
     metrics = read_metrics(run.run_dir)
@@ -122,13 +125,10 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
         3,
         sum(size for _, size in sampled.meta["layout"]),
     )
-    assert (
-        sampled.arrays["action"].shape == (STEPS, 3, 26)
-        and sampled.arrays["last_observation"].shape[0] == 3
-    )
-    assert (
-        np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == ENVIRONMENTS
-    )
+    assert sampled.arrays["action"].shape == (STEPS, 3, 26)
+    assert sampled.arrays["last_observation"].shape[0] == 3
+    assert np.isfinite(sampled.arrays["reward"]).all()
+    assert sampled.meta["environments"] == ENVIRONMENTS
 
 
 @pytest.mark.slow
@@ -157,7 +157,8 @@ def test_twenty_kills_of_the_learner_with_updates_between_do_not_end_a_run(start
     run.process.communicate(timeout=20)
     assert run.process.returncode == 128 + signal.SIGTERM
     report = audit(run.run_dir)
-    assert report.exit_code == 0 and report.lag_max <= report.max_staleness
+    assert report.exit_code == 0
+    assert report.lag_max <= report.max_staleness
 
 
 @pytest.mark.slow

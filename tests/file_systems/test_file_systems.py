@@ -119,12 +119,14 @@ def test_two_learners_without_locks_are_refused(tmp_path):
         process = first.stdout.readline().strip()
         second = on("no_locks(37)", HOLD.replace("END", "0"), tmp_path)
         first.kill()
-    assert second.returncode and f"in use by process {process}" in second.stderr
+    assert second.returncode
+    assert f"in use by process {process}" in second.stderr
     third = on("no_locks(37)", HOLD.replace("END", "0"), tmp_path)
     assert third.returncode == 0, "the claim of a killed process is replaced"
     (tmp_path / "claim").write_text('{"host": "elsewhere", "process": 7}')
     fourth = on("no_locks(37)", HOLD.replace("END", "0"), tmp_path)
-    assert fourth.returncode and "elsewhere" in fourth.stderr
+    assert fourth.returncode
+    assert "elsewhere" in fourth.stderr
 
 
 CASES = {
@@ -144,7 +146,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_names_that_differ_in_case(tmp_path, case):
     confused = on("ignores_case()", CASES[case], tmp_path)
-    assert confused.returncode and "CongraspError" in confused.stderr
+    assert confused.returncode
+    assert "CongraspError" in confused.stderr
     assert "mug" in confused.stderr.lower()
     for path in tmp_path.iterdir():
         assert b"second" not in path.read_bytes()
@@ -214,7 +217,8 @@ def test_a_planted_link_is_replaced_by_an_atomic_write(tmp_path):
     (tmp_path / f".config.json.{os.getpid()}.tmp").symlink_to(victim)
     write_atomically(path, b"new")
     assert victim.read_text() == "of the user"
-    assert path.read_bytes() == b"new" and not path.is_symlink()
+    assert path.read_bytes() == b"new"
+    assert not path.is_symlink()
 
 
 @pytest.mark.parametrize("before", [True, False])

@@ -38,7 +38,8 @@ class A2C:
     batch_schema = SCHEMA
 
     def __init__(self, spec, config):
-        self._spec, self._gamma = spec, config.ppo.gamma
+        self._spec = spec
+        self._gamma = config.ppo.gamma
 
     def init(self, seed, initial=None):
         initial = initial or random_policy(seed, self._spec)
@@ -70,7 +71,8 @@ class A2C:
 @functools.partial(jax.jit, static_argnames=("layout", "mesh"))
 def _step(learnt, batch, affine, gamma, *, layout, mesh):
     def program(learnt, batch, affine, gamma):
-        collectives, (params, optimizer) = Collectives(mesh), learnt
+        collectives = Collectives(mesh)
+        params, optimizer = learnt
         (_, metrics), gradients = jax.value_and_grad(_loss, has_aux=True)(
             params, batch, affine, gamma, layout, collectives
         )

@@ -50,12 +50,19 @@ class MadeUpActor(threading.Thread):
     ):
         super().__init__(daemon=True)
         self.versions: list[int] = []
-        self.outcomes, self.names, self.ended = [], (), ""
+        self.outcomes = []
+        self.names = ()
+        self.ended = ""
         """Futures of the uploads, names of the arrays that the learner takes, and how the run
         ended.
         """
-        self.stop, self.rng, self.reward = threading.Event(), np.random.default_rng(seed), reward
-        self._transport, self._actor, self._links, self._journal = transport, name, links, journal
+        self.stop = threading.Event()
+        self.rng = np.random.default_rng(seed)
+        self.reward = reward
+        self._transport = transport
+        self._actor = name
+        self._links = links
+        self._journal = journal
         self.start()
 
     def run(self) -> None:

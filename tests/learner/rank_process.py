@@ -21,7 +21,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
 from congrasp.learner.distributed.ranks import Ranks, end_process
-from congrasp.learner.process import Outputs, _Learner, run_learner
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.queue import RolloutQueue
+from congrasp.learner.process import Outputs, run_learner
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -34,11 +36,20 @@ CONFIG = RunConfig(
 )
 
 
+class Reports:
+    """What this process prints."""
+
+    @staticmethod
+    def update(values: dict[str, float]) -> None:
+        """Prints the number of a finished update, after which the learner waits for a batch."""
+        print("update", int(values["update"]), flush=True)
+
+
 PHASES = {
     "join": (jax.distributed, "initialize", 1),
-    "wait": (_Learner, "_wait", 4),
-    "update": (_Learner, "_update", 2),
-    "publish": (_Learner, "_publish", 3),
+    "wait": (Reports, "update", 3),
+    "update": (RolloutQueue, "next_batch", 2),
+    "publish": (LearnerHub, "publish_weights", 3),
     "checkpoint": (pathlib.Path, "replace", 8),
     "leave": (Ranks, "close", 1),
 }
@@ -50,12 +61,13 @@ or JAX itself.
 def die_in(phase: str) -> None:
     """Kills this process at that call, as the kernel would."""
     place, name, number = PHASES[phase]
-    given, calls = getattr(place, name), iter(range(1, number))
+    function = getattr(place, name)
+    calls = iter(range(1, number))
 
     def last(*args: object, **options: object) -> object:
         if next(calls, None) is None:
             os.kill(os.getpid(), signal.SIGKILL)
-        return given(*args, **options)
+        return function(*args, **options)
 
     setattr(place, name, last)
 
@@ -83,7 +95,7 @@ def main() -> None:
             resume=mode == "resume",
             ranks=ranks,
             outputs=Outputs(
-                on_update=lambda values: print("update", int(values["update"]), flush=True),
+                on_update=Reports.update,
                 on_event=lambda level, text: print(level, text, flush=True),
             ),
         )

@@ -21,7 +21,8 @@ from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
 from tests.learner.made_up_actor import MadeUpActor
 
-WORLDS, UPDATES = 64, 150
+WORLDS = 64
+UPDATES = 150
 CONFIG = RunConfig(
     name="t",
     environments=WORLDS,
@@ -55,7 +56,9 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
     ranges = Ranges(np.full(sum(size for _, size in toy.LAYOUT), 1e6), 1e6, 1e6, {})
     monkeypatch.setattr("congrasp.learner.process.task_ranges", lambda task, curriculum: ranges)
     create_run(tmp_path, CONFIG)
-    hub, events, stop = MemoryHub(), [], threading.Event()
+    hub = MemoryHub()
+    events = []
+    stop = threading.Event()
     actor = ToyActor(MemoryTransport(hub))
 
     def learn(resume):
@@ -85,7 +88,8 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
         "accepted",
     ]
     assert any("unknown array 'log_probability'" in text for text in events)
-    assert half.version == UPDATES // 2 and last.transitions == UPDATES * WORLDS * toy.STEPS
+    assert half.version == UPDATES // 2
+    assert last.transitions == UPDATES * WORLDS * toy.STEPS
     assert toy.mean_return(last) > toy.mean_return(half) > toy.STANDING_STILL / 2
     assert toy.mean_return(last) > toy.HALVING
     shipped = bundles.load(tmp_path / "policy.safetensors")
@@ -99,10 +103,12 @@ def test_a_batch_is_joined_and_divided_along_the_axis_of_worlds():
     rollouts = [toy.episode(still, 3, np.random.default_rng(seed)) for seed in (0, 1)]
     batch = collate(rollouts, SCHEMA)
     assert batch.keys() == SCHEMA.keys()
-    assert batch["reward"].shape == (toy.STEPS, 6) and batch["last_observation"].shape == (6, 11)
+    assert batch["reward"].shape == (toy.STEPS, 6)
+    assert batch["last_observation"].shape == (6, 11)
     np.testing.assert_array_equal(batch["observation"][:, 3:], rollouts[1]["observation"])
     specs = {name: tuple(spec) for name, spec in partition_specs(SCHEMA).items()}
-    assert specs["action"] == (None, "rank", None) and specs["last_observation"] == ("rank", None)
+    assert specs["action"] == (None, "rank", None)
+    assert specs["last_observation"] == ("rank", None)
 
 
 def test_an_unknown_algorithm_is_one_line_and_an_old_configuration_means_ppo():
@@ -112,4 +118,5 @@ def test_an_unknown_algorithm_is_one_line_and_an_old_configuration_means_ppo():
         make_algorithm(toy.SPEC, CONFIG)
     assert "\n" not in str(caught.value)
     old = to_json(RunConfig()).replace('  "algorithm": "ppo",\n', "")
-    assert "algorithm" not in old and run_config_from_json(old) == RunConfig()
+    assert "algorithm" not in old
+    assert run_config_from_json(old) == RunConfig()

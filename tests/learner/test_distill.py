@@ -23,7 +23,8 @@ from tests.policies import random_bundle
 
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)
 TASK = TaskConfig(hand="allegro", constraints=("heading",), surface_points=64)
-WORLDS, STEPS = 32, 8
+WORLDS = 32
+STEPS = 8
 
 
 def save_teacher(path):
@@ -50,18 +51,21 @@ def batch(run, seed, worlds=WORLDS):
     can learn from.
     """
     rng = np.random.default_rng(seed)
-    own, whole = (
-        sum(size for _, size in policy_spec(task, NETWORK).layout)
-        for task in (run.task, dataclasses.replace(run.task, observation="full"))
-    )
-    seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
+
+    def observation_size(task):
+        return sum(size for _, size in policy_spec(task, NETWORK).layout)
+
+    student_seen = observation_size(run.task)
+    teacher_seen = observation_size(dataclasses.replace(run.task, observation="full"))
+    seen = rng.normal(size=(STEPS, worlds, max(student_seen, teacher_seen))).astype(np.float32)
     # One for all: it can be learnt
-    given = (
-        np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
-    )
-    given = np.broadcast_to(given, (STEPS, worlds, len(given)))
-    taught = np.concatenate([seen[..., :whole], given], -1)
-    return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": taught}
+    mean = np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
+    mean = np.broadcast_to(mean, (STEPS, worlds, len(mean)))
+    taught = np.concatenate([seen[..., :teacher_seen], mean], -1)
+    return {
+        "observation": seen[..., :student_seen].astype(np.float16),
+        "teacher_observation": taught,
+    }
 
 
 def algorithm(run):
@@ -73,19 +77,22 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
     averaged over all.
     """
     run = run_of(teacher, epochs=1, learning_rate=0.0)
-    student, rows = algorithm(run), batch(run, 0)
+    student = algorithm(run)
+    rows = batch(run, 0)
     state = student.init(0)
     state.params["actor"]["network"]["output"] = jax.tree.map(
         jnp.zeros_like, state.params["actor"]["network"]["output"]
     )
     bundle = bundles.load(teacher)
-    wanted = mean_action(
+    teacher_action = mean_action(
         bundle.spec.layout,
         bundle.inference_parameters,
         rows["teacher_observation"][..., : -extra(get_hand("allegro"))],
     )
     labels = np.asarray(
-        student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted)
+        student_action(
+            get_hand("allegro"), TASK.control, rows["teacher_observation"], teacher_action
+        )
     )
     deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
     after, metrics = student.update(state, rows)
@@ -93,18 +100,18 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
         metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4
     )
     np.testing.assert_allclose(metrics["action_std"], deviation.mean(), rtol=1e-5)
-    assert (
-        after.version == 1
-        and after.transitions == STEPS * WORLDS
-        and metrics["learning_rate"] == 0.0
-    )
+    assert after.version == 1
+    assert after.transitions == STEPS * WORLDS
+    assert metrics["learning_rate"] == 0.0
     jax.tree.map(np.testing.assert_array_equal, after.params["critic"], state.params["critic"])
 
 
 def test_a_student_comes_to_its_teacher_and_keeps_its_deviation(teacher):
     run = run_of(teacher)
     student = algorithm(run)
-    state, losses, rates = student.init(0), [], []
+    state = student.init(0)
+    losses = []
+    rates = []
     for seed in range(60):
         state, metrics = student.update(state, batch(run, seed))
         losses.append(metrics["imitation_kl"])
@@ -118,7 +125,8 @@ def test_a_student_comes_to_its_teacher_and_keeps_its_deviation(teacher):
 
 def test_a_batch_that_is_not_finite_changes_nothing(teacher):
     run = run_of(teacher)
-    student, rows = algorithm(run), batch(run, 0)
+    student = algorithm(run)
+    rows = batch(run, 0)
     state = student.init(0)
     rows["teacher_observation"][3, 2] = np.nan
     with pytest.raises(
@@ -169,13 +177,13 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
     config = defaults(["--preset", "quickstart", "--teacher", teacher.name, "--updates", "7"])[
         "config"
     ]
-    assert config.algorithm == "distill" and config.distill.teacher == str(teacher)
-    assert config.name == "quickstart-student" and config.task.method == "student"
-    assert (config.task.observation, config.task.sensing, config.task.hand) == (
-        "tracked",
-        TRACKERS,
-        "allegro",
-    )
+    assert config.algorithm == "distill"
+    assert config.distill.teacher == str(teacher)
+    assert config.name == "quickstart-student"
+    assert config.task.method == "student"
+    assert config.task.observation == "tracked"
+    assert config.task.sensing == TRACKERS
+    assert config.task.hand == "allegro"
     assert config.task.surface_points == TASK.surface_points
     assert config.task.approach_steps == 2 * TASK.approach_steps
     assert config.curriculum.weights(config.task.reward, 1) == config.task.reward

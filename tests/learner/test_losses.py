@@ -50,12 +50,15 @@ def test_any_rollout_has_the_advantages_of_the_definition(seed, gamma, gae_lambd
     advantage, returns = advantages(
         reward, value, last, terminal, gamma, gae_lambda, truncated if marked else None
     )
-    expected, following, after = np.empty((7, 3)), np.zeros(3), last
+    expected = np.empty((7, 3))
+    following = np.zeros(3)
+    after = last
     for t in reversed(range(7)):
         bootstrap = np.where(terminal[t], marked * value[t] * truncated[t], after)
         delta = reward[t] + gamma * bootstrap - value[t]
         following = delta + np.where(terminal[t], 0.0, gamma * gae_lambda * following)
-        expected[t], after = following, value[t]
+        expected[t] = following
+        after = value[t]
     np.testing.assert_allclose(advantage, expected, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(returns, expected + value, rtol=1e-4, atol=1e-4)
 
@@ -161,7 +164,9 @@ def test_the_clip_is_counted_by_the_end_it_holds_and_by_staleness(case):
     """
     params, log_std, sample = case
     ratio = np.ones(64, np.float32)
-    ratio[:8], ratio[8:12], ratio[48:56] = 1.5, 0.5, 0.5
+    ratio[:8] = 1.5
+    ratio[8:12] = 0.5
+    ratio[48:56] = 0.5
     advantage = np.where(np.arange(64) < 48, 1.0, -1.0).astype(np.float32)
     mean, log_std_now = network.policy(params, LAYOUT, sample.observation, exact=False)
     now = network.log_probability(mean, log_std_now, sample.action)
@@ -209,8 +214,8 @@ ROWS = {"observation": (12,), "action": (2,), "log_probability": (), "reward": (
 def evaluate(batch):
     params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(64,), encoder=2))
     one = normalizer.Affine(jnp.float32(0.0), jnp.float32(1.0))
-    given = losses.Inputs(batch, one, None, one, {**HYPER, "decoupled": True})
-    return losses.evaluate(params, given, Collectives(None), LAYOUT)
+    inputs = losses.Inputs(batch, one, None, one, {**HYPER, "decoupled": True})
+    return losses.evaluate(params, inputs, Collectives(None), LAYOUT)
 
 
 def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
@@ -222,10 +227,12 @@ def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
         "lag": np.zeros(3, np.int32),
         "last_observation": rng.normal(size=(3, 12)).astype(np.float32),
     }
-    whole = evaluate(batch)
-    monkeypatch.setattr(losses, "_MAX_TOGETHER", 6)
+    at_once = evaluate(batch)
+    monkeypatch.setattr(losses, "MAX_TOGETHER", 6)
     jax.tree.map(
-        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), evaluate(batch), whole
+        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5),
+        evaluate(batch),
+        at_once,
     )
 
 

@@ -13,6 +13,7 @@ from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
+from tests.compiled import program_count
 from tests.learner import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
@@ -38,7 +39,7 @@ def leaves(state: TrainState) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("lag", [0, 2])
-def test_it_learns_to_reach(lag):
+def test_ppo_learns_to_reach(lag):
     """From hardly moving to better than halving the distance at every step, also from stale
     rollouts.
     """
@@ -60,7 +61,8 @@ def test_counters_and_normalisers_follow_the_batch():
     batch = rollout(toy.bundle_of(state), 0)
     state, _ = step(state, batch)
     state, _ = step(state, rollout(toy.bundle_of(state), 1))
-    assert (state.version, state.transitions) == (2, 2 * 64 * toy.STEPS)
+    assert state.version == 2
+    assert state.transitions == 2 * 64 * toy.STEPS
     assert state.observation.count == state.value.count == 2 * 64 * toy.STEPS
     assert state.observation.mean.dtype == np.float64
 
@@ -105,7 +107,7 @@ def test_moving_the_value_statistics_does_not_move_the_values():
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
 
 
-def test_rounding_between_actor_and_learner_is_told_apart_from_lag():
+def test_rounding_is_separated_from_lag():
     """Rollouts of the same version with log probabilities .01 off show as a gap of .01, older ones
     not at all.
     """
@@ -136,7 +138,8 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
         == 0.0
     )
     batch["truncated"][-1, :16] = True
-    reward, ended = batch["reward"], batch["reward"][-1, :16].mean()
+    reward = batch["reward"]
+    ended = batch["reward"][-1, :16].mean()
     errors = {}
     for bootstrap in (True, False):
         _, metrics = changed(bootstrap_truncated=bootstrap).update(
@@ -168,7 +171,7 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
 def test_learning_rate_follows_the_divergence_within_its_range(kl, before, limits, rate):
     hyper = {"kl_target": 0.012, "learning_rate_range": limits}
     np.testing.assert_allclose(
-        ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6
+        ppo.adapted_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6
     )
 
 
@@ -189,8 +192,8 @@ def test_divergence_and_noise_are_bounded_as_the_run_settles():
     targets = [settings.kl_target_at(version, 1000) for version in (0, 800, 900, 1000, 1200)]
     np.testing.assert_allclose(targets, [0.01, 0.01, 0.0055, 0.001, 0.001], rtol=1e-9)
     settings = PPOConfig(settling=0.3, final_std=0.1, least_std=0.35)
-    kept = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
-    np.testing.assert_allclose(kept, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
+    noise = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
+    np.testing.assert_allclose(noise, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
     assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [
         0.35,
         0.35,
@@ -199,11 +202,9 @@ def test_divergence_and_noise_are_bounded_as_the_run_settles():
         0.0,
     ]
     never = PPOConfig(kl_target=0.01, final_std=0.1, least_std=0.35)  # settles
-    assert (never.kl_target_at(9, 9), never.noise_kept_at(9, 9), never.least_std_at(9, 9)) == (
-        0.01,
-        np.inf,
-        0.35,
-    )
+    assert never.kl_target_at(9, 9) == 0.01
+    assert never.noise_kept_at(9, 9) == np.inf
+    assert never.least_std_at(9, 9) == 0.35
     assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
 
 
@@ -211,7 +212,8 @@ def test_divergence_and_noise_are_bounded_as_the_run_settles():
 def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_final_noise(least):
     """The deviations are 0.6 before each update; a floor of 0.7 is above what an update reaches."""
     settings = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2, least_std=least)
-    batch, stds = rollout(toy.bundle_of(fresh()), 0), {}
+    batch = rollout(toy.bundle_of(fresh()), 0)
+    stds = {}
     for version in (3, 4, 7):
         moved, metrics = PPO(toy.SPEC, settings, updates=8).update(
             fresh()._replace(version=version), batch
@@ -221,9 +223,8 @@ def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_fin
             np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6
         )
     assert stds[3] == pytest.approx(0.7, rel=1e-6) if least else stds[3] > 0.5
-    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6) and stds[7] == pytest.approx(
-        0.2, rel=1e-5
-    )
+    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6)
+    assert stds[7] == pytest.approx(0.2, rel=1e-5)
 
 
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
@@ -261,7 +262,8 @@ def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
     """Standard deviations of a hundredth; without the trust region the first update is too
     large.
     """
-    algorithm, state = changed(learning_rate=1e-3, kl_target=0.012), fresh()
+    algorithm = changed(learning_rate=1e-3, kl_target=0.012)
+    state = fresh()
     actor = {
         **state.params["actor"],
         "log_std": jnp.full_like(state.params["actor"]["log_std"], np.log(0.01)),
@@ -321,16 +323,17 @@ def test_more_minibatches_than_transitions_are_refused():
 
 def test_other_hyperparameters_do_not_compile_again():
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
-    compiled = ppo._optimise._cache_size()
+    compiled = program_count(ppo.optimise)
     for seed, clip in enumerate((0.1, 0.3)):
         other = changed(clip=clip, entropy=0.01, gamma=0.5, max_grad_norm=0.1)
         state, _ = other.update(state, rollout(toy.bundle_of(state), seed))
-    assert ppo._optimise._cache_size() == compiled
+    assert program_count(ppo.optimise) == compiled
 
 
 def test_same_seed_and_data_give_the_same_bits():
     batch = rollout(toy.bundle_of(fresh()), 0)
-    first, second = step(fresh(), batch)[0], step(fresh(), batch)[0]
+    first = step(fresh(), batch)[0]
+    second = step(fresh(), batch)[0]
     other = step(fresh(1), batch)[0]
     assert all(np.array_equal(a, b) for a, b in zip(leaves(first), leaves(second), strict=True))
     assert not np.array_equal(first.params["actor"]["log_std"], other.params["actor"]["log_std"])
@@ -365,7 +368,7 @@ def with_future(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def test_a_privileged_critic_explains_what_the_observation_does_not():
+def test_a_privileged_critic_explains_hidden_value():
     explained = {}
     for spec in (toy.SPEC, WIDE):
         algorithm = PPO(spec, toy.SETTINGS)

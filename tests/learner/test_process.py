@@ -1,5 +1,6 @@
 """The learner process with actors that act with its bundles on made-up observations."""
 
+import collections
 import contextlib
 import dataclasses
 import threading
@@ -19,6 +20,7 @@ from congrasp.learner.algorithms import ppo
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.process import Outputs, run_learner
 from congrasp.learner.run_directory import create_run, initial_notes, open_run
+from tests.compiled import program_count
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -40,14 +42,14 @@ def hub() -> MemoryHub:
 @pytest.fixture
 def act(hub):
     """A function that starts made-up actors, which end with the test."""
-    made = []
+    actors = []
 
     def make(*arguments, **options) -> MadeUpActor:
-        made.append(MadeUpActor(MemoryTransport(hub), *arguments, **options))
-        return made[-1]
+        actors.append(MadeUpActor(MemoryTransport(hub), *arguments, **options))
+        return actors[-1]
 
     yield make
-    for actor in made:
+    for actor in actors:
         actor.stop.set()
         actor.join(10.0)
 
@@ -83,9 +85,11 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
         assert actor.ended == "The run is finished."
     assert entered == ["in", "out"]
 
-    assert (last.version, last.transitions) == (3, 3 * 2 * 8)
+    assert last.version == 3
+    assert last.transitions == 3 * 2 * 8
     shipped = bundles.load(tmp_path / "policy.safetensors")
-    assert (shipped.version, shipped.run_id) == (3, last.run_id)
+    assert shipped.version == 3
+    assert shipped.run_id == last.run_id
     jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
     assert open_run(tmp_path) == CONFIG
     assert (
@@ -93,14 +97,14 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     ).resolve().name == "checkpoint_000000003.safetensors"
 
     received = list(iter(lambda: logs.receive(0.0), None))
-    kinds = {
-        kind: [m.meta for k, m in received if k.split("/")[3] == kind]
-        for kind in ("metrics", "version", "event")
-    }
+    kinds = collections.defaultdict(list)
+    for key, message in received:
+        kinds[key.split("/")[3]].append(message.meta)
     assert [meta["update"] for meta in kinds["metrics"]] == [1, 2, 3]
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
     values = kinds["metrics"][-1]["values"]
-    assert values["episode/success"] == 0.75 and values["episodes"] == 8
+    assert values["episode/success"] == 0.75
+    assert values["episodes"] == 8
     assert 0 <= values["staleness_mean"] <= values["staleness_max"] <= CONFIG.max_staleness
     assert all(np.isfinite(value) for value in values.values())
     assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
@@ -116,12 +120,14 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
     )
     assert first.version == 3
     assert actor.is_alive()
-    compiled = ppo._optimise._cache_size()
+    compiled = program_count(ppo.optimise)
     last = learn(tmp_path, hub, dataclasses.replace(CONFIG, updates=6), resume=True)
-    assert ppo._optimise._cache_size() == compiled
+    assert program_count(ppo.optimise) == compiled
     actor.join(10.0)
     assert actor.ended == "The run is finished."
-    assert (last.version, last.transitions, last.run_id) == (6, 6 * 2 * 8, first.run_id)
+    assert last.version == 6
+    assert last.transitions == 6 * 2 * 8
+    assert last.run_id == first.run_id
     assert open_run(tmp_path).updates == 6
     assert actor.versions == sorted(actor.versions)
 
@@ -131,10 +137,11 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, ac
     create_run(tmp_path, CONFIG)
     act()
     assert learn(tmp_path, hub, on_host=False).version == 3
-    assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
+    assert not (tmp_path / "accepted").exists()
+    assert not (tmp_path / "audit").exists()
 
 
-def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub, act):
+def test_a_resume_without_link_and_version_file_overwrites_nothing(tmp_path, hub, act):
     """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the
     one before.
     """
@@ -145,21 +152,22 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     learn(
         tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set()
     )
-    kept = tmp_path / "checkpoints"
-    (kept / "latest").unlink()
-    (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
+    checkpoints = tmp_path / "checkpoints"
+    (checkpoints / "latest").unlink()
+    (checkpoints / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
     with pytest.raises(CongraspError, match=r"has checkpoints of a run\. Pass --resume"):
         learn(tmp_path, hub)
-    seen, said = [], []
+    seen = []
+    logged = []
     learn(
         tmp_path,
         hub,
         dataclasses.replace(CONFIG, updates=7),
         resume=True,
         on_update=lambda values: seen.append((values["update"], values["version"])),
-        on_event=lambda level, text: said.append(text),
+        on_event=lambda level, text: logged.append(text),
     )
     # Versions up to 5 are out, and 6 is what the resume begins with
     assert seen == [
@@ -167,15 +175,13 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
         (6, 8),
         (7, 9),
     ]
-    assert f"Resuming from the checkpoint {kept}/checkpoint_000000004.safetensors." in said
-    assert any("000000005.safetensors is damaged" in text for text in said)
-    assert (kept / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
+    assert f"Resuming from the checkpoint {checkpoints}/checkpoint_000000004.safetensors." in logged
+    assert any("000000005.safetensors is damaged" in text for text in logged)
+    assert (checkpoints / "checkpoint_000000005.safetensors.aside").read_bytes() == damaged
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
-def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(
-    tmp_path, hub, act, monkeypatch
-):
+def test_too_many_unusable_batches_in_a_row_end_the_run(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=20)
     create_run(tmp_path, config)
     # What is within the ranges breaks nothing
@@ -191,33 +197,34 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
         "batch.safetensors",
     }
     # What waited is taken up by a resume, the batch itself is not.
-    kept = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
-    assert not kept & {0, 1}
+    stored = {int(path.stem.split("~")[3]) for path in (tmp_path / "accepted" / "0").iterdir()}
+    assert not stored & {0, 1}
 
 
-def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(
-    tmp_path, hub, act, monkeypatch
-):
+def test_an_unusable_batch_is_dropped(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
-    actor, said, seen = act(reward=1e37), [], []
+    actor = act(reward=1e37)
+    logged = []
+    seen = []
 
     def on_event(level, text):
         if "The batch was dropped" in text:
-            said.append((level, text))
+            logged.append((level, text))
             actor.reward = 1.0
 
     last = learn(tmp_path, hub, config, on_event=on_event, on_update=seen.append)
     dropped = [values["batches_dropped"] for values in seen]
-    assert 1 <= len(said) == dropped[-1] < 5 and said[0][0] == "error"
-    assert [values["update"] for values in seen] == list(range(1, 9)) and last.version == 8
+    assert 1 <= len(logged) == dropped[-1] < 5
+    assert logged[0][0] == "error"
+    assert [values["update"] for values in seen] == list(range(1, 9))
+    assert last.version == 8
     learnt = [values for values in seen if "policy_loss" in values]
-    assert (
-        len(learnt) == 8 - len(said)
-        and np.isfinite([values["policy_loss"] for values in learnt]).all()
-    )
-    assert np.isfinite(last.value.mean) and abs(last.value.mean) < 100
+    assert len(learnt) == 8 - len(logged)
+    assert np.isfinite([values["policy_loss"] for values in learnt]).all()
+    assert np.isfinite(last.value.mean)
+    assert abs(last.value.mean) < 100
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -241,7 +248,7 @@ def _started(thread: threading.Thread):
     yield
 
 
-def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
+def test_a_collapse_ends_the_run_with_an_error(tmp_path, hub, act):
     config = dataclasses.replace(CONFIG, updates=20, collapse_patience=3)
     create_run(tmp_path, config)
     act(links=0.0)
@@ -250,19 +257,21 @@ def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
         CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"
     ):
         learn(tmp_path, hub, config, on_event=lambda level, text: events.append((level, text)))
-    assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
+    assert events[-1][0] == "fatal"
+    assert (tmp_path / "checkpoints" / "latest").exists()
 
 
-def test_training_goes_on_from_a_given_policy(tmp_path, hub):
+def test_training_starts_from_an_initial_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
     stopped = threading.Event()
     stopped.set()
-    given = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
-    create_run(tmp_path / "two", CONFIG, given)
+    initial = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
+    create_run(tmp_path / "two", CONFIG, initial)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)
-    assert begun.version == 0 and begun.run_id != given.run_id
-    jax.tree.map(np.testing.assert_array_equal, begun.params, given.params)
-    other = dataclasses.replace(given, spec=dataclasses.replace(given.spec, hand="claw"))
+    assert begun.version == 0
+    assert begun.run_id != initial.run_id
+    jax.tree.map(np.testing.assert_array_equal, begun.params, initial.params)
+    other = dataclasses.replace(initial, spec=dataclasses.replace(initial.spec, hand="claw"))
     with pytest.raises(CongraspError, match=r"'claw'.*'human'"):
         create_run(tmp_path / "three", CONFIG, other)
     assert not (tmp_path / "three").exists()
@@ -275,7 +284,8 @@ def test_training_of_a_policy_without_critic_begins_one(tmp_path, hub):
     trained = learn(tmp_path / "one", hub, dataclasses.replace(CONFIG, seed=7), stopped)
     initial = bundles.without_critic(trained)
     (note,) = initial_notes(initial, CONFIG, tmp_path / "mine.safetensors")
-    assert "mine.safetensors" in note and "critic" in note
+    assert "mine.safetensors" in note
+    assert "critic" in note
     assert not list(initial_notes(trained, CONFIG, tmp_path / "mine.safetensors"))
     create_run(tmp_path / "two", CONFIG, initial)
     begun = learn(tmp_path / "two", hub, CONFIG, stopped)

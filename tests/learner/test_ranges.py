@@ -30,7 +30,8 @@ def _rollouts(*spreads):
     """Rollouts of one step each of the native engine, of whole episodes, whose actions have these
     deviations.
     """
-    worker, masses = suite.worker(), np.array([obj.mass for obj in suite.OBJECTS], np.float32)
+    worker = suite.worker()
+    masses = np.array([obj.mass for obj in suite.OBJECTS], np.float32)
     privileged = jax.jit(worker.env.critic_inputs)
     for spread in spreads:
         each = 0.5 * np.log(2 * np.pi) + np.log(spread)  # of one entry of an action, in nats
@@ -45,9 +46,10 @@ def _rollouts(*spreads):
     worker.physics.close()
 
 
-def test_whatever_an_engine_produces_is_within_the_ranges():
+def test_engine_output_is_within_the_ranges():
     """Actions of three units make hands beat about, and of 30 throw objects away."""
-    ranges, ended = task_ranges(suite.TASK, CurriculumConfig()), 0
+    ranges = task_ranges(suite.TASK, CurriculumConfig())
+    ended = 0
     admission = Admission(lambda: ranges)
     for rollout in _rollouts(0.3, 3.0, 30.0):
         admission.check(rollout)
@@ -77,7 +79,8 @@ def test_names_and_bounds_follow_from_the_task(ranges):
     # An action's contact earns at most 1, everywhere, and is given twice the room: 90 steps of 2.
     assert ranges.episodes["term/contact"][1] == pytest.approx(180.0, rel=1e-3)
     assert ranges.episodes["term/drop"] == (-180.0, 180.0)
-    assert 30.0 < ranges.reward < 300.0 and ranges.observation.max() < 1500.0
+    assert 30.0 < ranges.reward < 300.0
+    assert ranges.observation.max() < 1500.0
     assert np.isfinite(ranges.observation).all()
 
 

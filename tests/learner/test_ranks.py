@@ -1,6 +1,4 @@
-"""Ranks that talk, in threads; ranks that train and die, in processes; batches divided between two
-devices.
-"""
+"""Ranks that agree, in threads; ranks that train and die, in processes."""
 
 import os
 import pathlib
@@ -19,13 +17,11 @@ import pytest
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
-from congrasp.learner.distributed.ranks import Ranks, ended_by
+from congrasp.learner.distributed.ranks import Ranks, accept_links, ended_by, open_link
 from congrasp.learner.distributed.relay import relay
 from congrasp.learner.run_directory import create_run
-from tests.children import python
 from tests.conftest import ROOT
 from tests.learner.rank_process import CONFIG
-from tests.learner.test_distill import save_teacher
 from tests.waits import eventually, together
 
 
@@ -38,12 +34,10 @@ class Party:
         deadline = time.monotonic() + 20.0
 
         def meet(rank: int) -> None:
-            address = "127.0.0.1", port
-            self.links[rank] = (
-                {0: ranks_module._reach(rank, count, *address, deadline)}
-                if rank
-                else ranks_module._gather(count, *address, deadline)
-            )
+            if rank == 0:
+                self.links[0] = accept_links(count, "127.0.0.1", port, deadline)
+            else:
+                self.links[rank] = {0: open_link(rank, count, "127.0.0.1", port, deadline)}
 
         self.everywhere(meet, count)
         self.ranks = [
@@ -57,7 +51,7 @@ class Party:
 
     def end(self, rank: int) -> None:
         """Its process is no more: nothing in it runs on, and the kernel ends its connections."""
-        self.ranks[rank]._leaving.set()
+        self.ranks[rank].leave()
         for link in self.links[rank].values():
             link.close()
 
@@ -67,14 +61,14 @@ class Party:
 
 @pytest.fixture
 def party(monkeypatch):
-    monkeypatch.setattr(ranks_module, "_RELAY_SECONDS", 0.2)
+    monkeypatch.setattr(ranks_module, "RELAY_SECONDS", 0.2)
     party = Party(free_port())
     yield party
     for rank in range(3):
         party.end(rank)
 
 
-def test_everyone_is_given_the_same_entries_in_rank_order_and_the_arrays_of_rank_0(party):
+def test_all_ranks_receive_entries_in_order_and_rank_0s_arrays(party):
     decisions = {}
 
     def exchange(rank: int) -> None:
@@ -88,7 +82,7 @@ def test_everyone_is_given_the_same_entries_in_rank_order_and_the_arrays_of_rank
         np.testing.assert_array_equal(decision.arrays["x"], np.arange(3) + turn)
 
 
-def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_late(party):
+def test_an_urgent_entry_ends_the_round_for_all(party):
     first, second, third = party.ranks
     second.post({"end": ""})
     assert second.poll(0.2) is None
@@ -100,7 +94,7 @@ def test_an_urgent_entry_ends_the_round_for_those_who_wait_and_those_who_come_la
     party.everywhere(lambda rank: party.ranks[rank].exchange({}))
 
 
-def test_a_dead_rank_ends_the_others_who_are_told_why(party):
+def test_a_failed_rank_ends_the_others_with_its_reason(party):
     party.ranks[1].fail(CongraspError("The disk is full."))
     party.end(1)
     assert party.all_said({0, 2})
@@ -119,13 +113,13 @@ def test_a_killed_rank_ends_the_others(party, victim):
 
 
 def test_a_silent_rank_ends_the_others(monkeypatch):
-    monkeypatch.setattr(ranks_module, "_SILENCE_SECONDS", 0.5)
+    monkeypatch.setattr(ranks_module, "SILENCE_SECONDS", 0.5)
     party = Party(free_port())  # whose hearts beat every two seconds only
     assert party.all_said({0, 1, 2})
     assert any("silent" in text for text in party.said.values())
 
 
-def test_ranks_that_leave_cleanly_miss_nobody(party, monkeypatch):
+def test_ranks_that_leave_cleanly_report_no_loss(party, monkeypatch):
     monkeypatch.setattr(jax.distributed, "shutdown", lambda: None)
     party.everywhere(lambda rank: party.ranks[rank].close())
     for rank in (1, 0, 2):
@@ -173,7 +167,7 @@ def test_ranks_and_addresses_that_make_no_sense(arguments, complaint):
         Ranks.join(*arguments)
 
 
-def test_nobody_waits_for_ever_for_a_rank_that_never_comes(monkeypatch):
+def test_joining_ends_at_the_deadline(monkeypatch):
     monkeypatch.setattr(ranks_module, "JOIN_SECONDS", 0.5)
     with pytest.raises(TransportError, match=r"Ranks \[1\] of 2 did not join"):
         Ranks.join(0, 2, f"127.0.0.1:{free_port()}")
@@ -185,7 +179,8 @@ class Job:
     """Real processes of `tests.learner.rank_process`."""
 
     def __init__(self, run_dir: pathlib.Path, port: int):
-        self.run_dir, self._port = run_dir, port
+        self.run_dir = run_dir
+        self._port = port
         self.processes: list[subprocess.Popen[str]] = []
 
     def start(self, goal: int, mode: str, count: int = 2, *doom: str) -> None:
@@ -268,139 +263,46 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     words = job.kill(0)
     assert "Rank 0 ended. Rank 1 cannot continue alone: start all ranks with --resume." in words
 
-    kept = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
-    assert kept >= 5  # the first update after a resume has a checkpoint of its own
-    job.start(kept + 3, "resume")
+    saved = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
+    assert saved >= 5  # the first update after a resume has a checkpoint of its own
+    job.start(saved + 3, "resume")
     first, second = job.finish()
     steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
-    (said,), (other,) = (
-        [line.split()[1:] for line in text.splitlines() if "bundle" in line]
-        for text in (first, second)
-    )
-    # Weights, normalisers and versions, bit for bit, though the rollouts were not the same
-    assert said == other
-    assert int(said[1]) == steps * (kept + 3)
 
-    job.start(kept + 5, "resume", count=1)
+    def bundle(text):
+        (line,) = [line for line in text.splitlines() if "bundle" in line]
+        return line.split()[1:]
+
+    of_rank_0 = bundle(first)
+    # Weights, normalisers and versions, bit for bit, though the rollouts were not the same
+    assert of_rank_0 == bundle(second)
+    assert int(of_rank_0[1]) == steps * (saved + 3)
+
+    job.start(saved + 5, "resume", count=1)
     (alone,) = job.finish()
     assert "The checkpoint has 2 rank(s), this run has 1" in alone
-    assert int(alone.split()[-1]) == steps * (kept + 3) + steps // 2 * 2
+    assert int(alone.split()[-1]) == steps * (saved + 3) + steps // 2 * 2
 
 
 @pytest.mark.timeout(900)
 @pytest.mark.slow
-def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_resumes(job):
-    kept, mode = 0, "fresh"
+def test_a_rank_dying_in_any_phase_ends_the_other(job):
+    saved = 0
+    mode = "fresh"
     for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):
         victim = int(doom[0])
-        job.start(kept + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
+        job.start(saved + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
         assert f"Rank {victim} ended. Rank {1 - victim} cannot continue alone" in job.last_words(
             victim
         ), doom
         checkpoints = sorted((job.run_dir / "checkpoints").glob("checkpoint_*.safetensors"))
         assert bool(checkpoints) == (doom != "1:join")
-        kept, mode = (
+        saved, mode = (
             (int(checkpoints[-1].stem.removeprefix("checkpoint_")), "resume")
             if checkpoints
             else (0, "fresh")
         )
-    job.start(kept + 2, "resume", 3)
+    job.start(saved + 2, "resume", 3)
     (bundle,) = {text.split("bundle")[1] for text in job.finish()}
     steps = CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
-    assert int(bundle.split()[1]) == steps * (2 * kept + 3 * 2)
-
-
-# --- collectives ---
-
-
-PREAMBLE = """
-import dataclasses, functools, sys
-import jax, numpy as np
-from jax.sharding import Mesh
-from congrasp.common.config import RunConfig
-from congrasp.learner.algorithms.ppo import PPO
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate
-from congrasp.learner.algorithms.protocol import collate
-from congrasp.learner.distributed.collectives import AXIS, shard
-from tests.learner import toy
-from tests.learner.test_ppo import fresh, rollout
-
-mesh = Mesh(np.array(jax.devices()), (AXIS,))
-assert mesh.size == 2
-"""
-PPO = """
-# One minibatch: then both have the same samples in it, whatever order they draw.
-ppo = PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, minibatches=1, entropy=0.01, importance_max=1.02))
-one, two = fresh(), fresh()
-for seed in range(3):
-    batch = rollout(toy.bundle_of(one), seed)
-    # The halves are unlike, so that a mean of each instead of all would show; and stale, so that weights are truncated.
-    batch["reward"][:, :32] *= 3.0
-    batch["log_probability"] += np.random.default_rng(seed).normal(0.0, 0.05, batch["reward"].shape).astype(np.float32)
-    one, expected = ppo.update(one, batch)
-    two, metrics = ppo.update(two, batch, mesh)
-    assert (two.version, two.transitions) == (one.version, one.transitions)
-    assert metrics.keys() == expected.keys()
-    for name, value in expected.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=2e-3, atol=2e-5, err_msg=name)
-    for a, b in zip(one.observation + one.value, two.observation + two.value, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
-jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-4), two.params, one.params)
-copies = jax.tree.leaves(shard(two.params, mesh))
-assert all(len(leaf.addressable_shards) == 2 for leaf in copies)
-
-batch["reward"][3, 40] = np.nan  # on the second device alone
-try:
-    ppo.update(two, batch, mesh)
-except NonFiniteUpdate as error:
-    assert "reward" in str(error)
-    print("agreed")
-"""
-A2C = """
-from tests.learner.a2c import A2C, SCHEMA
-a2c = A2C(toy.SPEC, RunConfig())
-one, two = a2c.init(0), a2c.init(0)
-for seed in range(3):
-    batch = collate([rollout(toy.bundle_of(one), seed)], SCHEMA)
-    batch["reward"][:, :32] *= 3.0  # the halves are unlike
-    one, expected = a2c.update(one, batch)
-    two, metrics = a2c.update(two, batch, mesh)
-    assert two.transitions == one.transitions
-    for name, value in expected.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=2e-3, atol=2e-5, err_msg=name)
-jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4), two.params, one.params)
-"""
-DISTILLATION = """
-from tests.learner.test_distill import algorithm, batch, run_of
-run = run_of(sys.argv[1], epochs=1)
-student = algorithm(run)
-one, two = student.init(0), student.init(0)
-one, expected = student.update(one, batch(run, 0))
-two, metrics = student.update(two, batch(run, 0), mesh)
-assert two.transitions == one.transitions
-np.testing.assert_allclose(metrics["imitation_kl"], expected["imitation_kl"], rtol=0.05)
-np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5)
-"""
-
-
-def two_devices(program, *arguments):
-    """What a program prints that sees two devices."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    done = python("-c", PREAMBLE + program, *arguments, env={"XLA_FLAGS": flags}, timeout=280)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
-def test_half_of_the_batch_on_each_of_two_devices_is_the_whole_batch():
-    assert two_devices(PPO) == "agreed"
-
-
-@pytest.mark.slow
-def test_an_algorithm_from_outside_is_divided_between_two_devices():
-    two_devices(A2C)
-
-
-@pytest.mark.slow
-def test_distillation_is_divided_between_two_devices(tmp_path):
-    save_teacher(tmp_path / "teacher.safetensors")
-    two_devices(DISTILLATION, tmp_path / "teacher.safetensors")
+    assert int(bundle.split()[1]) == steps * (2 * saved + 3 * 2)

@@ -42,7 +42,7 @@ def run(tmp_path):
     return tmp_path / "run", config
 
 
-def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
+def test_settings_of_the_learner_alone_may_change(run):
     folder, config = run
     changed = dataclasses.replace(config, updates=9, ppo=dataclasses.replace(config.ppo, clip=0.1))
     continue_run(folder, changed)
@@ -52,7 +52,7 @@ def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
 @pytest.mark.parametrize(
     "change", [{"environments": 4}, {"rollout_steps": 5}, {"name": "other"}, {"algorithm": "a2c"}]
 )
-def test_what_actors_use_may_not(run, change):
+def test_settings_of_the_actors_may_not_change(run, change):
     folder, config = run
     with pytest.raises(
         CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"
@@ -61,7 +61,7 @@ def test_what_actors_use_may_not(run, change):
     assert open_run(folder) == config
 
 
-def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run):
+def test_resuming_starts_from_the_runs_configuration(run):
     folder, config = run
     assert defaults(["--resume", "--run-dir", str(folder)]) == {"config": config}
     assert defaults([f"--run-dir={folder}", "--or-resume", "--preset", "human"])["config"] == config
@@ -95,7 +95,7 @@ def test_a_command_line_that_resumes_starts_from_the_runs_own_configuration(run)
         b'{"ppo": {"clip": NaN}}',
     ],
 )
-def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text):
+def test_an_invalid_configuration_names_its_file(run, text):
     folder, _ = run
     (folder / "config.json").write_bytes(text)
     with pytest.raises(CongraspError, match=r"run/config\.json ") as caught:
@@ -103,7 +103,7 @@ def test_a_configuration_that_is_none_is_one_line_that_names_the_file(run, text)
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_left_of_a_run_is_not_begun_anew(run):
+def test_an_existing_run_is_not_started_again(run):
     folder, config = run
     assert not has_checkpoints(folder)
     (folder / "policy.safetensors").write_bytes(b"a policy")
@@ -129,7 +129,7 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
 @pytest.mark.parametrize(
     "damage", [b"", bytes(21), b"\xff\xfe", b"0" * 20 + b"\n", b"9" * 20 + b"\n", b"-5"]
 )
-def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run, damage):
+def test_versions_continue_from_journals_without_the_version_file(run, damage):
     folder, _ = run
     assert published_version(folder) == -1
     note_version(folder, 22)
@@ -155,8 +155,9 @@ def test_one_learner_at_a_time_until_it_dies(run):
         assert other.stdout.readline() == b"mine\n"
         with listening(folder, "tcp/127.0.0.1:7"), pytest.raises(CongraspError) as refused:
             continue_run(folder, dataclasses.replace(config, updates=9))
-        said = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
-        assert said in str(refused.value) and open_run(folder) == config
+        error = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
+        assert error in str(refused.value)
+        assert open_run(folder) == config
         other.kill()
         assert other.wait() == -signal.SIGKILL
     continue_run(folder, dataclasses.replace(config, updates=9))
@@ -192,14 +193,15 @@ def tree(value: float) -> dict:
     }
 
 
-def test_leaves_come_back_where_and_what_they_were(tmp_path):
+def test_leaves_round_trip_with_type_and_place(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(tree(1.0), {"hub": {"seen": [1, 2]}, "run_id": "e"}, 1)
     loaded, meta = checkpoints.load(tree(0.0))
     assert meta == {"hub": {"seen": [1, 2]}, "run_id": "e"}
     jax.tree.map(np.testing.assert_array_equal, loaded, tree(1.0))
     assert isinstance(loaded["device"]["half"], jax.Array)
-    assert isinstance(loaded["host"], np.ndarray) and loaded["host"].dtype == np.float64
+    assert isinstance(loaded["host"], np.ndarray)
+    assert loaded["host"].dtype == np.float64
     assert isinstance(loaded["steps"], int)
 
 
@@ -277,14 +279,14 @@ def test_no_checkpoint_a_damaged_one_and_one_of_another_shape(tmp_path):
 
 def lines_of(checkpoints: Checkpoints) -> tuple[float, list[str]]:
     """The value in the checkpoint that is found, and what was said."""
-    said: list[str] = []
-    loaded, _ = checkpoints.load(tree(0.0), lambda level, text: said.append(text))
-    assert not any("\n" in text for text in said)
-    return loaded["host"][0], said
+    lines: list[str] = []
+    loaded, _ = checkpoints.load(tree(0.0), lambda level, text: lines.append(text))
+    assert not any("\n" in text for text in lines)
+    return loaded["host"][0], lines
 
 
 @pytest.mark.parametrize("link", ["missing", "dangling", "of an older one"])
-def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
+def test_the_newest_checkpoint_is_found_with_any_link(tmp_path, link):
     checkpoints = Checkpoints(tmp_path)
     for version in (8, 9, 10):
         checkpoints.save(tree(version), {}, version)
@@ -292,10 +294,9 @@ def test_the_newest_checkpoint_is_found_whatever_the_link_says(tmp_path, link):
     if link != "missing":
         name = "nothing" if link == "dangling" else "checkpoint_000000008.safetensors"
         (tmp_path / "latest").symlink_to(name)
-    value, said = lines_of(checkpoints)
-    assert value == 10.0 and said == [
-        f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."
-    ]
+    value, lines = lines_of(checkpoints)
+    assert value == 10.0
+    assert lines == [f"Resuming from the checkpoint {tmp_path}/checkpoint_000000010.safetensors."]
 
 
 def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
@@ -303,12 +304,11 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     paths = [checkpoints.save(tree(version), {}, version) for version in (1, 2, 3)]
     paths[2].write_bytes(paths[2].read_bytes()[:-3])
     paths[1].write_bytes(b"")
-    value, said = lines_of(checkpoints)
-    assert value == 1.0 and len(said) == 3
-    assert (
-        "000000003.safetensors is damaged: The message" in said[0]
-        and "000000002.safetensors is damaged" in said[1]
-    )
+    value, lines = lines_of(checkpoints)
+    assert value == 1.0
+    assert len(lines) == 3
+    assert "000000003.safetensors is damaged: The message" in lines[0]
+    assert "000000002.safetensors is damaged" in lines[1]
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0

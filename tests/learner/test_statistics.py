@@ -13,12 +13,11 @@ def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Messag
 
 
 def figures(*batches: list[Message]) -> dict[str, float]:
-    return overall(
-        [
-            summary(messages, [9 - int(message.meta["version"]) for message in messages])
-            for messages in batches
-        ]
-    )
+    summaries = []
+    for messages in batches:
+        lags = [9 - int(message.meta["version"]) for message in messages]
+        summaries.append(summary(messages, lags))
+    return overall(summaries)
 
 
 def episode_means(messages: list[Message]) -> dict[str, float]:
@@ -70,7 +69,7 @@ def test_errors_and_success_count_where_their_constraint_was_active():
     assert "success/affordance" not in means
 
 
-def test_a_pose_whose_wrist_a_trajectory_decides_on_counts_for_both():
+def test_a_pose_with_a_trajectory_counts_for_both():
     """The fingers follow the pose; the distance of its wrist says nothing there."""
     means = episode_means(
         [
@@ -108,7 +107,8 @@ def test_the_batches_of_several_ranks_count_as_one():
         posed(9, 100, [0, 1], episode_success=[0, 0], episode_pose_rad=[9.0, 0.4]),
         posed(9, 200, [0], episode_success=[1], episode_pose_rad=[9.0]),
     ]
-    means, joint = figures(first, second), figures([*first, *second])
+    means = figures(first, second)
+    joint = figures([*first, *second])
     assert means == pytest.approx(joint)
     expected = {
         "episode/success": 0.5,
@@ -131,22 +131,23 @@ def test_pace_forgets_what_is_outside_its_window():
 def first_alarm(success, links, patience=20):
     watch = CollapseWatch(patience)
     for update, (rate, touching) in enumerate(zip(success, links, strict=True), 1):
-        if said := watch.add({"episode/success": rate, "episode/links_at_removal": touching}):
-            return update, said
+        if alarm := watch.add({"episode/success": rate, "episode/links_at_removal": touching}):
+            return update, alarm
     return None
 
 
-def test_a_fall_below_half_of_the_best_is_said_after_the_patience():
+def test_a_fall_below_half_of_the_best_raises_an_alarm():
     # Ten updates at 80 % and then none: the mean of ten is below 40 % from the sixth on, so the
     # twentieth is the 25th.
-    update, said = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
+    update, alarm = first_alarm([0.8] * 10 + [0.0] * 60, [3.0] * 70)
     assert update == 10 + 6 + 19
-    assert "fell from 80% to 0%" in said
+    assert "fell from 80% to 0%" in alarm
 
 
-def test_a_hand_that_never_touches_is_said():
-    update, said = first_alarm([0.0] * 50, [0.05] * 50)
-    assert update == 20 and "hardly touched" in said
+def test_a_hand_that_never_touches_raises_an_alarm():
+    update, alarm = first_alarm([0.0] * 50, [0.05] * 50)
+    assert update == 20
+    assert "hardly touched" in alarm
 
 
 @pytest.mark.parametrize(
@@ -158,11 +159,11 @@ def test_a_hand_that_never_touches_is_said():
         ([0.0] * 19 + [0.1] + [0.0] * 19, [0.0] * 19 + [1.0] + [0.0] * 19),
     ],
 )
-def test_what_may_still_become_something_goes_on(success, links):
+def test_slow_starts_raise_no_alarm(success, links):
     assert first_alarm(success, links) is None
 
 
-def test_without_patience_nothing_is_said():
+def test_without_patience_there_is_no_alarm():
     assert first_alarm([0.8] * 10 + [0.0] * 500, [0.0] * 510, patience=0) is None
 
 

@@ -38,11 +38,9 @@ SETTINGS = PPOConfig(epochs=4, minibatches=4, gamma=0.9, reward_scale=1.0, learn
 def observe(position: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Observations (B, D) of positions and goals (B,), in units that need normalising."""
     observation = np.zeros((len(position), sum(size for _, size in LAYOUT)), np.float32)
-    observation[:, 0], observation[:, 1], observation[:, 2] = (
-        position,
-        7.0 + 100.0 * goal,
-        goal - position,
-    )
+    observation[:, 0] = position
+    observation[:, 1] = 7.0 + 100.0 * goal
+    observation[:, 2] = goal - position
     return observation
 
 
@@ -55,7 +53,8 @@ def episode(
     """A batch of whole episodes; `act` maps observations to actions and log probabilities, goals
     lie within `reach`.
     """
-    goal, position = rng.uniform(-reach, reach, worlds), np.zeros(worlds)
+    goal = rng.uniform(-reach, reach, worlds)
+    position = np.zeros(worlds)
     rows = []
     for step in range(STEPS):
         observation = observe(position, goal)

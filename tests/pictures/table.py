@@ -127,11 +127,11 @@ IMAGES = (
 
 def gallery_pictures() -> Iterator[Picture]:
     """Yields the pictures and films of docs/gallery, which `tests.benchmarks.gallery` draws."""
-    for shown in SHOWN:
+    for entry in SHOWN:
         for suffix in (".jpg", ".gif"):
-            if suffix == ".jpg" or shown.film:
-                name = f"{shown.name}{suffix}"
-                yield Picture(name, command_of(shown), "", (shown.hand,))
+            if suffix == ".jpg" or entry.film:
+                name = f"{entry.name}{suffix}"
+                yield Picture(name, command_of(entry), "", (entry.hand,))
 
 
 def table() -> dict[str, Picture]:

@@ -35,12 +35,12 @@ congrasp = functools.partial(python, "-m", "congrasp")
 """Runs the command line in a process of its own."""
 
 
-def is_one_line(code: int, said: str, words: str) -> None:
+def is_one_line(code: int, printed: str, words: str) -> None:
     """What was said on the standard error is one line with these words, and the exit code tells of
     bad input.
     """
-    assert code not in (0, 1), said
-    (line,) = errors(said)
+    assert code not in (0, 1), printed
+    (line,) = errors(printed)
     assert line.startswith("congrasp: error: ")
     assert re.search(words, line), line
 
@@ -231,7 +231,8 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         "cli.main()"
     )
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        port, options = str(taken.getsockname()[1]), ["--physics", "native", "--actors", "0"]
+        port = str(taken.getsockname()[1])
+        options = ["--physics", "native", "--actors", "0"]
         arguments = ["train", *options, "--run-dir", str(tmp_path / "run"), "--metrics-port", port]
         command = [sys.executable, "-c", program, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -256,9 +257,7 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         ),
     ],
 )
-def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(
-    error, line, monkeypatch, capsys
-):
+def test_a_full_or_failing_disk_is_reported_in_one_line(error, line, monkeypatch, capsys):
     def fail(arguments):
         raise error
 
@@ -281,8 +280,8 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     monkeypatch.setenv(name or "JAX_PLATFORMS", "abacus")
     with pytest.raises(SystemExit, match="2"):
         cli.main([])
-    said = f"{name} is 'abacus', which does not work here (invalid value for {name})"
-    line = said if name else "JAX_PLATFORMS is 'abacus', which does not work here"
+    expected = f"{name} is 'abacus', which does not work here (invalid value for {name})"
+    line = expected if name else "JAX_PLATFORMS is 'abacus', which does not work here"
     assert capsys.readouterr().err == f"congrasp: error: {line}. Correct or unset it.\n"
 
 
@@ -310,7 +309,8 @@ def test_numpy_warnings_reach_no_user():
         main.main(["plot"])
     """
     done = python("-c", textwrap.dedent(program))
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    assert done.stderr == ""
 
 
 def test_jax_variable_whose_value_an_error_quotes_is_named(monkeypatch, capsys):
@@ -362,7 +362,7 @@ def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_pla
         ("INTERNAL: CUDA_ERROR_OUT_OF_MEMORY", "OUT_OF_MEMORY"),
     ],
 )
-def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, monkeypatch, capsys):
+def test_insufficient_memory_is_one_line(said, what, monkeypatch, capsys):
     monkeypatch.setattr(cli, "run", mock.Mock(side_effect=RuntimeError(said)))
     with pytest.raises(SystemExit) as end:
         cli.main([])
@@ -377,9 +377,7 @@ def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, m
 @pytest.mark.parametrize(
     "number", [errno.EACCES, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG]
 )
-def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(
-    number, monkeypatch, capsys
-):
+def test_an_unusable_path_is_one_line_but_a_bug_is_not(number, monkeypatch, capsys):
     def refuse(arguments):
         raise OSError(number, os.strerror(number), *arguments)
 
@@ -416,7 +414,8 @@ def test_a_reader_that_is_gone_is_no_error():
     done = congrasp("hands", "list", "--help", **options)
     os.close(writer)
     lines = errors(done.stderr)
-    assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
+    assert not lines
+    assert done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_an_output_without_some_characters_gets_escapes():
@@ -435,16 +434,14 @@ def test_an_output_without_some_characters_gets_escapes():
         ),
     ],
 )
-def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(
-    tmp_path, shell, code, words
-):
+def test_closed_output_and_removed_folder_are_not_bugs(tmp_path, shell, code, words):
     command = ["sh", "-c", shell.format(sys.executable)]
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
-    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr, (
-        done.stderr
-    )
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
 
 
 @pytest.mark.parametrize("late", [True, False])
@@ -459,7 +456,8 @@ sys.argv[1:] = ["hands", "list"]
 main()
 """
     done = python("-c", code, timeout=60)
-    assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
+    assert done.returncode == 0, done.stderr
+    assert "allegro" in done.stdout, done.stderr
     assert done.stdout.endswith("shut down\n") is not late
 
 
@@ -470,7 +468,8 @@ def test_a_command_runs_in_any_thread_of_a_program(capsys):
         thread = threading.Thread(target=lambda: codes.append(cli.run(["hands", "list"])))
         thread.start()
         thread.join(60.0)
-    assert codes == [0] and "allegro" in capsys.readouterr().out
+    assert codes == [0]
+    assert "allegro" in capsys.readouterr().out
 
 
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, exit_code_of, capfd):
@@ -522,7 +521,8 @@ def test_without_a_home_and_a_cache_everything_works(tmp_path):
         text=True,
         timeout=180,
     )
-    assert done.returncode == 0 and (tmp_path / "box.safetensors").is_file(), done.stderr
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "box.safetensors").is_file(), done.stderr
     assert done.stderr.count("/proc/nowhere") == done.stderr.count("XDG_CACHE_HOME") == 1
 
 
@@ -541,7 +541,7 @@ def test_a_misspelt_file_is_named_before_anything_is_imported(
         cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])
 
 
-def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(
+def test_long_work_alone_is_announced_with_its_duration(
     capsys: pytest.CaptureFixture,
 ) -> None:
     with announced("Compiling", first=60.0):
@@ -554,7 +554,7 @@ def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(
     assert set(lines) == {"Compiling: 0 s so far."}
 
 
-def test_without_a_terminal_the_current_task_and_its_counts_are_named(capsys, monkeypatch):
+def test_progress_without_a_terminal_names_task_and_counts(capsys, monkeypatch):
     monkeypatch.setattr(console, "announced", functools.partial(announced, first=0.01, every=0.01))
     with console.tracked() as track:
         track("heading", 12)(5)
@@ -570,18 +570,18 @@ def test_a_phase_without_counts_has_no_total(monkeypatch):
     with console.bars() as progress:
         phases = console.PhaseBar(progress, "Starting")
         phases.update("mug: Attempting", 360, 400)
-        assert console._current(progress) == "mug: Attempting, 360 of 400"
+        assert console.current_activity(progress) == "mug: Attempting, 360 of 400"
         phases.update("mug: Drawing", 0, 0)
-        assert console._current(progress) == "mug: Drawing"
+        assert console.current_activity(progress) == "mug: Drawing"
         phases.update("mug: Drawing", 1, 3)
-        assert console._current(progress) == "mug: Drawing, 1 of 3"
+        assert console.current_activity(progress) == "mug: Drawing, 1 of 3"
 
 
 def test_a_bar_without_a_step_shows_no_counts(monkeypatch):
     monkeypatch.setattr(console, "announced", lambda task: contextlib.nullcontext())
     with console.bars() as progress:
         task = progress.add_task("Episodes", total=12)
-        assert console._current(progress) == "Episodes"
-        assert str(console._Counts().render(progress.tasks[0])) == ""
+        assert console.current_activity(progress) == "Episodes"
+        assert str(console.Counts().render(progress.tasks[0])) == ""
         progress.update(task, completed=3)
-        assert "3/12" in str(console._Counts().render(progress.tasks[0]))
+        assert "3/12" in str(console.Counts().render(progress.tasks[0]))

@@ -41,7 +41,7 @@ def weigh(monkeypatch, tmp_path):
     (tmp_path / "weigh.py").write_text(textwrap.dedent(FILE))
     monkeypatch.setattr(cli, "__path__", [*cli.__path__, str(tmp_path)])
     monkeypatch.setitem(main.COMMANDS, "weigh", "the mass of a box")
-    monkeypatch.setattr(main, "_prepare_environment", lambda: None)
+    monkeypatch.setattr(main, "prepare_environment", lambda: None)
 
 
 def test_it_runs_and_its_options_follow_from_its_signature(capsys):
@@ -59,4 +59,5 @@ def test_it_is_in_the_help(capsys):
     with pytest.raises(SystemExit):
         main.run(["weigh", "--help"])
     text = capsys.readouterr().out
-    assert "Print the mass of a box." in text and "In kg/m^3." in text
+    assert "Print the mass of a box." in text
+    assert "In kg/m^3." in text

@@ -49,21 +49,22 @@ def policy() -> PolicyBundle:
 @pytest.fixture(scope="module")
 def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
-    request, state = example.request, example.state
-    given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
-    given |= {
+    request = example.request
+    state = example.state
+    arrays = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
+    arrays |= {
         "q_target": request.q,
         "q_initial": request.q,
         "u_target": np.zeros(6),
         "time": np.float32(0),
     }
-    given |= {
+    arrays |= {
         "base_position": request.wrist[0],
         "base_quaternion": request.wrist[1],
         "table": np.bool_(True),
     }
-    given |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
-    return {**given, **state, "surface_points": request.surface}
+    arrays |= {f"{name}_initial": state[name] for name in ("object_position", "object_quaternion")}
+    return {**arrays, **state, "surface_points": request.surface}
 
 
 # A policy that does not know it.
@@ -100,19 +101,18 @@ def test_the_studio_refuses_it_in_one_line() -> None:
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.choose("fingers", "allowed", PINCH.tolist())
-    assert studio.asked == set() and [
-        row["name"] for row in describe_request(studio)["constraints"]
-    ] == list(PAPER)
+    assert studio.asked == set()
+    assert [row["name"] for row in describe_request(studio)["constraints"]] == list(PAPER)
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
-    own = Experiment(
+    experiment = Experiment(
         untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))),
         [MUG],
         episodes=1,
     )
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
-        own.run([Variation("fingers")])
+        experiment.run([Variation("fingers")])
 
 
 # A policy that knows it.
@@ -122,29 +122,28 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     policy: PolicyBundle, tmp_path: pathlib.Path
 ) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
+    grasp = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert (
-        found.motion.constraints == ("heading", "fingers", "force")
-        and "fingers_ratio" in found.facts()
-    )
-    assert 0.0 <= found.facts()["force_ratio"] <= 1.0
-    save_motion(tmp_path / "grasp.npz", found.motion)
+    assert grasp.motion.constraints == ("heading", "fingers", "force")
+    assert "fingers_ratio" in grasp.facts()
+    assert 0.0 <= grasp.facts()["force_ratio"] <= 1.0
+    save_motion(tmp_path / "grasp.npz", grasp.motion)
     goal = load_motion(tmp_path / "grasp.npz").goal
     np.testing.assert_array_equal(goal["fingers_allowed"], PINCH)
     assert goal["force_limit"] == 3.0
-    assert "Only the named fingers may touch the object." in found.active
-    assert "No link may press harder than the force limit." in found.active
-    made = found.episode
-    errors = made.require_recorded().errors
-    steps = made.steps
+    assert "Only the named fingers may touch the object." in grasp.active
+    assert "No link may press harder than the force limit." in grasp.active
+    recorded = grasp.episode
+    errors = recorded.require_recorded().errors
+    steps = recorded.steps
     other = np.isin(HAND.link_fingers, (2, 3, 4))
-    links = np.linalg.norm(made.link_force, axis=-1)
+    links = np.linalg.norm(recorded.link_force, axis=-1)
     np.testing.assert_array_equal(errors["fingers_ratio"] > 0, ((links > 0) & other).any(-1))
     np.testing.assert_array_equal(errors["force_ratio"] > 0, (links > 3.0).any(-1))
-    assert made.active["fingers"] and not made.active["pose_finger"]
-    assert lanes(found.episode)["fingers"].met.shape == (steps,)
-    assert "lane/fingers/share" in for_page(found.episode).arrays
+    assert recorded.active["fingers"]
+    assert not recorded.active["pose_finger"]
+    assert lanes(grasp.episode)["fingers"].met.shape == (steps,)
+    assert "lane/fingers/share" in for_page(grasp.episode).arrays
 
 
 @pytest.fixture
@@ -165,7 +164,8 @@ def test_queries_for_it_are_answered_and_checked(ask) -> None:
     assert pinch.active == [
         ["Only the named fingers may touch the object.", "The heading guides the wrist."]
     ]
-    free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
+    free = ask(["heading"])
+    ignored = ask(["heading"], fingers_allowed=PINCH)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
     for one, other in ((pinch, free), (soft, firm)):
@@ -183,10 +183,11 @@ def test_queries_for_it_are_answered_and_checked(ask) -> None:
         ask(["fingers"], fingers_allowed=PINCH)
 
 
-def test_the_studio_asks_for_what_is_allowed_alone() -> None:
+def test_the_studio_requests_only_allowed_fingers() -> None:
     studio = Studio(HAND, TASK, MUG)
     studio.ask("fingers", True)
-    assert describe_request(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
+    assert describe_request(studio)["active"]["masks"]["fingers"]
+    assert studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
     studio.choose("fingers", "allowed", [True, False, False, False, False])
     assert (
@@ -197,7 +198,8 @@ def test_the_studio_asks_for_what_is_allowed_alone() -> None:
             studio.choose("fingers", "allowed", values)
     studio = Studio(HAND, TASK, MUG)
     studio.ask("force", True)
-    assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
+    assert studio.request.given("force", "limit") == 5.0
+    assert studio.trouble == ""
     for name, field in (("pose", "q"), ("force", "limit")):
         with pytest.raises(CongraspError, match=f"nothing to choose for '{name}'"):
             studio.choose(name, field, [True])

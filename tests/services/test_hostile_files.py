@@ -3,6 +3,7 @@ memory and time.
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import pathlib
@@ -40,7 +41,8 @@ from tests.episodes import episode, episode_message
 from tests.limits import limited
 
 CLAW = pathlib.Path(__file__).parents[1] / "hands" / "claw.json"
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 LOADERS = {
     "object": store.load,
     "set": set_file.load,
@@ -48,6 +50,25 @@ LOADERS = {
     "motion": load_motion,
     "policy": bundles.load,
 }
+
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+ OFFSET 0 0 0
+ CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+ JOINT RightHand
+ {
+  OFFSET 1 0 0
+  CHANNELS 3 Zrotation Xrotation Yrotation
+ }
+}
+MOTION
+Frames: 2
+Frame Time: 0.01
+0 0 0 0 0 0 0 0 0
+1 0 0 0 0 0 0 0 0
+"""
 
 
 def _saved(save, *arguments):
@@ -103,7 +124,8 @@ def test_absent_cut_and_foreign_files_are_named(tmp_path, kind, data, why):
         path.write_bytes(data)
     with pytest.raises(CongraspError, match=why) as raised:
         LOADERS[kind](path)
-    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
     with pytest.raises(CongraspError, match="the hand file has the format None"):
         hand_from_text("{}")
 
@@ -153,7 +175,7 @@ def test_letters_of_any_script_stay_in_names_and_equal_names_become_distinct():
     ):
         assert safe_name(text) == name
         file_name(name, "an object")
-    long = [safe_name(letter * 150 + end) for letter in "x碗" for end in "ab"]
+    long = [safe_name(letter * 150 + end) for letter, end in itertools.product("x碗", "ab")]
     assert len({file_name(name, "an object") for name in long}) == 4
     assert distinct_names(["mug", "Mug", "mug", "mug-2", "cup"]) == [
         "mug",
@@ -230,7 +252,8 @@ def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
     store.save(dataclasses.replace(obj, **change(obj)), tmp_path / "a.safetensors")
     with pytest.raises(CongraspError, match=why) as raised:
         store.load(tmp_path / "a.safetensors")
-    assert str(tmp_path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(tmp_path) in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -250,9 +273,9 @@ def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
     ],
 )
 def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, part, changes, why):
-    made = decode(policy_file(None).read_bytes())
-    meta = {**made.meta, **({part: {**made.meta[part], **changes}} if part else changes)}
-    (tmp_path / "a.safetensors").write_bytes(encode(Message(made.arrays, meta)))
+    bundle = decode(policy_file(None).read_bytes())
+    meta = {**bundle.meta, **({part: {**bundle.meta[part], **changes}} if part else changes)}
+    (tmp_path / "a.safetensors").write_bytes(encode(Message(bundle.arrays, meta)))
     with pytest.raises(CongraspError, match=why):
         bundles.load(tmp_path / "a.safetensors")
 
@@ -301,7 +324,8 @@ def test_hands_with_values_that_none_has_are_named(tmp_path, change, why):
     path.write_text(json.dumps(fields))
     with pytest.raises(CongraspError, match=why) as raised:
         read_hand(path)
-    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -362,68 +386,51 @@ def test_motion_whose_object_is_a_path_is_neither_written_nor_read(tmp_path):
 
 
 def constraint_set():
-    made = {
+    meta = {
         "object": "mug",
         "hand": "human",
         "object_scale": 1.0,
         "object_digest": "0" * 16,
         "kind": "constraints",
     }
-    made |= {"format": 2, "variants": list(set_file.REGIONS), "finger_joints": ["a", "b"]}
+    meta |= {"format": 2, "variants": list(set_file.REGIONS), "finger_joints": ["a", "b"]}
     sizes = {"P": 8, "R": 2, "V": 2, "H": 4, "M": 3, "F": 2, "K": 5, "n": 4, "m": 4}
     arrays = {}
     for name, meaning in set_file.MEANING.items():
         letters = meaning[1 : meaning.index(")")].replace(",", " ").split()
         kind = bool if "bool" in meaning else np.int32 if "indices" in meaning else np.float32
         arrays[name] = np.ones([int(x) if x.isdigit() else sizes[x] for x in letters], kind)
-    return Message(arrays, made)
+    return Message(arrays, meta)
 
 
 def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
-    path, made = tmp_path / "a.safetensors", constraint_set()
+    path = tmp_path / "a.safetensors"
+    intact = constraint_set()
     for change, why in (
-        (Message(made.arrays, {**made.meta, "object": "../../x"}), "cannot name the object"),
-        (Message(made.arrays, {**made.meta, "object_scale": -1}), "object_scale"),
+        (Message(intact.arrays, {**intact.meta, "object": "../../x"}), "cannot name the object"),
+        (Message(intact.arrays, {**intact.meta, "object_scale": -1}), "object_scale"),
         (
-            Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta),
+            Message({**intact.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, intact.meta),
             "pose/q holds",
         ),
         (
-            Message({**made.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, made.meta),
+            Message({**intact.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, intact.meta),
             r"pose/q has shape \(2, 3, 9\), but",
         ),
     ):
         path.write_bytes(encode(change))
         with pytest.raises(CongraspError, match=why):
             set_file.load(path)
-    path.write_bytes(encode(made))
-    assert set_file.load(path).meta == made.meta
-
-
-BVH = """HIERARCHY
-ROOT Hips
-{
- OFFSET 0 0 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT RightHand
- {
-  OFFSET 1 0 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
- }
-}
-MOTION
-Frames: 2
-Frame Time: 0.01
-0 0 0 0 0 0 0 0 0
-1 0 0 0 0 0 0 0 0
-"""
+    path.write_bytes(encode(intact))
+    assert set_file.load(path).meta == intact.meta
 
 
 def refused(function, path, why):
     with pytest.raises(CongraspError, match=why) as caught:
         result = function(path)
         list(result) if hasattr(result, "__next__") else None
-    assert len(str(caught.value)) < 1000 and str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
 
 
 def test_json_is_of_bounded_size_and_depth(tmp_path):
@@ -466,8 +473,8 @@ def test_a_bvh_that_is_none_is_one_line(tmp_path, before, after):
 
 
 def test_motions_of_others_are_of_bounded_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(bvh, "_MAX_BYTES", 100)
-    monkeypatch.setattr(wrist_paths, "_MAX_CSV_BYTES", 100)
+    monkeypatch.setattr(bvh, "MAX_BYTES", 100)
+    monkeypatch.setattr(wrist_paths, "MAX_CSV_BYTES", 100)
     for name in ("x.bvh", "x.csv"):
         (tmp_path / name).write_text("0,0,0,1,0,0,0\n" * 20)
         refused(wrist_paths.read_wrist_path, tmp_path / name, "bytes; the limit is 100")
@@ -500,7 +507,7 @@ def test_recordings_of_others_are_one_line(tmp_path):
             lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'"
         )
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
-    whole = episode_message()
+    message = episode_message()
     for number, (change, why) in enumerate(
         (
             ({"hand": "/etc/hosts.json"}, "not a built-in hand"),
@@ -508,12 +515,12 @@ def test_recordings_of_others_are_one_line(tmp_path):
             ({"metrics": []}, r"'metrics' is \[\]"),
         )
     ):
-        data = encode(Message(whole.arrays, {**whole.meta, **change}))
+        data = encode(Message(message.arrays, {**message.meta, **change}))
         path = _recording(tmp_path / f"e{number}", Entry(raw, 1, data))
         refused(read_episodes, path, why)
         refused(lambda path: pick_episode(path, -1), path, why)
-    lost = {name: array for name, array in whole.arrays.items() if name != "visual_faces"}
-    path = _recording(tmp_path / "lost", Entry(raw, 1, encode(Message(lost, whole.meta))))
+    lost = {name: array for name, array in message.arrays.items() if name != "visual_faces"}
+    path = _recording(tmp_path / "lost", Entry(raw, 1, encode(Message(lost, message.meta))))
     refused(read_episodes, path, "lacks the array 'visual_faces'")
-    path = _recording(tmp_path / "fine", Entry(raw, 1, encode(whole)))
-    np.testing.assert_array_equal(next(read_episodes(path)).joint_position, whole.arrays["q"])
+    path = _recording(tmp_path / "fine", Entry(raw, 1, encode(message)))
+    np.testing.assert_array_equal(next(read_episodes(path)).joint_position, message.arrays["q"])

@@ -111,7 +111,8 @@ def completed(script, line):
 def test_bash_accepts_the_script(bash_script):
     subprocess.run(["bash", "-n", bash_script], check=True)
     done = subprocess.run(["bash", bash_script], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("", "")
+    assert done.stdout == ""
+    assert done.stderr == ""
 
 
 @pytest.mark.parametrize(
@@ -132,7 +133,9 @@ def test_bash_completes(bash_script, line, completions):
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_script_has_all_commands(shell):
     text = completion.script(shell)
-    assert "'evaluate'" in text and "--repeat" in text and "Examples:" not in text
+    assert "'evaluate'" in text
+    assert "--repeat" in text
+    assert "Examples:" not in text
 
 
 @pytest.mark.parametrize("path", ["runs/a", "my runs/try [lr=0.1] a", "it's", "$HOME"])

@@ -122,7 +122,9 @@ def _sequence(
     has_hand = np.isfinite(hand).all(-1) & (hand != 0).any(-1)
     present = has_object & has_hand
     object_pose, hand = known_frames(name, present, object_pose, hand)
-    skeleton = human.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
+    skeleton = human.skeleton(
+        model, calibrated_shape(name, root, _value(name, meta, "mano_calib")[0])
+    )
     angles = model.hand_mean + hand[:, 3:48] @ model.components
     wrist, joints = skeleton.posed(
         Rotation.from_rotvec(hand[:, :3]), Rotation.from_rotvec(angles.reshape(-1, 15, 3))
@@ -177,8 +179,18 @@ def _value(name: str, meta: dict[str, Any], key: str) -> Any:
     return meta[key]
 
 
-def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
-    """Shape parameters (10,) of a calibration."""
+def calibrated_shape(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
+    """Returns the shape parameters (10,) of a subject's calibration.
+
+    Args:
+      name: name of the sequence.
+      root: folder of the data set.
+      calibration: name of the calibration, from the sequence's `meta.yml`.
+
+    Raises:
+      CongraspError: the name leads out of the folder of calibrations.
+      Dropped: the file is missing, or has another layout.
+    """
     folder = root / "calibration" / file_name(f"mano_{calibration}", "a calibration")
     content = _yaml(name, folder / "mano.yml")
     betas = np.array(content.get("betas", []), float)

@@ -103,7 +103,7 @@ def _sequence(
     shapes = {field: (width,) for field, width in _FIELD_WIDTHS.items()}
     arrays = frames_of(name, "the file", data, shapes)
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
-    skeleton = _skeleton(model, _template(root, data))
+    skeleton = _skeleton(model, hand_template(root, data))
     frame_count = len(arrays[0])
     present = np.isfinite(np.concatenate(arrays, 1)).all(-1)
     fields = dict(zip(shapes, known_frames(name, present, *arrays), strict=True))
@@ -129,8 +129,13 @@ def _sequence(
     )
 
 
-def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path | None:
-    """Mesh of the subject's right hand, if it exists in the folder."""
+def hand_template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path | None:
+    """Returns the mesh of the subject's right hand; None if the folder does not contain it.
+
+    Args:
+      root: folder of the data set.
+      data: arrays of a sequence, by name.
+    """
     if "rhand/vtemp" not in data:
         return None
     path = root / str(data["rhand/vtemp"])

@@ -17,10 +17,10 @@ def test_the_surface_stays_and_faces_are_bounded(sections):
     vertices, faces = finer(mesh.vertices, mesh.faces, 0.003, 9_000)
     fine = trimesh.Trimesh(vertices, faces, process=False)
     assert len(mesh.faces) < len(faces) <= 9_000
-    assert fine.area == pytest.approx(mesh.area, rel=1e-4) and fine.volume == pytest.approx(
-        mesh.volume, rel=1e-4
-    )
-    assert vertices.dtype == np.float32 and faces.dtype == np.int32
+    assert fine.area == pytest.approx(mesh.area, rel=1e-4)
+    assert fine.volume == pytest.approx(mesh.volume, rel=1e-4)
+    assert vertices.dtype == np.float32
+    assert faces.dtype == np.int32
 
 
 def test_edges_become_short():
@@ -37,7 +37,8 @@ def test_a_mesh_of_many_faces_is_left_as_it_is():
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
 
 
-RED, BLUE = (255, 0, 0), (0, 0, 255)
+RED = (255, 0, 0)
+BLUE = (0, 0, 255)
 
 
 def test_a_colour_is_a_mean_of_similar_ones():
@@ -85,10 +86,12 @@ def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
     again = painted(
         np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours))
     )
-    assert len(cuts) == 1 and all(a is b for a, b in zip(first, again, strict=True))
+    assert len(cuts) == 1
+    assert all(a is b for a, b in zip(first, again, strict=True))
     with pytest.raises(ValueError, match="read-only"):
         first[2][0] = 0
     other = painted(ball.vertices, ball.faces, colours._replace(values=colours.values[::-1]))
-    assert len(cuts) == 2 and not np.array_equal(other[2], first[2])
+    assert len(cuts) == 2
+    assert not np.array_equal(other[2], first[2])
     painted(1.01 * ball.vertices, ball.faces, colours)
     assert len(cuts) == 3

@@ -2,7 +2,9 @@
 refusals have names.
 """
 
+import contextlib
 import csv
+import io
 import json
 import sys
 import types
@@ -89,9 +91,11 @@ def path_of(robot, q: np.ndarray, at=(3.0, 0.0, 0.1), dt: float = 0.01) -> Path:
     """Where MuJoCo has the wrist at arm joints (T, 7), with an object somewhere and no table."""
     hand = get_hand("allegro")
     data = mujoco.MjData(robot.model)
-    position, turns = [], []
+    position = []
+    turns = []
     for row in q:
-        data.qpos[robot.joints], data.qpos[robot.fingers] = row, hand.q_open
+        data.qpos[robot.joints] = row
+        data.qpos[robot.fingers] = hand.q_open
         mujoco.mj_kinematics(robot.model, data)
         position.append(data.body(robot.palm).xpos.copy())
         turns.append(data.body(robot.palm).xquat.copy())
@@ -123,14 +127,12 @@ def test_poses_of_forward_kinematics_come_back_within_every_limit(robot):
     again = path_of(robot, track.q)
     off = np.linalg.norm(again.position - path.position, axis=-1)
     turned = (again.rotation.inv() * path.rotation).magnitude()
-    assert (
-        off.max() == pytest.approx(track.position_error, abs=1e-9) and off.max() < 2e-3 < POSITION
-    )
-    assert (
-        turned.max() == pytest.approx(track.rotation_error, abs=1e-6)
-        and turned.max() < np.radians(0.5) < ANGLE
-    )
-    assert (track.q >= robot.arm.lower).all() and (track.q <= robot.arm.upper).all()
+    assert off.max() == pytest.approx(track.position_error, abs=1e-9)
+    assert off.max() < 2e-3 < POSITION
+    assert turned.max() == pytest.approx(track.rotation_error, abs=1e-6)
+    assert turned.max() < np.radians(0.5) < ANGLE
+    assert (track.q >= robot.arm.lower).all()
+    assert (track.q <= robot.arm.upper).all()
     speed = np.abs(np.diff(track.q, axis=0)) / path.dt
     assert (speed <= SPEED * (1 + 1e-6)).all()
     np.testing.assert_allclose(track.speed, speed.max(0) / SPEED, rtol=1e-6)
@@ -164,7 +166,7 @@ def test_a_wrist_that_turns_on_and_on_names_the_range(robot):
         follow(robot, still, np.random.default_rng(0))
 
 
-def test_what_the_arm_runs_into_is_named(robot):
+def test_collisions_of_the_arm_are_named(robot):
     path = path_of(robot, swing())
     data = mujoco.MjData(robot.model)
     data.qpos[robot.joints] = swing()[0]
@@ -186,14 +188,16 @@ def test_what_the_arm_runs_into_is_named(robot):
 
 def test_a_gripper_makes_room_for_the_hand_and_angles_keep_their_units(folder, block):
     hand = get_hand("allegro")
-    plain, gripping = load_arm(folder / "seven.xml"), load_arm(folder / "gripping.xml")
+    plain = load_arm(folder / "seven.xml")
+    gripping = load_arm(folder / "gripping.xml")
     assert gripping.joints == plain.joints == tuple(f"j{i}" for i in range(1, 8))
     assert gripping.flange == plain.flange == "link7"
     np.testing.assert_allclose(gripping.position, plain.position)
     np.testing.assert_allclose(plain.upper, np.radians([degrees for *_, degrees in LINKS]))
     model = build_robot(gripping, hand, default_mount(hand), block).model
     bodies = {model.body(i).name for i in range(model.nbody)}
-    assert not {"gripper", "left", "right"} & bodies and model.nq == 7 + len(hand.joints)
+    assert not {"gripper", "left", "right"} & bodies
+    assert model.nq == 7 + len(hand.joints)
     fingers = [model.joint(f"hand/{joint.name}").id for joint in hand.joints]
     np.testing.assert_allclose(
         model.jnt_range[fingers], np.stack([hand.lower, hand.upper], -1), atol=1e-6
@@ -205,7 +209,8 @@ def test_unnamed_sites_are_not_the_flange(tmp_path):
     marked = mjcf(tool).replace("<worldbody>", '<worldbody><site pos="0 0 0.5"/>')
     (tmp_path / "marked.xml").write_text(marked)
     arm = load_arm(tmp_path / "marked.xml")
-    assert arm.flange == "tool" and arm.joints == tuple(f"j{i}" for i in range(1, 8))
+    assert arm.flange == "tool"
+    assert arm.joints == tuple(f"j{i}" for i in range(1, 8))
     with pytest.raises(CongraspError, match=r"no chain of hinge and slide joints .* --flange"):
         load_arm(tmp_path / "marked.xml", flange="world")
 
@@ -216,7 +221,8 @@ def test_the_fingers_point_away_from_the_flange(robot):
     mujoco.mj_kinematics(robot.model, data)
     tips = [data.body(f"hand/{hand.links[i].name}").xpos[2] for i in hand.tip_links[1:]]
     flange = sum(length for _, length, _ in LINKS)
-    assert min(tips) > flange and data.body(robot.palm).xpos[2] > flange - 1e-6
+    assert min(tips) > flange
+    assert data.body(robot.palm).xpos[2] > flange - 1e-6
 
 
 def test_limits_of_a_urdf_and_of_the_user(folder):
@@ -259,10 +265,10 @@ def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
     robot = types.SimpleNamespace(
         entry_names=("scene.xml", "panda.xml", "panda_nohand.xml"), xml=xml
     )
-    known = types.SimpleNamespace(
+    descriptions = types.SimpleNamespace(
         names=lambda: ["franka_panda", "ur5e"], get=lambda name: robot, MenagerieError=Unreachable
     )
-    monkeypatch.setitem(sys.modules, "mujoco_menagerie", known)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", descriptions)
     with pytest.raises(
         CongraspError, match="'franka_panda' of MuJoCo Menagerie could not be downloaded"
     ):
@@ -281,66 +287,108 @@ def test_numbers_that_are_none(folder, option):
         )
 
 
-@pytest.mark.slow
-def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
-    shared = [
-        str(folder / "block.stl"),
-        "--hand",
-        "allegro",
-        "--attempts",
-        "8",
-        "--cache-dir",
-        str(folder),
-    ]
-    shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]
+def on_the_arm(folder, *options):
+    """Runs `congrasp grasp` for the block on the seven-joint arm; returns its exit code."""
+    options = ["--hand", "allegro", "--arm", str(folder / "seven.xml"), *options]
+    options += ["--attempts", "8", "--cache-dir", str(folder)]
+    return load("grasp")([str(folder / "block.stl"), *options])()
+
+
+@pytest.fixture(scope="module")
+def arm_grasp(folder, tmp_path_factory):
+    """Folder of a grasp on the arm, and what the command printed."""
+    out = tmp_path_factory.mktemp("arm-grasp")
     film = ["--video", "--size", "320x240", "--fps", "2", "--approach", "0"]
-    assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1", *film])() == 0
-    facts = json.loads((tmp_path / "block" / "result.json").read_text())
-    assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]
-    assert "seven carries the hand within" in capsys.readouterr().out
-    assert 0 < facts["arm_error_mm"] < 1e3 * POSITION and 0 < facts["arm_speed_share"] <= 1 + 1e-6
-    with (tmp_path / "block" / ARM_CSV).open() as file:
-        rows = [*csv.reader(file)]
-    names = [f"j{i}" for i in range(1, 8)] + [joint.name for joint in get_hand("allegro").joints]
-    assert rows[0] == ["time", *names]
-    motion = load_motion(tmp_path / "block" / "grasp.npz")
-    assert motion.arm is not None and robot_joints(motion) == names
-    table = np.array(rows[1:], float)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        code = on_the_arm(folder, "--out", str(out), "--base", "-0.6 0 0 0", "--lift", "0.1", *film)
+    assert code == 0
+    return out / "block", printed.getvalue()
+
+
+def arm_table(grasp):
+    """Header and rows of the arm's CSV file of a grasp."""
+    with (grasp / ARM_CSV).open() as file:
+        header, *rows = csv.reader(file)
+    return header, np.array(rows, float)
+
+
+def arm_joint_names():
+    return [f"j{i}" for i in range(1, 8)] + [joint.name for joint in get_hand("allegro").joints]
+
+
+@pytest.mark.slow
+def test_result_of_a_grasp_on_the_arm(arm_grasp):
+    grasp, printed = arm_grasp
+    facts = json.loads((grasp / "result.json").read_text())
+    assert facts["arm"] == "seven"
+    assert facts["arm_base"] == [-0.6, 0, 0, 0]
+    assert facts["success"]
+    assert "seven carries the hand within" in printed
+    assert 0 < facts["arm_error_mm"] < 1e3 * POSITION
+    assert 0 < facts["arm_speed_share"] <= 1 + 1e-6
+
+
+@pytest.mark.slow
+def test_motion_of_a_grasp_on_the_arm(arm_grasp):
+    grasp, _ = arm_grasp
+    header, table = arm_table(grasp)
+    names = arm_joint_names()
+    assert header == ["time", *names]
+    motion = load_motion(grasp / "grasp.npz")
+    assert motion.arm is not None
+    assert robot_joints(motion) == names
     np.testing.assert_allclose(motion.arm.joint_position, table[:, 1:8], atol=1e-6)
     np.testing.assert_allclose(motion.time, table[:, 0], atol=1e-6)
     flange = motion.arm.link_names.tolist().index("link7")
     turn = Rotation.from_quat(motion.arm.link_quaternion[:, flange], scalar_first=True)
     carried = motion.arm.link_position[:, flange] + turn.apply(motion.arm.hand_position)
     off = 1e3 * np.linalg.norm(carried - motion.wrist_position, axis=-1)
+    facts = json.loads((grasp / "result.json").read_text())
     assert off.max() == pytest.approx(facts["arm_error_mm"], rel=1e-3, abs=1e-3)
-    recorded = pick_motion(tmp_path / "block" / "grasp.mcap").arm
+    recorded = pick_motion(grasp / "grasp.mcap").arm
     assert recorded is not None
     np.testing.assert_array_equal(recorded.link_position, motion.arm.link_position)
     assert recorded.link_names.tolist() == motion.arm.link_names.tolist()
     assert [m.colour for m in recorded.meshes] == [m.colour for m in motion.arm.meshes]
-    message = json.loads((tmp_path / "block" / ARM_TRAJECTORY).read_text())
-    assert message["joint_names"] == names and len(message["points"]) == len(rows) - 1
-    last = message["points"][-1]
-    np.testing.assert_allclose(last["positions"], [float(x) for x in rows[-1][1:]], atol=1e-6)
-    since = last["time_from_start"]
-    assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(1.0 + float(rows[-1][0]))
-    speeds = np.array([point["velocities"] for point in message["points"]])
-    assert speeds.shape == (len(rows) - 1, len(names)) and np.abs(speeds).max() > 0.1
-    assert not speeds[[0, -1]].any()  # controllers reject a goal that still moves
-    assert np.asarray(Image.open(tmp_path / "block" / ARM_PICTURE)).std() > 10
-    frames = imageio_ffmpeg.read_frames(str(tmp_path / "block" / "grasp.mp4"))
-    assert next(frames)["size"] == (320, 240)
-    first, *_, last = (
-        np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in frames
-    )
-    left = (np.abs(first - np.median(first, (0, 1))).sum(-1) > 60)[:, :160]
-    # Something stands where the base is, and moves
-    assert left.any() and np.abs(first - last).max() > 60
 
-    assert load("grasp")([*shared, "--base", "3 0 0 180", "--no-pictures"])() == 2
-    said = capsys.readouterr().err
-    assert (
-        "seven can execute none of the" in said
-        and "the reach" in said
-        and "Set another --base" in said
-    )
+
+@pytest.mark.slow
+def test_ros2_trajectory_of_a_grasp_on_the_arm(arm_grasp):
+    grasp, _ = arm_grasp
+    _, table = arm_table(grasp)
+    names = arm_joint_names()
+    message = json.loads((grasp / ARM_TRAJECTORY).read_text())
+    assert message["joint_names"] == names
+    assert len(message["points"]) == len(table)
+    last = message["points"][-1]
+    np.testing.assert_allclose(last["positions"], table[-1, 1:], atol=1e-6)
+    since = last["time_from_start"]
+    assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(1.0 + table[-1, 0])
+    speeds = np.array([point["velocities"] for point in message["points"]])
+    assert speeds.shape == (len(table), len(names))
+    assert np.abs(speeds).max() > 0.1
+    assert not speeds[[0, -1]].any()  # controllers reject a goal that still moves
+
+
+@pytest.mark.slow
+def test_pictures_of_a_grasp_on_the_arm(arm_grasp):
+    grasp, _ = arm_grasp
+    assert np.asarray(Image.open(grasp / ARM_PICTURE)).std() > 10
+    video = imageio_ffmpeg.read_frames(str(grasp / "grasp.mp4"))
+    assert next(video)["size"] == (320, 240)
+    frames = [np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in video]
+    first = frames[0]
+    background = np.median(first, (0, 1))
+    drawn = np.abs(first - background).sum(-1) > 60
+    assert drawn[:, :160].any()  # the arm's base
+    assert np.abs(first - frames[-1]).max() > 60
+
+
+def test_a_base_out_of_reach_is_refused(folder, tmp_path, capsys):
+    base = ["--base", "3 0 0 180", "--no-pictures"]
+    assert on_the_arm(folder, "--out", str(tmp_path), *base) == 2
+    message = capsys.readouterr().err
+    assert "seven can execute none of the" in message
+    assert "the reach" in message
+    assert "Set another --base" in message

@@ -90,15 +90,17 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
             status = error.exit_code
     printed = capsys.readouterr()
     lines = (printed.out + printed.err).splitlines(keepends=True)
-    said = "".join(line for line in lines if not PROGRESS.search(line))
-    assert status == case["status"], said
+    output = "".join(line for line in lines if not PROGRESS.search(line))
+    assert status == case["status"], output
     for pattern in case["says"]:
-        assert re.search(pattern, said, re.DOTALL), said
+        assert re.search(pattern, output, re.DOTALL), output
     for pattern in case.get("never", ()):
-        assert not re.search(pattern, said), said
-    assert "Traceback" not in said and "Warning" not in said and "\x1b" not in said
+        assert not re.search(pattern, output), output
+    assert "Traceback" not in output
+    assert "Warning" not in output
+    assert "\x1b" not in output
     if status == 2:
-        assert len(said.splitlines()) == 1, said
+        assert len(output.splitlines()) == 1, output
     objects = {path.stem: store.load(path) for path in (tmp_path / "out").glob("*.safetensors")}
     assert objects.keys() == case.get("objects", objects).keys()
     for key, facts in case.get("objects", {}).items():
@@ -110,7 +112,8 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
         if "mass_g" in facts:
             assert 1000 * obj.mass == pytest.approx(facts["mass_g"], rel=0.01)
         if "pieces" in facts:
-            assert len(obj.pieces) <= facts["pieces"] and obj.shape_reliable
+            assert len(obj.pieces) <= facts["pieces"]
+            assert obj.shape_reliable
         if "outwards" in facts:
             assert (obj.normals * obj.points).sum(-1).min() > 0
         if "parts" in facts:
@@ -123,16 +126,16 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("name", ["hand_plain", "hand_swapped"])
-def test_a_confined_process_reads_what_this_one_does(name, tmp_path):
+def test_a_confined_process_reads_the_same(name, tmp_path):
     prepared(name, tmp_path)
-    found = []
+    messages = []
     for read in (import_hand, model_files.propose):
         try:
             proposal = read(tmp_path / "hand.urdf")
-            found.append((proposal.hand, proposal.palm, proposal.notes, sorted(proposal.meshes)))
+            messages.append((proposal.hand, proposal.palm, proposal.notes, sorted(proposal.meshes)))
         except CongraspError as error:
-            found.append(str(error))
-    assert found[0] == found[1]
+            messages.append(str(error))
+    assert messages[0] == messages[1]
 
 
 def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkeypatch):

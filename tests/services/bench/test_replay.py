@@ -33,7 +33,8 @@ def test_replays_end_in_the_states_of_the_recording():
     )
     recorder, twin = (make(HAND, TASK, objects, 2) for make in (Recorder, NativePhysics))
     rng = np.random.default_rng(0)
-    state, touched = recorder.start(reset_state), False
+    state = recorder.start(reset_state)
+    touched = False
     for step in range(20):
         targets = 0.01 * rng.normal(size=(WORLDS, 6 + len(HAND.joints)))
         state, seen = recorder.step(state, targets, np.full(WORLDS, step < 10))

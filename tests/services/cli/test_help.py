@@ -1,5 +1,6 @@
 """Help that loads only what it shows."""
 
+import itertools
 import json
 
 import pytest
@@ -34,7 +35,7 @@ def results() -> dict[str, tuple[str, list[str]]]:
     """Help of every command, and the slow packages that it is the first to import, all in one
     process that starts without them.
     """
-    lines = [words for command in COMMANDS for words in lines_of(command)]
+    lines = list(itertools.chain.from_iterable(map(lines_of, COMMANDS)))
     done = python("-c", PROGRAM, json.dumps(lines))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

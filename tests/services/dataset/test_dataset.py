@@ -34,7 +34,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 def arguments(out: pathlib.Path, *more: str) -> list[str]:
     """Four episodes of each of two objects, a shard each, in batches of three and one."""
-    own = [
+    options = [
         "dataset",
         "box:2-3",
         "--out",
@@ -47,7 +47,7 @@ def arguments(out: pathlib.Path, *more: str) -> list[str]:
         "3",
     ]
     return [
-        *own,
+        *options,
         "--constraints",
         "heading",
         "affordance",
@@ -91,7 +91,7 @@ def short_protocol():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, short_protocol) -> pathlib.Path:
+def dataset(tmp_path_factory, short_protocol) -> pathlib.Path:
     """A dataset that was made at once."""
     out = tmp_path_factory.mktemp("dataset")
     made(out)
@@ -99,18 +99,21 @@ def whole(tmp_path_factory, short_protocol) -> pathlib.Path:
 
 
 @pytest.fixture(scope="module")
-def columns(whole) -> dict[str, np.ndarray]:
+def columns(dataset) -> dict[str, np.ndarray]:
     """Its grasps."""
-    batches = [dict(batch) for batch in loader()(whole, size=3)]
+    batches = [dict(batch) for batch in loader()(dataset, size=3)]
     assert max(len(batch["q"]) for batch in batches) <= 3
-    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    columns = {}
+    for name in batches[0]:
+        columns[name] = np.concatenate([batch[name] for batch in batches])
+    return columns
 
 
 @pytest.mark.slow
 def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "HOLD_SECONDS", 2.0)  # as in the process
     monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
-    made(whole := tmp_path_factory.mktemp("whole"))
+    made(dataset := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     eventually(lambda: len(contents(tmp_path)) >= 2 or process.poll() is not None, 0.01)
@@ -126,24 +129,24 @@ def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path,
     made(tmp_path, "--part", "2/2")
     card = made(tmp_path)
     assert first.stat().st_mtime_ns == changed, "what was finished is not made again"
-    assert contents(tmp_path) == contents(whole)
-    assert card["counts"] == json.loads((whole / CARD).read_text())["counts"]
+    assert contents(tmp_path) == contents(dataset)
+    assert card["counts"] == json.loads((dataset / CARD).read_text())["counts"]
     assert card["shards"] == {"finished": 2, "of": 2}
 
 
-def test_rows_have_requests_and_outcomes(whole, columns):
-    card = json.loads((whole / CARD).read_text())
-    assert len(columns["object"]) == 8 and sorted(set(columns["object"])) == ["box_2", "box_3"]
-    for asked in ("heading", "affordance"):
-        rows = columns["constraints"] == asked
+def test_rows_have_requests_and_outcomes(dataset, columns):
+    card = json.loads((dataset / CARD).read_text())
+    assert len(columns["object"]) == 8
+    assert sorted(set(columns["object"])) == ["box_2", "box_3"]
+    for constraint in ("heading", "affordance"):
+        rows = columns["constraints"] == constraint
         assert sorted(columns["episode"][rows]) == [0, 0, 1, 1]
-        assert card["counts"][asked]["episodes"] == 4
-        assert card["counts"][asked]["held"] == columns["held"][rows].sum()
-        assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
-        assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
-    assert (columns["held"] >= columns["lifted"]).all() and (
-        columns["lifted"] >= columns["pushed"]
-    ).all()
+        assert card["counts"][constraint]["episodes"] == 4
+        assert card["counts"][constraint]["held"] == columns["held"][rows].sum()
+        assert np.isnan(columns["goal_heading_direction"][rows]).all() == (constraint != "heading")
+        assert np.isfinite(columns["affordance_ratio"][rows]).all() == (constraint == "affordance")
+    assert (columns["held"] >= columns["lifted"]).all()
+    assert (columns["lifted"] >= columns["pushed"]).all()
     assert columns["held"].any()
     unit = np.linalg.norm(
         columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1
@@ -163,8 +166,8 @@ def test_poses_are_in_the_frame_of_the_object(columns):
     assert (np.asarray(turned + start[:, :3])[:, 2] > 0).all(), "the wrist starts above the table"
 
 
-def test_objects_are_stored(whole):
-    table = pq.read_table(whole / "objects")
+def test_objects_are_stored(dataset):
+    table = pq.read_table(dataset / "objects")
     box = generate(2, "box")
     row = table.column("object").to_pylist().index("box_2")
     np.testing.assert_allclose(table.column("mass")[row].as_py(), box.mass, rtol=1e-6)
@@ -173,14 +176,14 @@ def test_objects_are_stored(whole):
     )
 
 
-def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
+def test_only_requested_outcomes_are_kept_and_all_are_counted(dataset, columns, tmp_path):
     card = made(tmp_path, "--keep", "held", "clean", "--part", "1/2")
     of_first = columns["object"] == "box_2"
-    wanted = of_first & columns["held"] & columns["clean"]
-    assert pq.read_table(tmp_path / "grasps").num_rows == wanted.sum()
+    is_kept = of_first & columns["held"] & columns["clean"]
+    assert pq.read_table(tmp_path / "grasps").num_rows == is_kept.sum()
     counted = card["counts"].values()
-    assert sum(own["episodes"] for own in counted) == of_first.sum()
-    assert sum(own["kept"] for own in counted) == wanted.sum()
+    assert sum(counts["episodes"] for counts in counted) == of_first.sum()
+    assert sum(counts["kept"] for counts in counted) == is_kept.sum()
 
 
 @pytest.mark.parametrize(
@@ -193,18 +196,19 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tm
         (("--shard", "100000"), "--shard"),
     ],
 )
-def test_bad_options(whole, more, words):
+def test_bad_options(dataset, more, words):
     with pytest.raises(CongraspError, match=words) as error:
-        cli.run(arguments(whole, *more))
+        cli.run(arguments(dataset, *more))
     assert "\n" not in str(error.value)
 
 
-def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path):
+def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(dataset, tmp_path):
     folder = tmp_path / "copy"
-    shutil.copytree(whole, folder)
-    card, grasps = made(folder), folder / "grasps" / "00001-of-00002.parquet"
+    shutil.copytree(dataset, folder)
+    card = made(folder)
+    grasps = folder / "grasps" / "00001-of-00002.parquet"
     assert card["sha256"] == {
-        name: hashlib.sha256(data).hexdigest() for name, data in contents(whole).items()
+        name: hashlib.sha256(data).hexdigest() for name, data in contents(dataset).items()
     }
     data = grasps.read_bytes()
     for place in range(0, len(data), len(data) // 16):
@@ -216,13 +220,15 @@ def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path
         list(loader()(folder))
     grasps.write_bytes(data)
     (folder / "objects" / grasps.name).unlink()
-    assert made(folder) == card and contents(folder) == contents(whole)
+    assert made(folder) == card
+    assert contents(folder) == contents(dataset)
 
 
 def test_a_range_of_the_generator_is_many_objects():
-    found = objects_at(pathlib.Path("all:5-7"))
-    assert [one.load().name for one in found] == [one.name for one in found] and len(found) == 3
-    assert len({one.digest() for one in found}) == 3
+    objects = objects_at(pathlib.Path("all:5-7"))
+    assert [one.load().name for one in objects] == [one.name for one in objects]
+    assert len(objects) == 3
+    assert len({one.digest() for one in objects}) == 3
     with pytest.raises(CongraspError, match="is below the first"):
         objects_at(pathlib.Path("box:7-5"))
 
@@ -269,9 +275,9 @@ def change_columns(shard: pathlib.Path, change: Callable[[pa.Table], pa.Table]) 
 
 
 @pytest.fixture
-def copied(whole, tmp_path) -> pathlib.Path:
+def copied(dataset, tmp_path) -> pathlib.Path:
     """A copy of the dataset that a test may damage."""
-    return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
+    return pathlib.Path(shutil.copytree(dataset, tmp_path / "copy"))
 
 
 def refused(folder: pathlib.Path, shard: pathlib.Path) -> None:
@@ -279,7 +285,8 @@ def refused(folder: pathlib.Path, shard: pathlib.Path) -> None:
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(CongraspError, match=re.escape(str(shard))) as error:
         made(folder)
-    assert "\n" not in str(error.value) and "elete it" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert "elete it" in str(error.value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 

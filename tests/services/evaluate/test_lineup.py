@@ -38,7 +38,8 @@ def who(lineup):
 
 def test_hands_are_those_with_a_pretrained_policy_unless_policies_are_named(saved):
     everyone = [(hand, "ours", ("single",)) for hand in pretrained_hands()]
-    assert who(line_up(["hands"], [], "human")) == everyone and len(everyone) == 3
+    assert who(line_up(["hands"], [], "human")) == everyone
+    assert len(everyone) == 3
     named = read_entrants([str(saved("ours")), str(saved("ours", "allegro"))])
     assert who(line_up(["hands"], named, "human")) == [
         ("human", "ours", ("single",)),
@@ -47,10 +48,10 @@ def test_hands_are_those_with_a_pretrained_policy_unless_policies_are_named(save
 
 
 def test_a_method_without_a_policy_is_named_and_no_error(saved):
-    given = read_entrants([f"no-feedforward={saved('no-feedforward')}"])
-    found = line_up(["ablation"], given, "human")
-    assert who(found) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
-    absent = [(one.hand, one.method, one.reason) for one in found.missing]
+    entrants = read_entrants([f"no-feedforward={saved('no-feedforward')}"])
+    lineup = line_up(["ablation"], entrants, "human")
+    assert who(lineup) == [("human", "ours", ("single",)), ("human", "no-feedforward", ("single",))]
+    absent = [(one.hand, one.method, one.reason) for one in lineup.missing]
     assert absent == [
         ("human", name, "not trained")
         for name in ABLATION
@@ -58,26 +59,26 @@ def test_a_method_without_a_policy_is_named_and_no_error(saved):
     ]
 
 
-def test_a_student_stands_beside_the_pretrained_policy_of_its_hand(saved):
+def test_a_student_is_compared_with_the_pretrained_policy(saved):
     student = read_entrants([str(saved("student"))])
     both = [("human", "ours", ("sensing",)), ("human", "student", ("sensing",))]
     assert who(line_up(["sensing"], student, "human")) == both
     assert who(line_up(["sensing"], [], "allegro")) == [("allegro", "ours", ("sensing",))]
-    found = line_up(["single", "sensing"], student, "human")
-    assert dict((name, tables) for _, name, tables in who(found)) == {
+    lineup = line_up(["single", "sensing"], student, "human")
+    assert dict((name, tables) for _, name, tables in who(lineup)) == {
         "student": ("single", "sensing"),
         "ours": ("sensing",),
     }
 
 
 def test_a_policy_is_evaluated_once_for_all_its_tables(saved):
-    given = read_entrants([str(saved("ours"))])
-    found = line_up(["single", "composed", "hands", "ablation", "single"], given, "human")
-    assert who(found) == [("human", "ours", ("single", "composed"))]
+    entrants = read_entrants([str(saved("ours"))])
+    lineup = line_up(["single", "composed", "hands", "ablation", "single"], entrants, "human")
+    assert who(lineup) == [("human", "ours", ("single", "composed"))]
     assert who(line_up(["composed"], [], "allegro")) == [("allegro", "ours", ("composed",))]
 
 
-def test_a_folder_stands_for_the_policies_of_its_runs(saved, tmp_path):
+def test_a_folder_means_the_policies_of_its_runs(saved, tmp_path):
     for method in ("ours", "two-phase"):
         saved(method)
     assert [one.method for one in read_entrants([str(tmp_path)])] == ["ours", "two-phase"]
@@ -86,7 +87,8 @@ def test_a_folder_stands_for_the_policies_of_its_runs(saved, tmp_path):
 
 def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
     (one,) = read_entrants([f"pd={saved('ours')}"])
-    assert one.method == "pd" and one.policy.task.control.finger_scale == 0.0
+    assert one.method == "pd"
+    assert one.policy.task.control.finger_scale == 0.0
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,7 @@ def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
         (["/nonexistent/policy.safetensors"], "cannot be read"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
+def test_incomparable_entrants_are_refused(saved, tmp_path, texts, words):
     (tmp_path / "empty").mkdir()
     names = {
         "ours": saved("ours"),
@@ -112,7 +114,10 @@ def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
 
 def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monkeypatch):
     def evaluate_tables(own, names, pools, kept, *, keep):
-        assert names == ("single",) and own.episodes == 7 and pools is None and not keep
+        assert names == ("single",)
+        assert own.episodes == 7
+        assert pools is None
+        assert not keep
         return tables.Evaluation(
             own, [], [row("heading", 0.9, 0.8, 0.95, method=own.policy.task.method)], [], ""
         )
@@ -131,11 +136,10 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
         str(tmp_path / "rows.json"),
     ]
     assert load("evaluate")(command)() == 0
-    printed, read = capsys.readouterr().out, json.loads((tmp_path / "rows.json").read_text())
-    assert (
-        "2 policies, on procedural objects (figures)" in printed
-        and printed.count("not trained") == 3
-    )
+    printed = capsys.readouterr().out
+    read = json.loads((tmp_path / "rows.json").read_text())
+    assert "2 policies, on procedural objects (figures)" in printed
+    assert printed.count("not trained") == 3
     assert [one["method"] for one in read["rows"]] == ["ours", "no-feedforward"]
     assert [one["method"] for one in read["policies"]] == ["ours", "no-feedforward"]
     missing = [(one["method"], one["reason"]) for one in read["missing"]]

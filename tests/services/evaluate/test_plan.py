@@ -1,5 +1,7 @@
 """Rows of an evaluation: their objects and episodes, and what they do not depend on."""
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
@@ -21,15 +23,15 @@ def conditions():
 
 
 def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
-    asked = []
+    first_seeds = []
     monkeypatch.setattr(
         procedural,
         "parallel_map",
-        lambda make, seeds, families: asked.append((list(seeds), families)),
+        lambda make, seeds, families: first_seeds.append((list(seeds), families)),
     )
     exams.exam_pool("figures")
     exams.exam_pool("development", 5)
-    (figures, families), (development, _) = asked
+    (figures, families), (development, _) = first_seeds
     assert sorted(families) == sorted(procedural.FAMILIES), "one object of each family"
     assert figures == list(range(FIGURES_SEED, FIGURES_SEED + len(procedural.FAMILIES)))
     assert development == list(range(HELD_OUT_SEED, HELD_OUT_SEED + 5))
@@ -43,29 +45,32 @@ def test_the_development_exam_never_reaches_objects_for_figures():
 
 def test_episodes_that_begin_alike_are_one(conditions):
     twice = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf]), conditions)
-    found = identity(twice)
-    np.testing.assert_array_equal(found[:64], found[64:])
-    assert len(np.unique(found)) == 64
+    identities = identity(twice)
+    np.testing.assert_array_equal(identities[:64], identities[64:])
+    assert len(np.unique(identities)) == 64
     # The limit of a force that nothing asks for does not tell episodes apart; one that is asked for
     # does.
-    goal, active = conditions.goal, conditions.goal.active["force_limit"]
+    goal = conditions.goal
+    active = conditions.goal.active["force_limit"]
     other = conditions._replace(goal=goal.replace("force", limit=goal["force"].limit + 1))
     changed = identity(other) != identity(conditions)
     np.testing.assert_array_equal(changed, active)
-    assert active.any() and not active.all()
+    assert active.any()
+    assert not active.all()
 
 
 def test_episodes_of_one_reference_are_a_cluster(conditions):
-    goal, index = conditions.goal, conditions.reset_state.object_index
-    found = reference(conditions)
+    goal = conditions.goal
+    index = conditions.reset_state.object_index
+    clusters = reference(conditions)
     posed = goal.active["pose_finger"] | goal.active["trajectory"]
     plain = ~posed
-    assert len(np.unique(found[plain])) == len(np.unique(index[plain])), (
+    assert len(np.unique(clusters[plain])) == len(np.unique(index[plain])), (
         "without a reference, objects"
     )
     moved = conditions._replace(goal=goal.replace("pose", q=goal["pose"].q + 0.1))
     np.testing.assert_array_equal(
-        reference(moved) != found, goal.active["pose_finger"] | goal.active["pose_wrist"]
+        reference(moved) != clusters, goal.active["pose_finger"] | goal.active["pose_wrist"]
     )
 
 
@@ -108,9 +113,8 @@ def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
     for obj in np.flatnonzero(plan.covered):
         rests = plan.episodes.rests[index == obj]
         of_each = np.unique(rests, return_counts=True)[1]
-        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(
-            task.OBJECTS[obj].rest_poses
-        )
+        assert of_each.max() - of_each.min() <= 1
+        assert len(of_each) <= len(task.OBJECTS[obj].rest_poses)
     for block, active in zip(blocks(TASK), (*MASKS[name], 0, 0), strict=True):
         np.testing.assert_array_equal(
             conditions.goal.active[block], np.full(plan.total, bool(active))
@@ -125,7 +129,8 @@ def test_episodes_are_independent_of_other_objects(bank):
     for name in ("affordance", "pose+trajectory"):
         among = plan_row(TASK, bank, task.OBJECTS, name, 30)
         alone = plan_row(TASK, fewer, task.OBJECTS[1:], name, 8)
-        whole, part = _all(bank, among), _all(fewer, alone, size=4)
+        among_others = _all(bank, among)
+        part = _all(fewer, alone, size=4)
         for i, (obj, number) in enumerate(
             zip(alone.episodes.objects, alone.episodes.numbers, strict=True)
         ):
@@ -134,7 +139,7 @@ def test_episodes_are_independent_of_other_objects(bank):
             )
             for ours, theirs in zip(
                 jax.tree.leaves((part.goal, part.reset_state.base_position)),
-                jax.tree.leaves((whole.goal, whole.reset_state.base_position)),
+                jax.tree.leaves((among_others.goal, among_others.reset_state.base_position)),
                 strict=True,
             ):
                 np.testing.assert_allclose(ours[i], theirs[at], rtol=0, atol=1e-6)
@@ -160,12 +165,13 @@ def test_pairs_are_independent_unless_aligned(bank):
             for field in (bank.pose_q, bank.pose_position)
         )
         # Hands that close around nothing are alike: any pose with these fingers may be meant.
-        own = np.abs(q - goal["pose"].q[:, None]).max(-1) < 1e-5
+        is_aligned = np.abs(q - goal["pose"].q[:, None]).max(-1) < 1e-5
         away = np.linalg.norm(wrist - goal["trajectory"].position[:, -1:], axis=-1)
-        apart[name] = np.where(own, away, np.inf).min(1)
+        apart[name] = np.where(is_aligned, away, np.inf).min(1)
     independent, aligned = apart.values()
     # The table leaves few references in some resting poses, so that two draws may well be the same.
-    assert aligned.max() < 0.005 and np.mean(independent > 0.005) > 0.5
+    assert aligned.max() < 0.005
+    assert np.mean(independent > 0.005) > 0.5
 
 
 def test_trajectories_end_nearer_to_the_graspable_region(bank):
@@ -182,10 +188,11 @@ def test_objects_that_allow_nothing_are_counted(bank):
     valid = np.array(bank.pose_valid)
     valid[1] = False
     plan = plan_row(TASK, bank._replace(pose_valid=valid), task.OBJECTS, "pose", 10)
-    assert plan.covered.tolist() == [True, False, True, True] and 1 not in plan.episodes.objects
+    assert plan.covered.tolist() == [True, False, True, True]
+    assert 1 not in plan.episodes.objects
     assert plan.total == 12
 
 
 def test_the_tables_name_rows_that_can_be_planned(bank):
-    for name in dict.fromkeys(row for rows in TABLES.values() for row in rows):
+    for name in dict.fromkeys(itertools.chain.from_iterable(TABLES.values())):
         assert plan_row(TASK, bank, task.OBJECTS, name, 3).total >= 3

@@ -26,21 +26,25 @@ def policy():
 def test_reference_policies_never_had_poses_or_trajectories():
     for hand in pretrained_hands():
         bundle = bundles.load(reference_file(hand))
-        assert bundle.spec.hand == hand and set(bundle.task.constraints) == {
+        assert bundle.spec.hand == hand
+        assert set(bundle.task.constraints) == {
             "heading",
             "affordance",
         }
-        found, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
-        assert found.task == bundle.task
+        policy, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
+        assert policy.task == bundle.task
 
 
 @pytest.mark.parametrize("count", range(1, POSES + 1))
 def test_held_out_references_are_not_for_training(count):
     order = references.arrange(count)
-    training, held_out = order[:-HELD_OUT], order[-HELD_OUT:]
-    assert len(order) == POSES and set(order) <= set(range(count))
+    training = order[:-HELD_OUT]
+    held_out = order[-HELD_OUT:]
+    assert len(order) == POSES
+    assert set(order) <= set(range(count))
     if count > 1:
-        assert set(order) == set(range(count)) and not set(training) & set(held_out)
+        assert set(order) == set(range(count))
+        assert not set(training) & set(held_out)
     if count == POSES:
         np.testing.assert_array_equal(order, np.arange(POSES))
 
@@ -59,20 +63,21 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
         Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0])
         for rest in bank.rest[:, 0]
     ]
-    own, *below = (
+    of_policy, *below = (
         low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down)
     )
-    made = references.with_references(
-        policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2]
+    with_grasps = references.with_references(
+        policy,
+        task.TASK,
+        bank,
+        [[[of_policy, below[0], of_policy], []], [[below[1]], []], *[[[], []]] * 2],
     )
-    np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
-    np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))
+    np.testing.assert_array_equal(with_grasps.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(with_grasps.bank.pose_q[0, 0], np.tile(of_policy.q, (POSES, 1)))
     closed = np.asarray(bank.pose_q)[1, 0]
-    assert all(
-        any(np.array_equal(q, other) for other in closed)
-        for q in np.asarray(made.bank.pose_q)[1, 0]
-    )
+    for q in np.asarray(with_grasps.bank.pose_q)[1, 0]:
+        assert any(np.array_equal(q, other) for other in closed)
     # Of those that the table leaves room for
-    assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()
+    assert np.asarray(with_grasps.bank.pose_valid)[:, 0].any(1).all()
     for field in ("points", "heading_position", "rest"):
-        np.testing.assert_array_equal(getattr(made.bank, field), getattr(bank, field))
+        np.testing.assert_array_equal(getattr(with_grasps.bank, field), getattr(bank, field))

@@ -67,12 +67,14 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
         [Picture("Learning", png)],
     )
     write_report(out, content)
-    found = Reader(text := out.read_text())
-    cells = {content: kind for kind, content in found.cells}
+    report = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in report.cells}
     # The paper has 96.9, 96.4 and 95.5 %: above it, below it, and within the interval.
-    assert cells["99.0 % (97.5-99.5)"] == "better" and cells["90.0 % (85.0-95.0)"] == "worse"
+    assert cells["99.0 % (97.5-99.5)"] == "better"
+    assert cells["90.0 % (85.0-95.0)"] == "worse"
     assert cells["96.0 % (93.0-98.0)"] == ""
-    assert cells["96.9 %"] == "paper" and "p & q.safetensors" in cells
+    assert cells["96.9 %"] == "paper"
+    assert "p & q.safetensors" in cells
     # Ours and the paper's 0.137 rad and 0.020 m, in a column each.
     for ours, paper in (("4.0", "7.8"), ("13.0", "20.0")):
         assert f'<td class="number">{ours} <span class="paper">{paper}</span></td>' in text
@@ -81,9 +83,11 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
         "300 episodes in simulation. Success is at or above the paper's in 2 of its 3 rows"
         in html.unescape(text)
     )
-    assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
-    assert len(found.sources) == 2 and not found.links
-    for source in found.sources:
+    assert "slipped &lt;b&gt;" in text
+    assert "--policy &lt;mine&gt;" in text
+    assert len(report.sources) == 2
+    assert not report.links
+    for source in report.sources:
         kind, content = source.split(",")
         assert kind == "data:image/png;base64"
         assert Image.open(io.BytesIO(base64.b64decode(content))).size == (8, 6)
@@ -96,12 +100,13 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         [Finding("palm", "passed", "fine"), Finding("ball", "failed", "falls", "close <it>")],
     )
     bundles.save(policy, tmp_path / "policy.safetensors")
-    rows, out = [row("heading", 0.99, 0.975, 0.995)], tmp_path / "report.html"
+    rows = [row("heading", 0.99, 0.975, 0.995)]
+    out = tmp_path / "report.html"
 
     def report_on(own, name, out, *, check, subject, objects, run_dir):
-        assert (
-            subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
-        )
+        assert subject == f"--policy {tmp_path / name}"
+        assert own.episodes == 8
+        assert run_dir == tmp_path
         commands = Commands("c", "")
         content = ReportContent(own.policy, name, rows, "8 episodes", commands, check=check)
         write_report(out, content)
@@ -120,17 +125,18 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         str(tmp_path / "rows.json"),
     ]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
-    found = Reader(text := out.read_text())
-    cells = {content: kind for kind, content in found.cells}
-    assert cells["passed"] == "better" and cells["failed"] == "worse" and "close &lt;it&gt;" in text
-    assert len(found.sources) == 1
+    report = Reader(text := out.read_text())
+    cells = {content: kind for kind, content in report.cells}
+    assert cells["passed"] == "better"
+    assert cells["failed"] == "worse"
+    assert "close &lt;it&gt;" in text
+    assert len(report.sources) == 1
     written = json.loads((tmp_path / "rows.json").read_text())
     assert written["content"] == bundles.content_hash(
         (tmp_path / "policy.safetensors").read_bytes()
     )
-    assert [one["constraint"] for one in written["rows"]] == ["heading"] and written[
-        "episodes"
-    ] == 8
+    assert [one["constraint"] for one in written["rows"]] == ["heading"]
+    assert written["episodes"] == 8
     (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
     with pytest.raises(CongraspError, match=r"check\.json is not a self-check"):
         main.run([*command, "--check", str(tmp_path / "check.json")])
@@ -143,26 +149,30 @@ def test_the_command_evaluates_draws_and_writes(tmp_path):
     bundles.save(untrained(config), tmp_path / "mine.safetensors")
     command = ["report", str(tmp_path / "mine.safetensors"), "--out", str(tmp_path / "report.html")]
     assert main.run([*command, "--episodes", "1", "--pool", "2", "--physics", "native"]) == 0
-    found = Reader(text := (tmp_path / "report.html").read_text())
-    assert len(found.sources) == 1 and "--episodes 1 " in text and "2 episodes" in text
+    report = Reader(text := (tmp_path / "report.html").read_text())
+    assert len(report.sources) == 1
+    assert "--episodes 1 " in text
+    assert "2 episodes" in text
 
 
 def test_a_runs_curves_are_pictures(tmp_path):
     assert list(curves_of(tmp_path)) == []
-    writer, channels = LogWriter(tmp_path / "logs", "log"), JsonChannels()
+    writer = LogWriter(tmp_path / "logs", "log")
+    channels = JsonChannels()
     for update in range(3):
         values = {"update": update, "values": {"episode": {"success": 0.5}}}
         writer.write(channels.entry("/metrics/learner/0", update, values))
     writer.close()
     (learning,) = curves_of(tmp_path)
-    assert learning.title == "Learning" and Image.open(io.BytesIO(learning.png)).width > 300
+    assert learning.title == "Learning"
+    assert Image.open(io.BytesIO(learning.png)).width > 300
 
 
 def test_causes_are_counted():
     assert count_causes(["held", "slipped", "held"]) == "2 held, 1 slipped"
 
 
-def test_limits_name_what_is_bad_by_the_figures():
+def test_limits_of_a_report_follow_from_its_figures():
     good = row("heading", 0.99, 0.975, 0.995)
     assert limits([good]) == ["No row is below the paper's success, or below 80 %."]
     worst = [
@@ -183,7 +193,7 @@ def test_limits_name_what_is_bad_by_the_figures():
     ]
 
 
-def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
+def test_a_model_card_describes_observation_and_training(policy):
     ranged = dataclasses.replace(policy.task, friction_range=(0.5, 1.2), mass_range=(1.0, 1.0))
     card = model_card(dataclasses.replace(policy, task=ranged), [])
     assert "It observes exact poses, velocities and contact forces." in card["limits"]
@@ -194,9 +204,12 @@ def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
     )
     card = model_card(dataclasses.replace(policy, task=tracked), [])
     (observed,) = [text for text in card["limits"] if text.startswith("It observes")]
-    assert "last 8 control steps" in observed and "no velocities and no contact forces" in observed
-    said = "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."
-    assert card["data"][1].endswith(f"; mass x 1, sliding friction 0.5 to 1.2, {said}")
+    assert "last 8 control steps" in observed
+    assert "no velocities and no contact forces" in observed
+    disturbances = (
+        "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."
+    )
+    assert card["data"][1].endswith(f"; mass x 1, sliding friction 0.5 to 1.2, {disturbances}")
 
 
 def test_few_episodes_are_a_warning(tmp_path, policy):
@@ -204,7 +217,8 @@ def test_few_episodes_are_a_warning(tmp_path, policy):
     for rows, warned in (([few], True), ([row("heading", 0.99, 0.975, 0.995)], False)):
         write_report(tmp_path / "r.html", ReportContent(policy, "p", rows, "", Commands("c", "")))
         text = (tmp_path / "r.html").read_text()
-        assert ('class="warning"' in text) == warned and ("rows of 16 episodes" in text) == warned
+        assert ('class="warning"' in text) == warned
+        assert ("rows of 16 episodes" in text) == warned
         for section in ("Use", "Limits", "Data", "Licence", "Citation"):
             assert f"<h3>{section}</h3>" in text
         assert "@article{congraspxl" in text
@@ -215,16 +229,18 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     of the episode.
     """
     recorded = episode(9)
-    made = turntable(recorded)
-    data = json.loads(made["data"])
+    scene = turntable(recorded)
+    data = json.loads(scene["data"])
 
     def array(name, kind, *shape):
         return np.frombuffer(base64.b64decode(data[name]), kind).reshape(-1, *shape)
 
     frames = array("frames", "<f4", data["count"], 3, 4)
     assert len(frames) == len(range(0, recorded.steps, round(data["seconds"] / 0.01)))
-    step, which = round(data["seconds"] / 0.01), 1
-    bones, weights = array("bones", "u1", 4), array("weights", "u1", 4) / 255
+    step = round(data["seconds"] / 0.01)
+    which = 1
+    bones = array("bones", "u1", 4)
+    weights = array("weights", "u1", 4) / 255
     points = np.column_stack([array("position", "<f4", 3), np.ones(len(bones))])
     moved = np.einsum("vk,vkij,vj->vi", weights, frames[which][bones], points)
     hand = recorded.known_hand()
@@ -236,11 +252,9 @@ def test_a_grasp_to_turn_around_is_where_the_episode_was(tmp_path, policy):
     np.testing.assert_allclose(
         [solid.min(0), solid.max(0)], [corners.min(0), corners.max(0)], atol=1e-5
     )
-    assert (
-        array("faces", "<u4", 3).max() < len(points)
-        and data["table"][1] == array("faces", "<u4").size
-    )
-    motion = {**made, "constraint": "x"}
+    assert array("faces", "<u4", 3).max() < len(points)
+    assert data["table"][1] == array("faces", "<u4").size
+    motion = {**scene, "constraint": "x"}
     content = ReportContent(policy, "p", [], "", Commands("c", ""), motion=motion)
     write_report(tmp_path / "r.html", content)
     assert "A grasp to turn around" in (tmp_path / "r.html").read_text()

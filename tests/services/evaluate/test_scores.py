@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import json
 
 import numpy as np
@@ -95,10 +96,13 @@ def test_a_row_averages_over_successful_episodes():
     row = summarised(
         "pose+trajectory", "human", sample, held_2s=True, objects=list("abcdefg"), paper="captured"
     )
-    assert (row.episodes, row.covered, row.pool, row.success, row.held_2s) == (4, 3, 7, 0.75, 0.5)
-    assert row.diverged == 0.25 and [
-        (of["name"], of["episodes"], of["success"]) for of in row.objects
-    ] == [
+    assert row.episodes == 4
+    assert row.covered == 3
+    assert row.pool == 7
+    assert row.success == 0.75
+    assert row.held_2s == 0.5
+    assert row.diverged == 0.25
+    assert [(of["name"], of["episodes"], of["success"]) for of in row.objects] == [
         ("d", 2, 1.0),
         ("e", 1, 1.0),
         ("f", 1, 0.0),
@@ -106,16 +110,17 @@ def test_a_row_averages_over_successful_episodes():
     objects = sample.values["object_index"]
     assert (row.success_low, row.success_high) == clustered(np.array([1, 1, 0, 1]), objects)
     assert (row.held_2s_low, row.held_2s_high) == clustered(np.array([1, 0, 0, 1]), objects)
-    assert row.errors["pose_rad"] == pytest.approx(0.2) and row.errors["pose_m"] == pytest.approx(
-        0.02
-    )
+    assert row.errors["pose_rad"] == pytest.approx(0.2)
+    assert row.errors["pose_m"] == pytest.approx(0.02)
     assert row.errors["traj_rad"] == pytest.approx(0.5)
-    assert row.errors["heading_rad"] is None and row.errors["affordance_ratio"] is None
+    assert row.errors["heading_rad"] is None
+    assert row.errors["affordance_ratio"] is None
     assert row.forces["link_force_mean"] == pytest.approx(4.0)  # of the links that touch: 2, 4, 6
     assert row.forces["link_force_p95"] == pytest.approx(5.8)
     assert row.forces["force_sum_mean"] == pytest.approx(4.0)  # 2, 10, 0
     assert row.forces["torque_share_mean"] == pytest.approx(3.0 / 9)
-    assert row.paper is not None and row.paper.success == 0.865
+    assert row.paper is not None
+    assert row.paper.success == 0.865
 
 
 def test_uncovered_objects_count_as_failures():
@@ -124,8 +129,12 @@ def test_uncovered_objects_count_as_failures():
     """
     sample = _sample([1, 1, 1, 0, 0, 0], [1, 0, 1, 0, 0, 0], object_index=[0, 0, 2, 2, 4, 4])
     row = summarised("affordance", "human", sample, held_2s=True, objects=list("abcde"))
-    assert (row.covered, row.pool, row.success, row.success_all) == (3, 5, 0.5, pytest.approx(0.3))
-    assert row.held_2s == pytest.approx(1 / 3) and row.held_all == pytest.approx(0.2)
+    assert row.covered == 3
+    assert row.pool == 5
+    assert row.success == 0.5
+    assert row.success_all == pytest.approx(0.3)
+    assert row.held_2s == pytest.approx(1 / 3)
+    assert row.held_all == pytest.approx(0.2)
     assert RATE["of all objects"](row) == "30.0 %, 20.0 %"
     # Of a group of three of the five there is no uncovered object.
     assert (
@@ -141,25 +150,28 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
         [1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8
     )
     row = summarised("pose", "human", repeated, held_2s=True, objects=["a", "b"])
-    assert (row.episodes, row.distinct, row.independent) == (16, 2, pytest.approx(1.0))
+    assert row.episodes == 16
+    assert row.distinct == 2
+    assert row.independent == pytest.approx(1.0)
     assert RATE["episodes"](row) == "16 (2 different)"
     spread = summarised(
         "pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"]
     )
-    assert (
-        spread.distinct == 16
-        and row.success_low < spread.success_low < spread.success_high < row.success_high
-    )
+    assert spread.distinct == 16
+    assert row.success_low < spread.success_low < spread.success_high < row.success_high
     # Sequences of one object are the clusters where references are.
-    own = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
-    row = summarised("pose", "human", own, held_2s=True, objects=["a"], by_reference=True)
+    clustered = _sample([1, 1, 0, 0], [0] * 4, reference=[7, 7, 9, 9])
+    row = summarised("pose", "human", clustered, held_2s=True, objects=["a"], by_reference=True)
     assert row.independent == pytest.approx(1.0)
 
 
 def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
     row = summarised("heading", "human", _sample([0, 0], [0, 0]), held_2s=False, objects=["a"])
-    assert row.success == 0 and row.held_2s is None and row.held_2s_low is None
-    assert set(row.errors.values()) == {None} and set(row.forces.values()) == {None}
+    assert row.success == 0
+    assert row.held_2s is None
+    assert row.held_2s_low is None
+    assert set(row.errors.values()) == {None}
+    assert set(row.forces.values()) == {None}
 
 
 @pytest.mark.parametrize(
@@ -179,9 +191,7 @@ def test_a_row_without_success_has_no_errors_and_short_episodes_no_hold():
         ("", "human", "ours", "heading", "", None),
     ],
 )
-def test_rows_stand_beside_those_that_were_made_alike(
-    source, hand, method, constraint, group, success
-):
+def test_rows_are_matched_by_equal_settings(source, hand, method, constraint, group, success):
     row = paper_row(source, hand, method, constraint, group)
     assert (row and row.success) == success
 
@@ -192,20 +202,18 @@ def test_joined_samples_keep_forces_beside_their_episodes():
         _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5)),
     ]
     parts[0].link_force[:] = 1.0
-    whole = joined(parts)
-    assert (
-        len(whole.values["success"]) == PROBED_EPISODES + 7
-        and len(whole.link_force) == PROBED_EPISODES
-    )
-    assert whole.link_force[:2].min() == 1.0 and whole.link_force[2:].max() == 0.0
+    sample = joined(parts)
+    assert len(sample.values["success"]) == PROBED_EPISODES + 7
+    assert len(sample.link_force) == PROBED_EPISODES
+    assert sample.link_force[:2].min() == 1.0
+    assert sample.link_force[2:].max() == 0.0
     # What follows a sample without all its forces must not move up to another episode's place.
-    late = joined([whole, parts[0]])
-    assert (
-        len(late.values["success"]) == PROBED_EPISODES + 9
-        and len(late.link_force) == PROBED_EPISODES
-    )
+    late = joined([sample, parts[0]])
+    assert len(late.values["success"]) == PROBED_EPISODES + 9
+    assert len(late.link_force) == PROBED_EPISODES
     odd = late.where(np.arange(PROBED_EPISODES + 9) % 2 == 1)
-    assert len(odd.link_force) == PROBED_EPISODES // 2 and odd.link_force[0].min() == 1.0
+    assert len(odd.link_force) == PROBED_EPISODES // 2
+    assert odd.link_force[0].min() == 1.0
 
 
 def test_peak_and_mean_of_the_strongest_links_force():
@@ -215,14 +223,13 @@ def test_peak_and_mean_of_the_strongest_links_force():
     force = np.array([[[3, 1], [0, 4]], [[8, 2], [1, 0]]], np.float16)
     sample = dataclasses.replace(_sample([1, 1], [1, 1]), link_force=force)
     row = summarised("heading", "human", sample, held_2s=True, objects=["a"]).to_json()
-    assert (row["force_peak_n"], row["force_mean_n"]) == (6.0, 4.0)
+    assert row["force_peak_n"] == 6.0
+    assert row["force_mean_n"] == 4.0
 
 
 def test_objects_are_grouped_by_terciles_and_family():
-    sizes, masses = (
-        np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18]),
-        np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1]),
-    )
+    sizes = np.array([0.03, 0.09, 0.06, 0.12, 0.15, 0.18])
+    masses = np.array([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
     groups = dict(
         object_groups(sizes, masses, np.array(["mug", "ball", "mug", "mug", "ball", "ball"]))
     )
@@ -230,13 +237,17 @@ def test_objects_are_grouped_by_terciles_and_family():
         label.split(" (")[0]: set(np.flatnonzero(members).tolist())
         for label, members in groups.items()
     }
-    assert by_word["small"] == {0, 2} and by_word["medium"] == {1, 3} and by_word["large"] == {4, 5}
-    assert by_word["light"] == {4, 5} and by_word["heavy"] == {0, 1}
-    assert by_word["family mug"] == {0, 2, 3} and by_word["family ball"] == {1, 4, 5}
+    assert by_word["small"] == {0, 2}
+    assert by_word["medium"] == {1, 3}
+    assert by_word["large"] == {4, 5}
+    assert by_word["light"] == {4, 5}
+    assert by_word["heavy"] == {0, 1}
+    assert by_word["family mug"] == {0, 2, 3}
+    assert by_word["family ball"] == {1, 4, 5}
 
 
 def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
-    names = dict.fromkeys(name for names in TABLES.values() for name in names)
+    names = dict.fromkeys(itertools.chain.from_iterable(TABLES.values()))
     objects = list("abcdefgh")
     rows = [
         summarised(name, "human", _sample([1, 0], [1, 0]), held_2s=True, objects=objects)
@@ -245,10 +256,13 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     rows.append(dataclasses.replace(rows[0], group="small (up to 8 cm)", paper=None))
     write_json(rows, tmp_path / "new" / "rows.json", {"seed": 0})
     read = json.loads((tmp_path / "new" / "rows.json").read_text())
-    assert read["seed"] == 0 and len(read["rows"]) == len(rows) == 10
+    assert read["seed"] == 0
+    assert len(read["rows"]) == len(rows) == 10
     for row in read["rows"]:
-        assert set(REQUIRED) <= set(row) and row["method"] == "ours"
-    assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
+        assert set(REQUIRED) <= set(row)
+        assert row["method"] == "ours"
+    assert read["rows"][0]["pose_rad"] is None
+    assert read["rows"][0]["heading_rad"] == 0.0
     assert all(
         table.terminal().row_count == len(table.rows) == 10 for table in tables_of(rows, "title")
     )
@@ -257,8 +271,7 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
 def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
     rows = [
         made_row(name, 0.9, 0.8, 0.95, method=method)
-        for method in ("ours", "pd")
-        for name in ("heading", "pose")
+        for method, name in itertools.product(("ours", "pd"), ("heading", "pose"))
     ]
     rates, *_ = tables_of(rows, "title", [("human", "graspxl", "not trained")])
     assert rates.columns[:3] == ["constraint", "hand", "method"]
@@ -280,20 +293,24 @@ def test_a_terminal_shows_every_figure_of_several_policies():
     ]
     console = Console(width=160, file=io.StringIO())
     console.print(tables_of(rows, "title")[0].terminal())
-    shown = console.file.getvalue()
-    assert "\N{HORIZONTAL ELLIPSIS}" not in shown and "episodes" in shown and "objects" in shown
-    assert shown.count("100.0 % (34.2-100.0)") == 4 and shown.count("0.000 rad") >= 2
+    printed = console.file.getvalue()
+    assert "\N{HORIZONTAL ELLIPSIS}" not in printed
+    assert "episodes" in printed
+    assert "objects" in printed
+    assert printed.count("100.0 % (34.2-100.0)") == 4
+    assert printed.count("0.000 rad") >= 2
 
 
 def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
     sample = _sample(
         [1, 1, 1, 0], [0, 0, 0, 0], heading_rad=[0.1, 0.2, 0.3, 9.0], heading_m=[0.5, 0.5, 0.5, 9.0]
     )
-    found = summarised("heading", "human", sample, held_2s=True, objects=["box"])
+    row = summarised("heading", "human", sample, held_2s=True, objects=["box"])
     # Standard deviation 0.1 of three values: 1.96 x 0.1 / sqrt(3).
-    assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
+    assert row.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
     only = summarised("heading", "human", sample.first(1), held_2s=True, objects=["box"])
-    assert only.margins == {} and only.errors["heading_rad"] == pytest.approx(0.1)
+    assert only.margins == {}
+    assert only.errors["heading_rad"] == pytest.approx(0.1)
 
 
 def test_wilson_interval():
@@ -321,7 +338,8 @@ def test_clusters_count_by_the_design_effect():
 
 
 def test_an_interval_is_never_narrower_than_that_of_independent_episodes():
-    alternating, clusters = np.tile([1, 0], 8), np.repeat(np.arange(8), 2)
+    alternating = np.tile([1, 0], 8)
+    clusters = np.repeat(np.arange(8), 2)
     assert independent_episodes(alternating, clusters) == 16.0
     # G / (G - 1), as of a sample's variance
     assert independent_episodes(alternating, np.arange(16)) == 15.0
@@ -341,12 +359,17 @@ def lost(heights, **metrics) -> Episode:
     count = len(heights)
     position = np.zeros((count, 3), np.float32)
     position[:, 2] = heights
-    known = {"diverged": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
+    episode_metrics = {
+        "diverged": 0.0,
+        "held": 0.0,
+        "moved_at_removal": 0.01,
+        "links_at_removal": 3.0,
+    }
     return dataclasses.replace(
         episode(count),
         object_position=position,
         table=np.arange(count) < 2,
-        metrics=known | metrics,
+        metrics=episode_metrics | metrics,
         control_dt=0.01,
         about={},
     )
@@ -366,7 +389,7 @@ def test_every_cause_has_its_label(metrics, said):
     assert cause(lost([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
-def test_what_slips_in_a_lift_is_measured_from_the_wrist():
+def test_slip_in_a_lift_is_relative_to_the_wrist():
     made = lost([0.1] * 8)
     links = np.zeros_like(made.link_position)
     links[:, :, 2] = np.array([0.2, 0.2, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3])[:, None]

@@ -55,8 +55,10 @@ def test_joint_noise_has_its_size_and_stays_within_the_limits(experiment, bank):
     noisy = Noise("pose", kind="joints", level=0.1).bank(experiment)
     q = np.asarray(bank.pose_q)
     away = (noisy.pose_q - q)[(q > HAND.lower + 0.4) & (q < HAND.upper - 0.4)]
-    assert 0.095 < away.std() < 0.105 and abs(away.mean()) < 0.005
-    assert np.all(noisy.pose_q >= HAND.lower) and np.all(noisy.pose_q <= HAND.upper)
+    assert 0.095 < away.std() < 0.105
+    assert abs(away.mean()) < 0.005
+    assert np.all(noisy.pose_q >= HAND.lower)
+    assert np.all(noisy.pose_q <= HAND.upper)
     np.testing.assert_array_equal(noisy.pose_position, bank.pose_position)
 
 
@@ -68,21 +70,25 @@ def test_poses_sink_along_the_heading(experiment, bank):
     v = np.stack(v, -1)
     heading = axis + 2 * np.cross(v, np.cross(v, axis) + w[..., None] * axis)
     depth = (moved * heading).sum(-1)
-    assert depth.min() >= 0 and 0.0095 < depth.max() <= 0.01001
+    assert depth.min() >= 0
+    assert 0.0095 < depth.max() <= 0.01001
     np.testing.assert_allclose(moved, depth[..., None] * heading, atol=1e-6)
 
 
 def test_jitter_moves_every_waypoint(experiment, bank):
     noisy = Noise("trajectory", kind="jitter", level=0.01).bank(experiment)
     away = np.asarray(noisy.trajectory_position) - np.asarray(bank.trajectory_position)
-    assert 0.0098 < away.std() < 0.0102 and np.all(np.abs(away).max((0, 1, 2, 4)) > 0)
+    assert 0.0098 < away.std() < 0.0102
+    assert np.all(np.abs(away).max((0, 1, 2, 4)) > 0)
     np.testing.assert_array_equal(noisy.trajectory_quaternion, bank.trajectory_quaternion)
 
 
 def test_curves_show_every_kind_of_noise(tmp_path):
     errors = {"pose_rad": 0.1, "pose_m": 0.01, "traj_rad": 0.1, "traj_m": 0.01}
     row = mock.Mock(success=0.9, success_low=0.8, success_high=0.95, errors=errors)
-    row.held_2s, row.held_2s_low, row.held_2s_high = 0.8, 0.7, 0.9
+    row.held_2s = 0.8
+    row.held_2s_low = 0.7
+    row.held_2s_high = 0.9
     draw_noise([row] * len(NOISE), tmp_path / "noise.png", "made up")
     picture = np.asarray(Image.open(tmp_path / "noise.png").convert("RGB")).astype(int)
     for part in np.array_split(picture, 3, axis=1):  # the lines of success in each panel
@@ -90,7 +96,7 @@ def test_curves_show_every_kind_of_noise(tmp_path):
         assert (blue - red > 100).sum() > 50
 
 
-def test_a_level_is_what_it_says(bank):
+def test_sensing_levels_match_their_labels(bank):
     """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than
     one a step.
     """
@@ -98,36 +104,31 @@ def test_a_level_is_what_it_says(bank):
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
     sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
     drawn = sample(task.HAND, sensed, one, jax.random.key(0), 4)
-    found = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
-    assert len(found) == len(SENSING)
-    true, nominal = (found[level.label] for level in SENSING[:2])
+    episodes = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
+    assert len(episodes) == len(SENSING)
+    true, nominal = (episodes[level.label] for level in SENSING[:2])
     errors = set(true.sensors._fields) - {"key", "period", "phase", "eye"}
-    assert (
-        not any(np.any(getattr(true.sensors, name)) for name in errors)
-        and (true.sensors.period == 1.0).all()
-    )
-    assert (nominal.sensors.delay == 6).all() and nominal.sensors.delay.dtype == np.int32
+    assert not any(np.any(getattr(true.sensors, name)) for name in errors)
+    assert (true.sensors.period == 1.0).all()
+    assert (nominal.sensors.delay == 6).all()
+    assert nominal.sensors.delay.dtype == np.int32
     np.testing.assert_allclose(nominal.sensors.period, 10 / 3, rtol=1e-6)
     np.testing.assert_allclose(nominal.sensors.position_noise, 0.005)
     np.testing.assert_allclose(nominal.sensors.rotation_noise, math.pi / 60, rtol=1e-6)
-    assert (found["100 ms"].sensors.delay == 10).all()
+    assert (episodes["100 ms"].sensors.delay == 10).all()
     assert longest(sensed.sensing, sensed.control_dt) == 11, "room for the longest delay"
-    np.testing.assert_allclose(found["10 Hz"].sensors.period, 10.0)
-    np.testing.assert_allclose(found["30 % dropped"].sensors.dropout, 0.3)
-    np.testing.assert_allclose(found["friction 0.5"].reset_state.friction, 0.5)
-    np.testing.assert_allclose(found["gains -20 %"].reset_state.gain_scale, 0.8)
+    np.testing.assert_allclose(episodes["10 Hz"].sensors.period, 10.0)
+    np.testing.assert_allclose(episodes["30 % dropped"].sensors.dropout, 0.3)
+    np.testing.assert_allclose(episodes["friction 0.5"].reset_state.friction, 0.5)
+    np.testing.assert_allclose(episodes["gains -20 %"].reset_state.gain_scale, 0.8)
     for level in SENSING[2:]:
-        changed = [
-            name
-            for part in ("sensors", "reset_state")
-            for name, a, b in zip(
-                getattr(nominal, part)._fields,
-                getattr(nominal, part),
-                getattr(found[level.label], part),
-                strict=True,
-            )
-            if not np.array_equal(a, b)
-        ]
+        changed = []
+        for part in ("sensors", "reset_state"):
+            before = getattr(nominal, part)
+            after = getattr(episodes[level.label], part)
+            for name, a, b in zip(before._fields, before, after, strict=True):
+                if not np.array_equal(a, b):
+                    changed.append(name)
         assert len(changed) == (
             2 if "noise" in level.label or "6\N{DEGREE SIGN}" in level.label else 1
         ), level.label
@@ -135,10 +136,12 @@ def test_a_level_is_what_it_says(bank):
 
 def test_a_policy_observes_trackers_only_there():
     ranged = dataclasses.replace(TASK, observation="tracked", sensing=TRACKERS)
-    assert protocol(ranged, 25).sensed and not TASK.sensed and SENSING[0].task(TASK).sensed
+    assert protocol(ranged, 25).sensed
+    assert not TASK.sensed
+    assert SENSING[0].task(TASK).sensed
 
 
-def test_friction_is_stiff_whatever_the_training_s_was():
+def test_policies_run_with_stiff_friction_after_any_training():
     """One option of the scene, in training alone."""
     soft = dataclasses.replace(TASK, impratio=1.0)
     assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [
@@ -155,15 +158,19 @@ def test_friction_is_stiff_whatever_the_training_s_was():
 def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes():
     conditions = task.episodes(64)
     for obj, heavy in zip(OBJECTS, Load(mass=(2.0, 2.0)).objects(OBJECTS), strict=True):
-        assert heavy.mass == 2.0 and heavy.name == obj.name
+        assert heavy.mass == 2.0
+        assert heavy.name == obj.name
         np.testing.assert_allclose(heavy.inertia * obj.mass, 2.0 * obj.inertia)
     for obj, half in zip(OBJECTS, Load(factor=0.5).objects(OBJECTS), strict=True):
         assert half.mass == pytest.approx(obj.mass / 2)
     many = [dataclasses.replace(OBJECTS[0], name=f"box_{i}") for i in range(64)]
     masses = np.array([obj.mass for obj in PEERS[1].objects(many)])
-    assert 0.04 <= masses.min() < 0.1 and 0.44 < masses.max() <= 0.5 and 0.2 < masses.mean() < 0.34
+    assert 0.04 <= masses.min() < 0.1
+    assert 0.44 < masses.max() <= 0.5
+    assert 0.2 < masses.mean() < 0.34
     dexsuite = PEERS[1].episodes(conditions, 0.01).reset_state
-    assert 0.5 <= dexsuite.friction.min() < 0.6 and 0.9 < dexsuite.friction.max() <= 1.0
+    assert 0.5 <= dexsuite.friction.min() < 0.6
+    assert 0.9 < dexsuite.friction.max() <= 1.0
     np.testing.assert_array_equal(dexsuite.q, conditions.reset_state.q)
     assert Load(mass=(2.0, 2.0)).episodes(conditions, 0.01) is conditions
     # An episode's friction does not depend on the others.
@@ -174,10 +181,10 @@ def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes()
 @pytest.mark.parametrize("constant_mass", [True, False])
 def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass):
     """Objects of 1.4 times the length are 2.744 times as heavy at the same density."""
-    *masses, own, literal = payload(1.4, constant_mass=constant_mass)
+    *masses, scaled, literal = payload(1.4, constant_mass=constant_mass)
     assert [load.mass for load in masses] == [(mass, mass) for mass in MASSES]
-    assert literal.factor / own.factor == pytest.approx(2.744)
-    assert (own if constant_mass else literal).factor == pytest.approx(1.0)
+    assert literal.factor / scaled.factor == pytest.approx(2.744)
+    assert (scaled if constant_mass else literal).factor == pytest.approx(1.0)
     assert len(payload(1.0, constant_mass=constant_mass)) == len(MASSES) + 1
 
 
@@ -185,10 +192,14 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
     """Objects and initial conditions are those of the first level but for its change; progress
     counts the episodes of a running batch, too.
     """
-    seen, told, variations = [], [], [*NOISE, *SENSING, *PEERS]
+    seen = []
+    told = []
+    variations = [*NOISE, *SENSING, *PEERS]
 
     class Running:
-        batch, stressable, objects = 4, True, experiment.scaled
+        batch = 4
+        stressable = True
+        objects = experiment.scaled
 
         def __enter__(self):
             return self
@@ -252,12 +263,13 @@ def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
         np.testing.assert_array_equal(back.pose_valid[n, :, :rests], bank.pose_valid[n, :, :rests])
         for v, r in np.ndindex(2, rests):
             if v == 0 or bank.has_affordance[n, r]:
-                asked, found = bank.heading_index[n, v, r], back.heading_index[n, v, r]
-                assert set(np.asarray(asked)) == set(np.asarray(found))
+                before = bank.heading_index[n, v, r]
+                after = back.heading_index[n, v, r]
+                assert set(np.asarray(before)) == set(np.asarray(after))
                 back_of = dict(
-                    zip(np.asarray(asked), np.asarray(bank.heading_back[n, v, r]), strict=True)
+                    zip(np.asarray(before), np.asarray(bank.heading_back[n, v, r]), strict=True)
                 )
-                np.testing.assert_allclose([back_of[i] for i in found], back.heading_back[n, v, r])
+                np.testing.assert_allclose([back_of[i] for i in after], back.heading_back[n, v, r])
         np.testing.assert_array_equal(
             back.has_affordance[n, :rests], bank.has_affordance[n, :rests]
         )

@@ -5,6 +5,7 @@ goes on.
 import contextlib
 import dataclasses
 import functools
+import itertools
 import types
 
 import numpy as np
@@ -40,7 +41,8 @@ def simulated(monkeypatch):
         return [obj.name for obj in objects]
 
     def plan(self, variation):
-        assert self.bank == [obj.name for obj in self.objects] and variation.constraint == "heading"
+        assert self.bank == [obj.name for obj in self.objects]
+        assert variation.constraint == "heading"
         index = np.tile(np.arange(len(self.objects)), self.episodes // len(self.objects))
         return types.SimpleNamespace(episodes=index, total=len(index))
 
@@ -67,14 +69,16 @@ def simulated(monkeypatch):
     return done
 
 
-def evaluated(pools, episodes, kept=None, *, seed=0, track=lambda label, total: lambda done: None):
+def evaluated(
+    pools, episodes, folder=None, *, seed=0, track=lambda label, total: lambda done: None
+):
     """Rows of the test's policy."""
     return evaluate_pools(
         dataclasses.replace(
             experiment_without_objects(), episodes=episodes, seed=seed, track=track
         ),
         pools,
-        kept,
+        folder,
     )
 
 
@@ -87,21 +91,23 @@ def pools_of(*groups, left_out=()):
     return Pools("test", max(map(len, groups)), makes)
 
 
-def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
+def test_episodes_of_an_object_do_not_depend_on_its_pool(simulated):
     told = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
-    whole, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
-    assert {obj["episodes"] for obj in whole.objects} == {2}
-    assert [obj["name"] for obj in whole.objects] == [obj.name for obj in OBJECTS]
-    assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
+    all_pools, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
+    assert {obj["episodes"] for obj in all_pools.objects} == {2}
+    assert [obj["name"] for obj in all_pools.objects] == [obj.name for obj in OBJECTS]
+    assert all_pools.episodes == 10
+    assert all_pools.covered == 5
+    assert all_pools.pool == 6
+    assert all_pools.success == 1.0
     assert told == [6, 12]  # the second pool is filled up, and what fills it does not count
     by_size = [row for row in groups if row.group.split(" ")[0] in ("small", "medium", "large")]
-    assert sum(row.episodes for row in by_size) == 10 and {row.success_all for row in by_size} == {
-        1.0
-    }
-    assert whole.success_all == pytest.approx(5 / 6)
+    assert sum(row.episodes for row in by_size) == 10
+    assert {row.success_all for row in by_size} == {1.0}
+    assert all_pools.success_all == pytest.approx(5 / 6)
     assert sum(row.episodes for row in groups if row.group.startswith("family")) == 10
-    assert whole.paper.success == 0.927
+    assert all_pools.paper.success == 0.927
     assert [stressed for _, stressed in simulated] == [200, 194]
 
 
@@ -116,8 +122,8 @@ def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
     assert heaviest in {obj["name"] for obj in heavy.objects}
 
 
-def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
-    whole = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
+def test_a_stopped_evaluation_resumes_at_the_next_pool(simulated, tmp_path):
+    complete = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
     simulated.clear()
 
     def stop():
@@ -129,7 +135,7 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
     assert len(simulated) == 1
     again = first._replace(make=[stop, first.make[1]])  # the first is not even made
     rows = evaluated(again, 8, tmp_path)
-    assert [row.to_json() for row in rows] == [row.to_json() for row in whole]
+    assert [row.to_json() for row in rows] == [row.to_json() for row in complete]
     assert [names for names, _ in simulated] == [
         [o.name for o in OBJECTS[:2]],
         [o.name for o in OBJECTS[2:4]],
@@ -144,17 +150,19 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
 
 
 def test_no_more_than_the_next_pool_is_made_ahead(simulated):
-    made, ahead = [], []
+    loaded = []
+    ahead = []
 
     def make(i):
-        made.append(i)
+        loaded.append(i)
         return Loaded(OBJECTS[:1], [])
 
     pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
     evaluated(
-        pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated))
+        pools, 5, track=lambda label, total: lambda done: ahead.append(len(loaded) - len(simulated))
     )
-    assert made == [0, 1, 2, 3, 4] and max(ahead) <= 1
+    assert loaded == [0, 1, 2, 3, 4]
+    assert max(ahead) <= 1
 
 
 def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
@@ -175,15 +183,17 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
 
     monkeypatch.setattr(experiment, "build_bank", build_bank)
     monkeypatch.setattr(of_objects, "headings_of", headings_of)
-    whole, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
-    assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
-    assert (whole.covered, whole.pool) == (2, 4) and lost in caplog.text
+    all_pools, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
+    assert [obj["name"] for obj in all_pools.objects] == [OBJECTS[0].name, OBJECTS[2].name]
+    assert all_pools.covered == 2
+    assert all_pools.pool == 4
+    assert lost in caplog.text
     with pytest.raises(CongraspError, match="None of the objects can be approached"):
         evaluated(pools_of(OBJECTS[1:2]), 6)
 
 
 def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
-    monkeypatch.setattr(of_objects, "_MAX_OBJECTS_OF_FOLDER", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_OF_FOLDER", 2)
     for obj in OBJECTS:
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
@@ -192,14 +202,16 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
         "results of other files are not resumed"
     )
     loaded = [make() for make in pools.make]
-    assert pools.size == 2 and [len(one.objects) for one in loaded] == [2, 2, 0]
+    assert pools.size == 2
+    assert [len(one.objects) for one in loaded] == [2, 2, 0]
     assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
-    monkeypatch.setattr(of_objects, "_MAX_OBJECTS_ELSEWHERE", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_ELSEWHERE", 2)
     pools = procedural_pools(5, "native", "development")
     objects = [make().objects for make in pools.make]
-    assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
-    names = [obj.name for pool in objects for obj in pool]
+    assert pools.size == 2
+    assert [len(pool) for pool in objects] == [2, 2, 2]
+    names = [obj.name for obj in itertools.chain(*objects)]
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, FAMILIES)]

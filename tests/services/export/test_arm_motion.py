@@ -36,7 +36,8 @@ from tests.episodes import episode, episode_message
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, forward_kinematics
 
 T = 5
-ORANGE, BLUE = (1.0, 0.4, 0.0), (0.1, 0.2, 0.8)
+ORANGE = (1.0, 0.4, 0.0)
+BLUE = (0.1, 0.2, 0.8)
 ARM = """<mujoco><compiler angle="radian"/><asset><material name="orange" rgba="1 .4 0 1"/></asset><worldbody>
 <geom type="box" size=".1 .1 .05" rgba=".1 .2 .8 1"/>
 <body name="sledge" pos="0 0 .1" quat=".9 .1 .3 .2"><joint name="rail" type="slide" axis="0 1 0" range="-.3 .3"/>
@@ -60,18 +61,23 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Episode:
     """Any joints of arm and hand, on a base that stands askew; the wrist is where the arm takes
     it.
     """
-    hand, rng = get_hand("allegro"), np.random.default_rng(0)
+    hand = get_hand("allegro")
+    rng = np.random.default_rng(0)
     file = tmp_path_factory.mktemp("arm") / "odd.xml"
     file.write_text(ARM.replace("JOINT", hand.joints[0].name))
-    arm, mount = load_arm(file), default_mount(hand)
+    arm = load_arm(file)
+    mount = default_mount(hand)
     robot = build_robot(arm, hand, mount, procedural.generate(3))
     q = rng.uniform([-0.3, -3, -1, -1], [0.3, 3, 2, 1], (T, 4))
     fingers = rng.uniform(hand.lower, hand.upper, (T, len(hand.joints)))
     base = Pose(np.array([0.4, -0.2, 0.1]), Rotation.from_euler("z", 0.7))
-    data, position, turns = mujoco.MjData(robot.model), [], []
+    data = mujoco.MjData(robot.model)
+    position = []
+    turns = []
     bodies = [robot.model.body(f"hand/{link.name}").id for link in hand.links]
     for t in range(T):
-        data.qpos[robot.joints], data.qpos[robot.fingers] = q[t], fingers[t]
+        data.qpos[robot.joints] = q[t]
+        data.qpos[robot.fingers] = fingers[t]
         mujoco.mj_kinematics(robot.model, data)
         position.append(base.rotation.apply(data.xpos[bodies]) + base.position)
         turn = base.rotation * Rotation.from_quat(data.xquat[bodies], scalar_first=True)
@@ -93,10 +99,13 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Episode:
 
 def test_links_have_the_names_parents_and_colours_of_the_file(motion: Episode) -> None:
     arm = motion.arm
-    assert arm is not None and arm.name == "odd"
+    assert arm is not None
+    assert arm.name == "odd"
     assert arm.link_names.tolist() == ["odd_base", "sledge", "arm_palm", "body_3"]
-    assert arm.link_parent.tolist() == [-1, 0, 1, 2] and arm.joint_link.tolist() == [1, 2, 2, 3]
-    assert arm.joint_limits[1].tolist() == [-1000, 1000] and arm.joint_slides.tolist() == [
+    assert arm.link_parent.tolist() == [-1, 0, 1, 2]
+    assert arm.joint_link.tolist() == [1, 2, 2, 3]
+    assert arm.joint_limits[1].tolist() == [-1000, 1000]
+    assert arm.joint_slides.tolist() == [
         True,
         False,
         False,
@@ -129,7 +138,8 @@ def test_every_reader_finds_the_arm_where_it_was(
     path = tmp_path / f"motion{formats.FORMATS[kind]}"
     formats.export_motions([motion], kind, path)
     (track,) = READERS[kind](path)
-    assert "arm_palm" in track.poses and error_mm(motion, track) < 0.01
+    assert "arm_palm" in track.poses
+    assert error_mm(motion, track) < 0.01
 
 
 def test_the_described_robot_is_mujocos(motion: Episode) -> None:
@@ -150,11 +160,14 @@ def test_the_described_robot_is_mujocos(motion: Episode) -> None:
 def test_a_motions_file_keeps_its_arm(motion: Episode, tmp_path: pathlib.Path) -> None:
     save_motion(tmp_path / "motion.npz", motion)
     again = load_motion(tmp_path / "motion.npz").arm
-    assert again is not None and motion.arm is not None and again.name == "odd"
+    assert again is not None
+    assert motion.arm is not None
+    assert again.name == "odd"
     for name, values in motion.arm.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values)
     slower = at_rate(motion, 50.0)
-    assert slower.arm is not None and len(slower.arm.joint_position) == len(slower.time) == 3
+    assert slower.arm is not None
+    assert len(slower.arm.joint_position) == len(slower.time) == 3
     np.testing.assert_array_equal(slower.arm.joint_position, motion.arm.joint_position[::2])
     for name, values, words in (
         ("mesh_faces", motion.arm.mesh_faces + 9999, "arm_mesh_faces has indices"),
@@ -187,7 +200,8 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(
     info = json.loads((path / "meta" / "info.json").read_text())
     first = get_hand("allegro").joints[0].name
     state, action = (info["features"][name]["names"] for name in ("observation.state", "action"))
-    assert state[:5] == ["rail", "turn", "bend", first, f"hand_{first}"] and state[-7:-4] == [
+    assert state[:5] == ["rail", "turn", "bend", first, f"hand_{first}"]
+    assert state[-7:-4] == [
         "wrist_x",
         "wrist_y",
         "wrist_z",
@@ -233,31 +247,29 @@ def test_other_readers_find_meshes_and_colours(motion: Episode, tmp_path: pathli
     sledge = stage.GetPrimAtPath("/grasp/odd_base/sledge")
     pose = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(sledge)).T
     np.testing.assert_allclose(pose[:3, 3], arm.link_position[3, 1], atol=1e-6)
-    shown = [
+    drawn_colours = [
         UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)
     ]
-    np.testing.assert_allclose(shown, linear, atol=1e-6)
+    np.testing.assert_allclose(drawn_colours, linear, atol=1e-6)
 
 
 def test_the_camera_sees_the_arm(motion: Episode) -> None:
     alone = dataclasses.replace(motion, arm=None)
     camera = camera_for([alone])
-    shown, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
-    assert (np.abs(shown - blank).sum(-1) > 60).mean() > 0.02
+    with_arm, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
+    assert (np.abs(with_arm - blank).sum(-1) > 60).mean() > 0.02
 
 
 def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: Episode) -> None:
     arm = motion.arm
     assert arm is not None
-    whole = decode(encode(arm.add_to(episode_message(T))))
-    recorded = Episode.from_message(whole)
+    message = decode(encode(arm.add_to(episode_message(T))))
+    recorded = Episode.from_message(message)
     again = recorded.arm
     assert "rail" in urdf.robot_urdf(recorded)
-    assert (
-        again is not None
-        and again.name == "odd"
-        and again.joint_names.tolist() == arm.joint_names.tolist()
-    )
+    assert again is not None
+    assert again.name == "odd"
+    assert again.joint_names.tolist() == arm.joint_names.tolist()
     for name, values in arm.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values)
     entries = [*scene_entries("a0", recorded, 0, 0, JsonChannels())]
@@ -266,20 +278,20 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: Episode) -
         for entry in entries
         if entry.channel.topic == "/episode/a0/scene"
     ]
-    shown = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
-    assert [entity.frame_id for entity in shown.values()] == [
+    entities = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
+    assert [entity.frame_id for entity in entities.values()] == [
         f"a0/arm/{name}" for name in ("odd_base", "sledge", "sledge", "arm_palm")
     ]
-    assert (
-        shown["arm/1"].triangles[0].color.r == pytest.approx(1.0)
-        and len(shown["arm/1"].triangles[0].indices) == 36
-    )
+    assert entities["arm/1"].triangles[0].color.r == pytest.approx(1.0)
+    assert len(entities["arm/1"].triangles[0].indices) == 36
     frame = next(
         FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf"
     )
     sledge = next(t.translation for t in frame.transforms if t.child_frame_id == "a0/arm/sledge")
     np.testing.assert_allclose([sledge.x, sledge.y, sledge.z], arm.link_position[0, 1], atol=1e-6)
-    short = Message({**whole.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, whole.meta)
+    short = Message(
+        {**message.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, message.meta
+    )
     with pytest.raises(
         CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"
     ):

@@ -1,5 +1,6 @@
 """A layout shows what is in the recording."""
 
+import itertools
 import json
 import pathlib
 from typing import Any
@@ -16,7 +17,8 @@ from tests.episodes import episode_message
 
 
 def record(folder: pathlib.Path, *messages: tuple[str, Message]) -> pathlib.Path:
-    convert, writer = Converter(), LogWriter(folder, "log")
+    convert = Converter()
+    writer = LogWriter(folder, "log")
     for number, (key, message) in enumerate(messages):
         writer.write(*convert(f"congrasp/run/log/{key}", message, 10**15 + number))
     writer.close()
@@ -26,7 +28,7 @@ def record(folder: pathlib.Path, *messages: tuple[str, Message]) -> pathlib.Path
 def panels(content: dict[str, Any]) -> list[dict[str, Any]]:
     if content["type"] == "panel":
         return [content]
-    return [panel for item in content["items"] for panel in panels(item["content"])]
+    return list(itertools.chain(*(panels(item["content"]) for item in content["items"])))
 
 
 def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib.Path) -> None:
@@ -46,17 +48,19 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
         ("event/learner/0", Message({}, {"time": 0.0, "level": "info", "text": "hello"})),
     )
     count = export_layout(tmp_path / "logs", tmp_path / "layout.json")
-    shown = panels(json.loads((tmp_path / "layout.json").read_text())["content"])
-    assert count == len(shown)
+    layout_panels = panels(json.loads((tmp_path / "layout.json").read_text())["content"])
+    assert count == len(layout_panels)
     fields: dict[str, set[str]] = {}
     for file in (tmp_path / "logs").iterdir():
         for entry in read_records(file):
-            known = fields.setdefault(entry.topic, set())
+            recorded = fields.setdefault(entry.topic, set())
             if entry.encoding == "json":
-                known |= {path.replace("/", ".") for path in flatten(json.loads(entry.data))}
-    kinds = [panel["panelType"] for panel in shown]
-    assert (kinds.count("ThreeDee"), kinds.count("Log"), kinds.count("Plot")) == (1, 1, 5)
-    for panel in shown:
+                recorded |= {path.replace("/", ".") for path in flatten(json.loads(entry.data))}
+    kinds = [panel["panelType"] for panel in layout_panels]
+    assert kinds.count("ThreeDee") == 1
+    assert kinds.count("Log") == 1
+    assert kinds.count("Plot") == 5
+    for panel in layout_panels:
         config = panel["config"]
         topics = [
             *config.get("topics", {}),
@@ -66,7 +70,7 @@ def test_every_topic_and_field_of_a_layout_is_in_the_recording(tmp_path: pathlib
         for series in config.get("paths", []):
             topic, _, field = series["value"].partition(".")
             assert field in fields[topic], series
-    (scene,) = [panel["config"] for panel in shown if panel["panelType"] == "ThreeDee"]
+    (scene,) = [panel["config"] for panel in layout_panels if panel["panelType"] == "ThreeDee"]
     assert {f"/episode/{actor}/scene" for actor in ("actor-0", "b")} <= set(scene["topics"])
 
 

@@ -50,13 +50,15 @@ def posed(
     """A wild motion of the same hand: any wrist, any fingers within their limits, any object
     pose.
     """
-    rng, count = np.random.default_rng(seed), len(motion.time)
+    rng = np.random.default_rng(seed)
+    count = len(motion.time)
     q = rng.uniform(*motion.joint_limits.T, (count, len(motion.joint_names)))
-    wrist, place = Rotation.random(count, rng=rng), rng.normal(scale=0.3, size=(count, 3))
+    wrist = Rotation.random(count, rng=rng)
+    place = rng.normal(scale=0.3, size=(count, 3))
     local = [link(angles) for angles in q]
     position = np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(count)])
-    own = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
-    turns = [(wrist[t] * own[t]).as_quat(scalar_first=True) for t in range(count)]
+    rotations = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
+    turns = [(wrist[t] * rotations[t]).as_quat(scalar_first=True) for t in range(count)]
     return dataclasses.replace(
         motion,
         time=motion.control_dt * np.arange(count),
@@ -88,20 +90,21 @@ def odd_hand(human: Episode) -> Episode:
     without joints, and names that other formats do not take."""
     axes = Rotation.random(3, rng=np.random.default_rng(3)).as_matrix()[:, 0]
     anchors = np.array([[0.02, 0.0, 0.03], [0.03, 0.01, 0.05], [0.05, 0.0, 0.09]])
-    names, parents, joint_link = ["palm", "1st phalanx", "plate", "tip/1"], [-1, 0, 1, 1], [1, 1, 3]
+    names = ["palm", "1st phalanx", "plate", "tip/1"]
+    parents = [-1, 0, 1, 1]
+    joint_link = [1, 1, 3]
 
     def link(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # X = turn x0 + place for points of the zero pose
-        turns, places = (
-            [Rotation.identity()],
-            [np.zeros(3)],
-        )
+        turns = [Rotation.identity()]
+        places = [np.zeros(3)]
         for i in range(1, 4):
-            turn, place = turns[parents[i]], places[parents[i]]
+            turn = turns[parents[i]]
+            place = places[parents[i]]
             for j in np.flatnonzero(np.array(joint_link) == i):
-                own = Rotation.from_rotvec(q[j] * axes[j])
-                place = place + turn.apply(anchors[j] - own.apply(anchors[j]))
-                turn = turn * own
+                joint_turn = Rotation.from_rotvec(q[j] * axes[j])
+                place = place + turn.apply(anchors[j] - joint_turn.apply(anchors[j]))
+                turn = turn * joint_turn
             turns.append(turn)
             places.append(place)
         origins = [np.zeros(3), anchors[0], np.zeros(3), anchors[2]]
@@ -141,7 +144,8 @@ def test_every_reader_finds_hand_and_object_where_they_were(which, kind, tmp_pat
     motion = request.getfixturevalue(which)
     path = export([motion], kind, tmp_path)
     (track,) = READERS[kind](path)
-    assert error_mm(motion, track) < 0.01 and bool(track.triangles) == (kind in MESHES)
+    assert error_mm(motion, track) < 0.01
+    assert bool(track.triangles) == (kind in MESHES)
     beside = [".json"] if kind == "bvh" else []
     assert {p.name for p in path.parent.iterdir()} == {
         path.name,
@@ -207,15 +211,13 @@ def test_a_controller_can_take_the_trajectory_of_a_bag(
     np.testing.assert_allclose(since, 1.0 + robot.time, atol=1e-9)
 
 
-def test_a_usd_has_the_rate_that_is_asked_for(odd_hand: Episode, tmp_path: pathlib.Path) -> None:
+def test_a_usd_has_the_requested_rate(odd_hand: Episode, tmp_path: pathlib.Path) -> None:
     slower = at_rate(odd_hand, 24.0)
     assert len(slower.time) == int((T - 1) * 24 / 100) + 1
     formats.export_motions([slower], "usd", tmp_path / "m.usda")
     stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
-    assert (
-        stage.GetTimeCodesPerSecond() == pytest.approx(24)
-        and stage.GetEndTimeCode() == len(slower.time) - 1
-    )
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(24)
+    assert stage.GetEndTimeCode() == len(slower.time) - 1
     # 1/24 s is 4.2 steps
     np.testing.assert_array_equal(slower.object_position[1], odd_hand.object_position[4])
     with pytest.raises(CongraspError, match="--fps is 200"):
@@ -249,9 +251,8 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(
 ) -> None:
     path = export([human], "glb", tmp_path)
     content = path.read_bytes()
-    assert content[:8] == b"glTF\x02\0\0\0" and int.from_bytes(content[8:12], "little") == len(
-        content
-    )
+    assert content[:8] == b"glTF\x02\0\0\0"
+    assert int.from_bytes(content[8:12], "little") == len(content)
     file = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     root, skinned = [file["nodes"][i] for i in file["scenes"][0]["nodes"]]
     # It stands at the origin, and its joints move it
@@ -263,7 +264,8 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(
     np.testing.assert_allclose(
         Rotation.from_quat(root["rotation"]).apply([0, 0, 1]), [0, 1, 0], atol=1e-12
     )
-    assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
+    assert root["extras"]["unit"] == "m"
+    assert root["extras"]["quaternion"] == "x, y, z, w"
     assert root["extras"]["joints"] == human.joint_names.tolist()
     assert all("matrix" not in node for node in file["nodes"])
     assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0] * 4
@@ -310,9 +312,11 @@ def test_the_skin_of_a_glb_follows_its_joints(which, request, tmp_path):
         start = file.bufferViews[accessor.bufferView].byteOffset
         return np.frombuffer(blob, kind, accessor.count * width, start).reshape(-1, width)
 
-    (skin,), mesh = file.skins, file.meshes[file.nodes[-1].mesh]
+    (skin,) = file.skins
+    mesh = file.meshes[file.nodes[-1].mesh]
     attributes = mesh.primitives[0].attributes
-    joints, weights = values(attributes.JOINTS_0), values(attributes.WEIGHTS_0)
+    joints = values(attributes.JOINTS_0)
+    weights = values(attributes.WEIGHTS_0)
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-5)
     inverse = values(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     points = np.pad(values(attributes.POSITION), ((0, 0), (0, 1)), constant_values=1)
@@ -323,8 +327,8 @@ def test_the_skin_of_a_glb_follows_its_joints(which, request, tmp_path):
     for t in (0, T - 1):
         matrices = np.stack([track.poses[name][t] for name in names]) @ inverse
         mixed = np.einsum("vk,vkij->vij", weights, matrices[joints])
-        found = np.einsum("vij,vj->vi", mixed, points)[:, :3]
-        np.testing.assert_allclose(found, expected_surface(motion, t)[source], atol=2e-6)
+        skinned = np.einsum("vij,vj->vi", mixed, points)[:, :3]
+        np.testing.assert_allclose(skinned, expected_surface(motion, t)[source], atol=2e-6)
 
 
 @pytest.mark.parametrize("which", ["human", "robot"])
@@ -336,8 +340,10 @@ def test_pixars_library_moves_the_skin_of_a_usd(which, request, tmp_path):
     cache = UsdSkel.Cache()
     cache.Populate(root, Usd.PrimDefaultPredicate)
     (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
-    skeleton, (target,) = cache.GetSkelQuery(binding.GetSkeleton()), binding.GetSkinningTargets()
-    mesh, surface = UsdGeom.Mesh(target.GetPrim()), skin_of_motion(motion)
+    skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+    (target,) = binding.GetSkinningTargets()
+    mesh = UsdGeom.Mesh(target.GetPrim())
+    surface = skin_of_motion(motion)
     # One a corner, v upwards
     st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
     flat = unwrapped(surface.points, surface.faces)
@@ -359,11 +365,15 @@ def test_glb_and_usd_have_the_colours_of_the_object(
     motion = dataclasses.replace(odd_hand, colours=colours)
     save_motion(tmp_path / "motion.npz", dataclasses.replace(human, colours=colours))
     again = load_motion(tmp_path / "motion.npz").colours
-    assert again is not None and (again.values == red).all() and (again.points == corners).all()
+    assert again is not None
+    assert (again.values == red).all()
+    assert (again.points == corners).all()
 
     def red_above_blue(points: np.ndarray, colours: np.ndarray) -> bool:
-        z, middle = points[:, 2], corners[:, 2].mean()
-        top, bottom = colours[z > middle + 0.01], colours[z < middle - 0.01]
+        z = points[:, 2]
+        middle = corners[:, 2].mean()
+        top = colours[z > middle + 0.01]
+        bottom = colours[z < middle - 0.01]
         return len(top) > 0 < len(bottom) and bool(
             (top[:, 0] > top[:, 2]).all() and (bottom[:, 2] > bottom[:, 0]).all()
         )
@@ -378,9 +388,9 @@ def test_glb_and_usd_have_the_colours_of_the_object(
         for prim in stage.Traverse()
         if prim.GetName() == "mesh" and "skin" not in str(prim.GetPath())
     )
-    shown = shape.GetDisplayColorPrimvar()
-    assert shown.GetInterpolation() == UsdGeom.Tokens.vertex
-    assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(shown.Get()))
+    primvar = shape.GetDisplayColorPrimvar()
+    assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+    assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(primvar.Get()))
 
 
 def test_colours_of_a_hand_are_linear_in_glb_and_usd(
@@ -394,8 +404,8 @@ def test_colours_of_a_hand_are_linear_in_glb_and_usd(
     )
     stage = Usd.Stage.Open(str(export([human], "usd", tmp_path)))
     meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
-    shown = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
-    assert (np.abs(shown - flesh).max(1) < 1e-5).any()
+    colours = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
+    assert (np.abs(colours - flesh).max(1) < 1e-5).any()
 
 
 def test_a_bvh_has_the_skeleton_of_the_skin(human: Episode, tmp_path: pathlib.Path) -> None:
@@ -423,17 +433,16 @@ def test_neighbouring_quaternions_do_not_jump() -> None:
 def test_pixars_library_finds_the_shapes_in_a_usd(human: Episode, tmp_path: pathlib.Path) -> None:
     path = export([human], "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
-    assert (
-        UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-        and UsdGeom.GetStageMetersPerUnit(stage) == 1
-    )
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert stage.GetTimeCodesPerSecond() == pytest.approx(1 / human.control_dt)
     assert (
         "w, x, y, z" in json.loads(stage.GetRootLayer().customLayerData["congrasp"])["quaternion"]
     )
     prims = {prim.GetName(): prim for prim in stage.Traverse()}
     k = 9
-    link, prim = int(human.capsule_link[k]), prims[f"capsule_{k}"]
+    link = int(human.capsule_link[k])
+    prim = prims[f"capsule_{k}"]
     half = UsdGeom.Capsule(prim).GetHeightAttr().Get() / 2
     matrix = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(prim)).T
     ends = (matrix @ [[0, 0], [0, 0], [-half, half], [1, 1]])[:3].T
@@ -455,22 +464,18 @@ def test_a_dataset_of_several_motions(human: Episode, tmp_path: pathlib.Path) ->
     for motion, track in zip(motions, READERS["lerobot"](path), strict=True):
         assert error_mm(motion, track) < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
-    assert (info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]) == (
-        3,
-        3 * T,
-        2,
-        100,
-    )
+    assert info["total_episodes"] == 3
+    assert info["total_frames"] == 3 * T
+    assert info["total_tasks"] == 2
+    assert info["fps"] == 100
     table = pq.read_table(path / "data")
     assert table["index"].to_pylist() == list(range(3 * T))
     assert table["task_index"].to_pylist() == [0] * T + [1] * T + [0] * T
     action = np.array(table["action"].to_pylist())[T : 2 * T]
     np.testing.assert_allclose(action[:-1, -7:-4], other.wrist_position[1:], atol=1e-6)
     names = info["features"]["action"]["names"]
-    assert (
-        names[:2] == ["thumb_cmc_abduction_target", "thumb_cmc_flexion_target"]
-        and len(names) == action.shape[1]
-    )
+    assert names[:2] == ["thumb_cmc_abduction_target", "thumb_cmc_flexion_target"]
+    assert len(names) == action.shape[1]
     pose = names.index("index_pip_target")
     joint = human.joint_names.tolist().index("index_pip")
     np.testing.assert_allclose(action[:, pose], other.joint_target[:, joint], atol=1e-6)
@@ -486,43 +491,39 @@ def test_a_dataset_of_several_motions(human: Episode, tmp_path: pathlib.Path) ->
 def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
     human: Episode, tmp_path: pathlib.Path
 ) -> None:
-    count, near = (
-        2,
-        beginning(dataclasses.replace(human, object_position=human.wrist_position + 0.1), 2),
-    )
+    count = 2
+    near = beginning(dataclasses.replace(human, object_position=human.wrist_position + 0.1), 2)
     path = tmp_path / "filmed"
     formats.export_motions([near, near], "lerobot", path, camera=True)
     info = json.loads((path / "meta" / "info.json").read_text())
     feature = info["features"]["observation.images.front"]
-    assert feature["dtype"] == "video" and feature["shape"] == [240, 320, 3]
+    assert feature["dtype"] == "video"
+    assert feature["shape"] == [240, 320, 3]
     video = path / info["video_path"].format(
         video_key="observation.images.front", chunk_index=0, file_index=0
     )
     frames = list(imageio_ffmpeg.read_frames(str(video)))
-    assert (
-        frames[0]["size"] == (320, 240) and frames[0]["fps"] == 100 and len(frames[1:]) == 2 * count
-    )
+    assert frames[0]["size"] == (320, 240)
+    assert frames[0]["fps"] == 100
+    assert len(frames[1:]) == 2 * count
     first, second = (
         np.frombuffer(frames[1 + i], np.uint8).reshape(240, 320, 3).astype(int) for i in (0, count)
     )
     assert np.abs(first - second).mean() < 2  # the same motion twice
     rows = pq.read_table(path / "meta" / "episodes").to_pylist()
-    spans = [
-        [row[f"videos/observation.images.front/{end}_timestamp"] for end in ("from", "to")]
-        for row in rows
-    ]
+    video = "videos/observation.images.front"
+    spans = [[row[f"{video}/from_timestamp"], row[f"{video}/to_timestamp"]] for row in rows]
     np.testing.assert_allclose(spans, [[0, count / 100], [count / 100, 2 * count / 100]])
     stats = json.loads((path / "meta" / "stats.json").read_text())["observation.images.front"]
     np.testing.assert_allclose(
         np.ravel(stats["mean"]), np.mean([first, second], (0, 1, 2)) / 255, atol=0.03
     )
-    assert np.shape(stats["mean"]) == (3, 1, 1) and stats["count"] == [2 * count]
+    assert np.shape(stats["mean"]) == (3, 1, 1)
+    assert stats["count"] == [2 * count]
     # The object is seen where the calibration says.
     calibration = json.loads((path / "meta" / "camera.json").read_text())
-    to_world, intrinsics = (
-        np.array(calibration["camera_to_world"]),
-        np.array(calibration["intrinsics"]),
-    )
+    to_world = np.array(calibration["camera_to_world"])
+    intrinsics = np.array(calibration["intrinsics"])
     turn = Rotation.from_quat(near.object_quaternion[0], scalar_first=True)
     corners = turn.apply(near.object_vertices) + near.object_position[0]
     seen = ((corners - to_world[:3, 3]) @ to_world[:3, :3]) @ intrinsics.T
@@ -531,10 +532,10 @@ def test_a_dataset_with_a_camera_has_a_frame_for_every_row(
         near, link_position=near.link_position + np.array([0, 0, 50.0]), table=np.zeros(count, bool)
     )
     nothing = dataclasses.replace(alone, object_position=near.object_position + 50.0)
-    shown, blank = (
+    drawn, blank = (
         next(pictures(motion, camera_for([near]))).astype(int) for motion in (alone, nothing)
     )
-    changed = np.argwhere(np.abs(shown - blank).sum(-1) > 20)
+    changed = np.argwhere(np.abs(drawn - blank).sum(-1) > 20)
     np.testing.assert_allclose(
         [changed.min(0), changed.max(0)], [seen.min(0), seen.max(0)], atol=1.5
     )
@@ -550,8 +551,10 @@ def test_lerobots_own_reader_gives_the_frame_of_each_row(
     )
     formats.export_motions([human, human], "lerobot", tmp_path / "filmed", camera=True)
     data = reader.LeRobotDataset("congrasp/test", root=tmp_path / "filmed", video_backend="pyav")
-    assert len(data) == 2 * T and data.meta.camera_keys == ["observation.images.front"]
-    first, second = data[1], data[T + 1]
+    assert len(data) == 2 * T
+    assert data.meta.camera_keys == ["observation.images.front"]
+    first = data[1]
+    second = data[T + 1]
     np.testing.assert_allclose(
         first["observation.state"][: len(human.joint_names)], human.joint_position[1], atol=1e-6
     )
@@ -582,18 +585,22 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     changed = tmp_path / "cylinder-0.glb"
     changed.write_bytes(b"mine")
     assert run("mug.npz") == 2
-    assert (
-        changed.read_bytes() == b"mine"
-        and "cylinder-0.glb exists already" in capsys.readouterr().err
-    )
-    assert run("mug.npz", "--force") == 0 and changed.read_bytes().startswith(b"glTF")
+    assert changed.read_bytes() == b"mine"
+    assert "cylinder-0.glb exists already" in capsys.readouterr().err
+    assert run("mug.npz", "--force") == 0
+    assert changed.read_bytes().startswith(b"glTF")
     (tmp_path / "cylinder-0.bvh").rename(tmp_path / "taken.bvh")
     assert run("mug.npz", "--to", "bvh") == 2  # what goes beside the file is there already, too
     assert not (tmp_path / "cylinder-0.bvh").exists()
     (tmp_path / "taken.bvh").rename(tmp_path / "cylinder-0.bvh")
     assert run("mug.npz", "logs", "--to", "lerobot") == 0
-    made = {"cylinder-0.bvh", "cylinder-0.bvh.json", "cylinder-0-lerobot", "cylinder-0.glb"}
-    assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
+    expected_files = {
+        "cylinder-0.bvh",
+        "cylinder-0.bvh.json",
+        "cylinder-0-lerobot",
+        "cylinder-0.glb",
+    }
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *expected_files}
     capsys.readouterr()
     for arguments, words in (
         (["mug.npz", "logs", "--to", "glb"], "contains a single motion, but there are 2"),
@@ -606,8 +613,8 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
-        (said,) = errors(capsys.readouterr().err)
-        assert words in said
+        (error,) = errors(capsys.readouterr().err)
+        assert words in error
 
 
 def test_a_motions_file_has_no_other_number(human: Episode, tmp_path: pathlib.Path) -> None:

@@ -65,7 +65,9 @@ def test_exported_policies_answer_as_the_flax_policy(
             assert json.loads(archive.read("meta.json"))["hand"] == "human"
 
 
-def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_the_exported_file_describes_every_number(
+    bundle: PolicyBundle, tmp_path: pathlib.Path
+) -> None:
     exports.export_policy(bundle, "onnx", tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
     meta = {
@@ -85,9 +87,11 @@ def test_the_file_says_what_every_number_is(bundle: PolicyBundle, tmp_path: path
         sum(field["size"] for field in meta["observation"]),
     ]
     assert session.get_outputs()[0].shape == ["batch", len(meta["action"])]
-    assert "w, x, y, z" in meta["units"] and meta["version"] == 7
+    assert "w, x, y, z" in meta["units"]
+    assert meta["version"] == 7
     units = [entry["unit"] for entry in meta["action"]]
-    assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3 and meta["rate_hz"] == 100.0
+    assert units == ["rad"] * 20 + ["m"] * 3 + ["rad"] * 3
+    assert meta["rate_hz"] == 100.0
 
 
 def test_the_file_s_limits_and_gains_are_those_of_the_hand(
@@ -97,22 +101,22 @@ def test_the_file_s_limits_and_gains_are_those_of_the_hand(
     stored = (
         onnxruntime.InferenceSession(tmp_path / "policy.onnx").get_modelmeta().custom_metadata_map
     )
-    limits, joints = JointLimits(**json.loads(stored["robot_limits"])), get_hand("human").joints
-    for name, wanted in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
+    limits = JointLimits(**json.loads(stored["robot_limits"]))
+    joints = get_hand("human").joints
+    for name, field in {"torque": "torque_limit", "kp": "kp", "kv": "kv"}.items():
         np.testing.assert_allclose(
-            getattr(limits, name)[:-6], [getattr(joint, wanted) for joint in joints]
+            getattr(limits, name)[:-6], [getattr(joint, field) for joint in joints]
         )
     q_open = np.append(get_hand("human").q_open, np.zeros(6))
     limited = Limiter(limits, q_open).limit(np.full(26, np.nan), q_open, np.zeros(26), 0.0)
-    assert np.isfinite(limited.target).all() and limited.by == ("not_finite",)
+    assert np.isfinite(limited.target).all()
+    assert limited.by == ("not_finite",)
 
 
 @pytest.fixture(scope="module")
 def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    path, pretrained = (
-        tmp_path_factory.mktemp("onnx") / "policy.onnx",
-        bundles.load(policy_file(None)),
-    )
+    path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
+    pretrained = bundles.load(policy_file(None))
     exports.export_policy(pretrained, "onnx", path)
     assert difference(pretrained, path) <= 3e-6
     return path
@@ -139,12 +143,13 @@ def example_grasp(path: pathlib.Path) -> tuple[Any, Any]:
 
 def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     """(D,) what the policy of a task is to observe in the state of the example's grasp."""
-    hand, data = get_hand("human"), grasp.data
+    hand = get_hand("human")
+    data = grasp.data
     force, touching = grasp.forces()
     contacts = np.zeros((1, len(hand.links), CONTACTS_PER_LINK, 3))
     contacts[0, :, 0] = force  # one contact a link that carries its whole force
-    found = np.zeros(contacts.shape[:-1], bool)
-    found[0, :, 0] = touching > 0
+    contact_found = np.zeros(contacts.shape[:-1], bool)
+    contact_found[0, :, 0] = touching > 0
 
     def turn(m: np.ndarray) -> np.ndarray:
         return Rotation.from_matrix(m).as_quat(scalar_first=True)
@@ -163,7 +168,7 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
         object_angular_velocity=now @ data.qvel[grasp.free + 3 : grasp.free + 6],
         contact_force=contacts[0],
         contact_position=contacts[0],
-        contact_found=found[0],
+        contact_found=contact_found[0],
         base_position=grasp.base_position,
         base_quaternion=turn(grasp.base),
         q_initial=hand.q_open,
@@ -199,7 +204,7 @@ def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:
     ]
 
 
-def test_the_example_observes_what_the_policy_was_trained_on(pretrained_onnx: pathlib.Path) -> None:
+def test_the_example_observes_the_training_layout(pretrained_onnx: pathlib.Path) -> None:
     example, grasp = example_grasp(pretrained_onnx)
     for _ in range(57):  # the hand holds the object, and the table is gone
         grasp.step()

@@ -11,18 +11,23 @@ from congrasp.services.export.texture_coordinates import unwrapped
 
 def areas(uv: np.ndarray) -> np.ndarray:
     """Signed areas (F,) of triangles (F, 3, 2)."""
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    a = uv[:, 1] - uv[:, 0]
+    b = uv[:, 2] - uv[:, 0]
     return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
 
 
 def test_a_box_has_six_charts_with_the_proportions_of_its_sides():
     box = trimesh.creation.box((0.1, 0.2, 0.3))
-    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    vertices = np.asarray(box.vertices)
+    faces = np.asarray(box.faces)
     flat = unwrapped(vertices, faces)
-    assert len(flat.source) == 24 and np.array_equal(flat.source[flat.faces], faces)
-    found = areas(flat.uv[flat.faces])
-    np.testing.assert_allclose(found / found.sum(), box.area_faces / box.area, rtol=1e-6)
-    assert (found > 0).all()  # seen from outside, none mirrored
+    assert len(flat.source) == 24
+    assert np.array_equal(flat.source[flat.faces], faces)
+    chart_areas = areas(flat.uv[flat.faces])
+    np.testing.assert_allclose(
+        chart_areas / chart_areas.sum(), box.area_faces / box.area, rtol=1e-6
+    )
+    assert (chart_areas > 0).all()  # seen from outside, none mirrored
     boxes = sorted(
         {(tuple(c.min(0)), tuple(c.max(0))) for c in flat.uv[flat.faces].reshape(-1, 3, 2)}
     )
@@ -39,16 +44,19 @@ def test_a_box_has_six_charts_with_the_proportions_of_its_sides():
 def test_no_face_is_lost_or_mirrored_and_no_texel_belongs_to_two(name):
     if name == "ball":
         mesh = trimesh.creation.icosphere(4)
-        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        vertices = np.asarray(mesh.vertices)
+        faces = np.asarray(mesh.faces)
     elif name == "flat":  # with a face without area, and one twice
         vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [9, 9, 9]])
         faces = np.array([[0, 1, 2], [1, 3, 2], [0, 0, 1]])
     else:
         skin = skin_of(get_hand(name))
-        vertices, faces = skin.points.astype(float), skin.faces
+        vertices = skin.points.astype(float)
+        faces = skin.faces
     flat = unwrapped(vertices, faces)
     assert np.array_equal(flat.source[flat.faces], faces)
-    assert flat.uv.min() >= 0 and flat.uv.max() <= 1
+    assert flat.uv.min() >= 0
+    assert flat.uv.max() <= 1
     triangles = flat.uv[flat.faces]
     assert (areas(triangles) >= -1e-12).all()
     # Middles of faces lie in their own face alone, of the convex meshes; of hands in few others,

@@ -21,14 +21,16 @@ from congrasp.services.grasp.approaches import headings, with_avoid
 def test_an_object_that_lies_too_flat(tmp_path: pathlib.Path, quick_import: None) -> None:
     trimesh.creation.box((0.085, 0.054, 0.008)).export(tmp_path / "phone.stl")
     phone = one_object(tmp_path / "phone.stl", ImportOptions(cache_dir=str(tmp_path)))
-    request, rng = GraspRequest({"heading": {}}), np.random.default_rng(0)
+    request = GraspRequest({"heading": {}})
+    rng = np.random.default_rng(0)
     with pytest.raises(
         CongraspError, match=r"lies too flat .* 8 mm high .* Set --rest (\d)"
     ) as error:
         headings(get_hand("human"), phone, request, 8, rng)
     rest = int(str(error.value).split("--rest ")[1][0]) - 1
     rests = headings(get_hand("human"), phone, GraspRequest({"heading": {}}, rest=rest), 8, rng)[3]
-    assert rest > 0 and (rests == rest).all()
+    assert rest > 0
+    assert (rests == rest).all()
 
 
 def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
@@ -39,20 +41,22 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
     draft = Draft(
         (box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0)))
     )
-    cup = procedural._build("cup", "mug", draft, np.random.default_rng(0))
+    cup = procedural.build_object("cup", "mug", draft, np.random.default_rng(0))
     assert cup is not None
     face = cup.pieces[0].pos[0] + 0.04
     avoid = cup.points[:, 0] < face + 0.001
     assert 0.02 < (~avoid).mean() < 0.1
     upright = int(np.argmax([abs(matrix(rest[3:])[2, 2]) for rest in cup.rest_poses]))
-    request, rng = GraspRequest({"heading": {}}, avoid, rest=upright), np.random.default_rng(0)
+    request = GraspRequest({"heading": {}}, avoid, rest=upright)
+    rng = np.random.default_rng(0)
     position, _, cross, _ = headings(get_hand("human"), with_avoid(cup, avoid), request, 64, rng)
-    assert len(np.unique(position, axis=0)) > 4 and (position[:, 0] > face + 0.01).all()
+    assert len(np.unique(position, axis=0)) > 4
+    assert (position[:, 0] > face + 0.01).all()
     assert (np.abs(cross[:, 1]) > 0.7).all()  # across the bars of the handle, not along them
 
 
 @pytest.mark.parametrize(
-    ("asked", "remedy"),
+    ("grasp_request", "remedy"),
     [
         (GraspRequest(), "Scale it."),
         (GraspRequest(rest=2), "Leave out --rest, or scale it."),
@@ -63,5 +67,7 @@ def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
         ),
     ],
 )
-def test_a_remedy_names_the_options_that_were_given(asked: GraspRequest, remedy: str) -> None:
-    assert approaches._remedy(asked, "scale it") == remedy
+def test_a_remedy_names_the_options_that_were_given(
+    grasp_request: GraspRequest, remedy: str
+) -> None:
+    assert approaches.remedy_for(grasp_request, "scale it") == remedy

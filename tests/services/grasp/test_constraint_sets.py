@@ -29,7 +29,8 @@ def file(constraint_sets, tmp_path_factory):
 
 def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
     for constraints in constraint_sets:
-        arrays, meta = constraints.arrays, constraints.meta
+        arrays = constraints.arrays
+        meta = constraints.meta
         assert set(arrays) == set(meta["arrays"])
         sizes: dict[str, int] = {"V": 2, "F": len(meta["finger_joints"]), "H": 256, "M": 20}
         for name, words in meta["arrays"].items():
@@ -40,20 +41,18 @@ def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
                     int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
                 ), name
         assert get_hand(meta["hand_reference"]) is HAND
-        assert (
-            meta["finger_joints"][0] == HAND.joints[0].name
-            and meta["quaternions"] == "(w, x, y, z)"
-        )
+        assert meta["finger_joints"][0] == HAND.joints[0].name
+        assert meta["quaternions"] == "(w, x, y, z)"
 
 
 def test_a_set_equals_the_bank_of_training(constraint_sets):
-    made = bank()
+    trained = bank()
     for n, constraints in enumerate(constraint_sets):
         arrays = constraints.arrays
-        np.testing.assert_array_equal(arrays["heading/position"], made.heading_position[n])
-        np.testing.assert_array_equal(arrays["pose/q"], made.pose_q[n])
+        np.testing.assert_array_equal(arrays["heading/position"], trained.heading_position[n])
+        np.testing.assert_array_equal(arrays["pose/q"], trained.pose_q[n])
         rest = arrays["rest"]
-        assert len(np.unique(rest, axis=0)) == len(rest) <= made.rest.shape[1]
+        assert len(np.unique(rest, axis=0)) == len(rest) <= trained.rest.shape[1]
         headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
         all_cleared, reachable = within_reach(headings, OBJECTS[n], rest, outline(HAND))
         np.testing.assert_array_equal(arrays["heading/allowed"][0], reachable)
@@ -70,19 +69,20 @@ def test_a_set_equals_the_bank_of_training(constraint_sets):
 
 def test_files_round_trip(constraint_sets, file):
     read = set_file.load(file)
-    assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(
-        constraint_sets[2].meta
-    )
+    assert file.name == "mug_2.constraints.safetensors"
+    assert dict(read.meta) == dict(constraint_sets[2].meta)
     for name, array in constraint_sets[2].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
 
 
 def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("congrasp.services.viz.constraint_sheet._SIZE", (48, 36))
+    monkeypatch.setattr("congrasp.services.viz.constraint_sheet.SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out
-    assert "human, 20 finger joints" in words and "mug_2" in words and "resting pose 1" in words
+    assert "human, 20 finger joints" in words
+    assert "mug_2" in words
+    assert "resting pose 1" in words
     colours = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
     red, _, blue = colours.T
     assert (blue - red > 60).sum() > 20  # arrows
@@ -92,11 +92,11 @@ def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
 
 
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
-    made = []
+    names = []
     monkeypatch.setattr(
         sets,
         "make_sets",
-        lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or [],
+        lambda hand, task, objects, seed, bank: names.extend(obj.name for obj in objects) or [],
     )
     store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
@@ -104,7 +104,7 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     store.save(dataclasses.replace(BOX, name="crate"), file)
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
     assert load("constraints")(["generate", *arguments, *folder])() == 0
-    assert made == ["box_0", "mug_7", "crate", "ball_0"]
+    assert names == ["box_0", "mug_7", "crate", "ball_0"]
     with pytest.raises(CongraspError, match="no objects for which to generate constraints"):
         load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ from congrasp.services.grasp.files import (
     RESULT,
     save_grasp,
 )
-from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.grasper import Grasper, limiting_cause
 from congrasp.services.grasp.keys import identity_of_text
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.parse import read_request
@@ -80,21 +79,22 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     minus = block.points[:, 2] < 0
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
     request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
-    found = grasper.grasp(
+    grasp = grasper.grasp(
         block, request, lambda what, done, total: reports.append((what, done, total))
     )
     steps = grasper.task.approach_steps + 25
     assert reports[0][0].startswith("Compiling")
     counts = [report[1:] for report in reports if report[0] == "Attempting"]
     simulated = counts[0][1]
-    assert simulated > steps and counts == [(step + 1, simulated) for step in range(simulated)]
-    assert 1 <= found.held <= found.attempts <= 12 and found.success
-    motion = found.motion
-    assert (
-        motion.constraints == ("heading", "affordance")
-        and motion.about["attempts"] == found.attempts
-    )
-    assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
+    assert simulated > steps
+    assert counts == [(step + 1, simulated) for step in range(simulated)]
+    assert 1 <= grasp.held <= grasp.attempts <= 12
+    assert grasp.success
+    motion = grasp.motion
+    assert motion.constraints == ("heading", "affordance")
+    assert motion.about["attempts"] == grasp.attempts
+    assert len(motion.time) == steps
+    assert motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
     # The hand approached along the block's z axis: the wrist moved mostly in that direction.
@@ -103,30 +103,33 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     assert way @ axis > 0.8 * np.linalg.norm(way) > 0.05
     # The held block keeps its height although there is no table.
     assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
-    facts = found.facts()
-    assert (
-        facts["heading_rad"] < 0.5
-        and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
-    )
+    facts = grasp.facts()
+    assert facts["heading_rad"] < 0.5
+    assert {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
 
     again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
 def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
-    begun, given = [], attempts._requested
-    monkeypatch.setattr(
-        attempts, "_requested", lambda *arguments: begun.append(given(*arguments)) or begun[-1]
-    )
-    monkeypatch.setattr(grasper, "_left", True)
+    begun = []
+    conditions_of = attempts.conditions_of
+
+    def recorded(*arguments):
+        begun.append(conditions_of(*arguments))
+        return begun[-1]
+
+    monkeypatch.setattr(attempts, "conditions_of", recorded)
+    monkeypatch.setattr(grasper, "left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
-    found = grasper.grasp(
+    grasp = grasper.grasp(
         block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}})
     )
-    arrays = found.episode.to_message().arrays
-    assert found.motion.hand == "human_left" and found.success
-    np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
-    np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
+    arrays = grasp.episode.to_message().arrays
+    assert grasp.motion.hand == "human_left"
+    assert grasp.success
+    np.testing.assert_allclose(grasp.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
+    np.testing.assert_allclose(grasp.motion.object_vertices, block.visual_vertices, atol=1e-6)
     start = mirror.fields(
         {name: np.asarray(x) for name, x in begun[-1][0].reset_state._asdict().items()}
     )
@@ -157,24 +160,21 @@ def test_costs_of_attempts():
         **dict.fromkeys(SURVIVAL, np.array([0.0, 0, 1, 1, 1])),
     }
     trace = Trace(*(np.zeros((3, 5, 3)) for _ in Trace._fields))
-    found = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
-    np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
+    computed = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
+    np.testing.assert_allclose(computed, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
 
 
-def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
+def test_the_cause_of_failures_is_weight_or_width(block):
     """Attempts hold objects that are light or narrow enough; the cause is the limit that was
     exceeded.
     """
-    four = Grasper(bundles.load(policy_file(None)), attempts=4)
 
     def cause(request, may_be_held):
-        def run(obj, episodes, progress):
-            return SimpleNamespace(metrics={"held": np.full(4, float(may_be_held(obj)))})
+        return limiting_cause(block, request, lambda obj, _: np.full(4, may_be_held(obj)))
 
-        monkeypatch.setattr(four._attempts, "run", run)
-        return four._cause(block, request, lambda what, done, total: None)
-
-    free, light, narrow = GraspRequest(), 0.3 * block.mass, 0.8 * SIDES[0]
+    free = GraspRequest()
+    light = 0.3 * block.mass
+    narrow = 0.8 * SIDES[0]
     assert cause(free, lambda obj: obj.mass < light) == (
         f"Its weight is the cause: with a quarter of its {1000 * block.mass:.0f} g 4 of 4 attempts "
         f"hold it."
@@ -194,13 +194,17 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
         bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2
     )
     upright = int(np.argmax(block.rest_poses[:, 2]))
-    found = lifting.grasp(block, GraspRequest(rest=upright))
+    grasp = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()
-    motion, phases = found.motion, found.facts()["phases"]
-    assert list(phases) == ["approach", "grasp", "lift", "hold"] and found.rest == upright
+    motion = grasp.motion
+    phases = grasp.facts()["phases"]
+    assert list(phases) == ["approach", "grasp", "lift", "hold"]
+    assert grasp.rest == upright
     seconds = lifting.task.approach_steps * lifting.task.control_dt
-    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + seconds)
-    assert motion.table.all() and found.success
+    assert phases["grasp"] >= 0.3
+    assert phases["lift"] == pytest.approx(phases["grasp"] + seconds)
+    assert motion.table.all()
+    assert grasp.success
     grasped, lifted, held = (
         round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold")
     )
@@ -217,18 +221,18 @@ def test_a_grasp_lifts_the_block_off_the_table(block):
 
 
 def test_impossible_requests(block, grasper):
-    lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
+    one_pose = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
     with pytest.raises(
         CongraspError, match=f'approach through the table.* straight down is --heading "{words}"'
     ):
-        grasper.grasp(lying, GraspRequest({"heading": {"direction": -down}}))
+        grasper.grasp(one_pose, GraspRequest({"heading": {"direction": -down}}))
     below = {"q": grasper.hand.q_open, "position": down, "quaternion": np.array([1.0, 0, 0, 0])}
     with pytest.raises(
         CongraspError, match="would be in the table in every resting pose of 'block'"
     ):
-        grasper.grasp(lying, GraspRequest({"heading": {}, "pose": below}))
+        grasper.grasp(one_pose, GraspRequest({"heading": {}, "pose": below}))
 
 
 @pytest.fixture
@@ -238,7 +242,7 @@ def fake_grasps(monkeypatch, quick_import):
 
     def motion(self, attempted, progress):
         obj = attempted
-        found = episode(success=obj.name != "loose")
+        fake_episode = episode(success=obj.name != "loose")
         errors = (
             "heading_rad",
             "heading_m",
@@ -248,21 +252,21 @@ def fake_grasps(monkeypatch, quick_import):
             "trajectory_m",
         )
         metrics = {
-            **found.metrics,
+            **fake_episode.metrics,
             **dict.fromkeys(errors, 0.01),
             "affordance_ratio": 0.0,
             "moved_at_removal": 0.0,
             "force_link_max": 3.0,
-            "held": float(found.success),
+            "held": float(fake_episode.success),
             "push_survival": float(obj.name == "a"),
         }
-        made = dataclasses.replace(
-            found,
+        fake_result = dataclasses.replace(
+            fake_episode,
             object=obj.name,
             metrics=metrics,
-            about={**found.about, "phases": {"grasp": 0.0, "hold": 0.04}},
+            about={**fake_episode.about, "phases": {"grasp": 0.0, "hold": 0.04}},
         )
-        return Grasp(made, 4, 3, 0, ("The heading guides the wrist.",))
+        return Grasp(fake_result, 4, 3, 0, ("The heading guides the wrist.",))
 
     def attempt(self, obj, request, progress):
         calls.append(obj.name)
@@ -286,12 +290,14 @@ def meshes(folder: pathlib.Path, *names: str) -> pathlib.Path:
 
 def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch, fake_grasps):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    folder, out = meshes(tmp_path / "things", "a", "b"), tmp_path / "out"
+    folder = meshes(tmp_path / "things", "a", "b")
+    out = tmp_path / "out"
     (folder / "bad.obj").write_text("no mesh")
     assert command(folder, "--out", out) == 2
     captured = capsys.readouterr()
     assert fake_grasps == ["a", "b"]
-    assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
+    assert "bad.obj" in captured.err
+    assert captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
     size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
     assert (
@@ -300,7 +306,8 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert f"b: {size}; held; best of" in captured.out
     assert "2 of 3 objects are held; 1 could not be used" in captured.out
     summary = json.loads((out / "summary.json").read_text())
-    assert (summary["objects"], summary["succeeded"]) == (3, 2)
+    assert summary["objects"] == 3
+    assert summary["succeeded"] == 2
     assert load_motion(out / "a" / MOTION).object == "a"
     assert next(read_episodes(out / "a" / RECORDING)).object == "a"
     assert sorted(path.name for path in (out / "a").iterdir()) == [RECORDING, MOTION, RESULT]
@@ -310,7 +317,8 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert json.loads((out / "a" / RESULT).read_text())["object_mass"] > 0.001
     (out / "b" / RESULT).unlink()  # as if it had been interrupted while b was written
     assert command(folder, "--out", out) == 0
-    assert fake_grasps == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
+    assert fake_grasps == ["a", "b", "b", "c"]
+    assert "a (done before)" in capsys.readouterr().out
     assert command(folder, "--out", out, "--heading", "above") == 0  # another request
     assert command(folder, "--out", out, "--heading", "above") == 0
     assert fake_grasps[4:] == ["a", "b", "c"]
@@ -322,11 +330,13 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
 
 
 def test_another_file_of_a_constraint_is_another_request(tmp_path):
-    found = set()
+    identities = set()
     for content in ("one", "other"):
         (tmp_path / "a.bvh").write_text(content)
-        found |= {identity_of_text(f"{tmp_path}/a.bvh{part}") for part in ("", ":0", ":1", ":Hand")}
-    assert len(found) == 6
+        identities |= {
+            identity_of_text(f"{tmp_path}/a.bvh{part}") for part in ("", ":0", ":1", ":Hand")
+        }
+    assert len(identities) == 6
 
 
 def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):
@@ -354,24 +364,23 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
         red, _, blue = np.moveaxis(image, -1, 0)
-        orange, skin = (
-            (red > 90) & (blue < 0.5 * red),
-            (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red),
-        )
+        orange = (red > 90) & (blue < 0.5 * red)
+        skin = (red > 80) & (red > 1.2 * blue) & (blue > 0.5 * red)
         for part in np.array_split(np.arange(image.shape[1]), columns)[
             : 2 if name == OBJECT else columns
         ]:
-            assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
+            assert orange[:, part].sum() > 400, name
+            assert skin[:, part].sum() > 400, name
     assert (tmp_path / "out" / "summary.png").exists()
 
 
 def test_a_grasp_is_a_constraint_of_the_next(tmp_path, block, grasper, monkeypatch, fake_grasps):
-    found = Grasper.grasp(grasper, block)
-    save_grasp(tmp_path, found, film=None, pictures=False, about={"key": "k"})
+    grasp = Grasper.grasp(grasper, block)
+    save_grasp(tmp_path, grasp, film=None, pictures=False, about={"key": "k"})
     text = str(tmp_path / MOTION)
     request = read_request(block, grasper.hand, 15, pose=text, trajectory=text)
     assert set(request.constraints) == {"heading", "pose", "trajectory"}
-    np.testing.assert_array_equal(request.given("pose", "q"), found.motion.joint_position[7])
+    np.testing.assert_array_equal(request.given("pose", "q"), grasp.motion.joint_position[7])
 
 
 def test_an_upright_resting_pose_is_preferred():
@@ -380,9 +389,11 @@ def test_an_upright_resting_pose_is_preferred():
     """
     mug = procedural.generate(0, "mug")
     upright = upright_rest(mug)
-    assert upright is not None and upright > 0
+    assert upright is not None
+    assert upright > 0
     rests = np.arange(len(mug.rest_poses))
     places = rest_ranks(mug, rests, GraspRequest())
-    assert places[upright] == 0 and sorted(places) == list(rests)
+    assert places[upright] == 0
+    assert sorted(places) == list(rests)
     np.testing.assert_array_equal(places[upright + 1 :], rests[upright + 1 :])
     assert not rest_ranks(mug, rests, GraspRequest(rest=0)).any()

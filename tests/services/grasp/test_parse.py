@@ -46,15 +46,17 @@ def test_an_object_has_the_origin_and_scale_of_its_file(block):
 
 
 def test_headings_are_numbers_or_a_word(block):
-    given = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
-    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    request = asked(block, heading="0 0 -2", at="0.1, -0.2, 0.34")
+    np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(request.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
     for written in ((0, 0, -2), [0.0, 0.0, -1.0], np.array([0, 0, -1], np.float32)):
-        given = asked(block, heading=written, at=None, force=np.float32(2))
-        np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-        assert given.above is False and given.given("force", "limit") == 2
+        request = asked(block, heading=written, at=None, force=np.float32(2))
+        np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+        assert request.above is False
+        assert request.given("force", "limit") == 2
     above = asked(block, heading="above")
-    assert above.above and above.given("heading", "direction") is None
+    assert above.above
+    assert above.given("heading", "direction") is None
     with pytest.raises(CongraspError, match=r"--at is 39.* m away from 'block'"):
         asked(block, at="0 0 40")
     uneven = [np.zeros((2, 3)), np.zeros((2, 2))]
@@ -112,16 +114,17 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
     """The quarter turn takes (x, y, z) to (x, -z, y)."""
     turned = dataclasses.replace(block, file_up="y")
     x, y, z = CENTER
-    given = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
-    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
-    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    request = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
+    np.testing.assert_allclose(request.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(request.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
     upper = (
         trimesh.creation.box((0.04, 0.05, 0.05))
         .apply_translation(np.add(CENTER, [0, 0, 0.035]))
         .apply_scale(1000)
     )
     upper.vertices = upper.vertices[:, [0, 2, 1]] * [1, 1, -1]
-    high, clear = block.points[:, 2] > 0.01, np.abs(block.points[:, 2] - 0.01) > 0.005
+    high = block.points[:, 2] > 0.01
+    clear = np.abs(block.points[:, 2] - 0.01) > 0.005
     for suffix in ("ply", "glb", "stl"):
         upper.export(tmp_path / f"upper.{suffix}")
         avoid = asked(turned, avoid=tmp_path / f"upper.{suffix}").avoid
@@ -136,15 +139,16 @@ def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
 def test_references_come_from_motions_json_and_csv(block, tmp_path):
     motion = episode().normalised()
     save_motion(tmp_path / "grasp.npz", motion)
-    given = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
-    pose = given.constraints["pose"]
+    request = asked(block, pose=str(tmp_path / "grasp.npz"), trajectory=str(tmp_path / "grasp.npz"))
+    pose = request.constraints["pose"]
     last = 7  # the last moment with the table
     np.testing.assert_array_equal(pose["q"], motion.joint_position[last])
     np.testing.assert_allclose(
         pose["position"], motion.wrist_position[last] - [0, 0, HEIGHT / 2], atol=1e-6
     )
-    path, turns = given.constraints["trajectory"].values()
-    assert path.shape == (15, 3) and turns.shape == (15, 4)
+    path, turns = request.constraints["trajectory"].values()
+    assert path.shape == (15, 3)
+    assert turns.shape == (15, 4)
     np.testing.assert_allclose(
         path[[0, -1]], motion.wrist_position[[0, last]] - [0, 0, HEIGHT / 2], atol=1e-6
     )
@@ -156,7 +160,8 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
     pose = asked(block, pose=str(tmp_path / "pose.json")).constraints["pose"]
     np.testing.assert_allclose(pose["position"], [0, 0, 0.2], atol=1e-6)
     np.testing.assert_allclose(pose["quaternion"], [1, 0, 0, 0])
-    assert pose["q"][3] == pytest.approx(0.3) and not pose["q"][:3].any()
+    assert pose["q"][3] == pytest.approx(0.3)
+    assert not pose["q"][:3].any()
 
     (tmp_path / "path.csv").write_text(
         "x,y,z,qw,qx,qy,qz\n0.1,-0.2,0.7,1,0,0,0\n0.1,-0.2,0.5,-1,0,0,0\n"
@@ -277,7 +282,8 @@ def test_the_path_of_a_skeleton_s_joint_ends_nearest_to_the_object():
     mug = dataclasses.replace(generate(7, "mug"), origin=(0.03, 0.0, -0.05))
     path = asked(mug, trajectory="examples/reach.bvh").constraints["trajectory"]
     distance = np.linalg.norm(path["position"], axis=-1)
-    assert path["position"].shape == (15, 3) and distance.argmin() == 14
+    assert path["position"].shape == (15, 3)
+    assert distance.argmin() == 14
     assert distance[0] - distance[-1] > 0.1  # it comes from at least a decimetre farther away
     with pytest.raises(CongraspError, match="LeftHand"):
         asked(mug, trajectory="examples/reach.bvh:LeftHand")

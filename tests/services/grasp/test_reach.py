@@ -35,8 +35,8 @@ BALL = 0.04  # m
 
 @pytest.fixture(scope="module")
 def ball():
-    made = procedural.generate(1, "ball")
-    return made.scaled(2 * BALL / np.ptp(made.visual_vertices, axis=0).max())
+    obj = procedural.generate(1, "ball")
+    return obj.scaled(2 * BALL / np.ptp(obj.visual_vertices, axis=0).max())
 
 
 def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
@@ -51,7 +51,8 @@ def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
 
 def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) exact distances of the hand's capsules from a ball, and from the table."""
-    ball, table = [], []
+    ball = []
+    table = []
     origins = np.array(
         [link.joints[0].anchor if link.joints else (0.0, 0.0, 0.0) for link in hand.links]
     )
@@ -76,7 +77,8 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
 def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
     name, heading, speed, ball
 ) -> None:
-    hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
+    hand = get_hand(name)
+    way = np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
     reach = plan_reach(hand, ball, rest, way, first, 0.2, DT, speed)
@@ -84,20 +86,20 @@ def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
         np.linalg.norm((place - rest[:3])[:2]) for place in (reach.position[0], first.position[0])
     )
     assert away == pytest.approx(max(0.45, end + 0.22), abs=1e-6)
-    whole = Reach(
+    full_reach = Reach(
         np.concatenate([reach.position, first.position]),
         Rotation.concatenate([reach.rotation, first.rotation]),
         np.concatenate([reach.q, first.q]),
     )
-    near, low = clearance(hand, whole, rest[:3])
+    near, low = clearance(hand, full_reach, rest[:3])
     assert near.min() > min(CLEARANCE, near[-1]) - 2e-3
     assert low.min() > min(CLEARANCE, low[-1]) - 2e-3
-    velocity = np.diff(whole.position, axis=0) / DT
+    velocity = np.diff(full_reach.position, axis=0) / DT
     assert np.linalg.norm(velocity, axis=1).max() < 1.02 * SPEED
     np.testing.assert_allclose(velocity[-1], speed * way, atol=0.02)
     acceleration = np.diff(velocity, axis=0, prepend=0 * velocity[:1], append=[speed * way]) / DT
     assert np.linalg.norm(acceleration, axis=1).max() < 1.05 * ACCELERATION
-    turned = (whole.rotation[:-1].inv() * whole.rotation[1:]).magnitude() / DT
+    turned = (full_reach.rotation[:-1].inv() * full_reach.rotation[1:]).magnitude() / DT
     assert turned.max() < 1.02 * TURNING
     slow = plan_reach(hand, ball, rest, way, first, 3.0, DT, speed)
     assert len(slow.q) == 300
@@ -106,12 +108,13 @@ def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(
 
 
 def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
-    hand, task = get_hand("human"), TaskConfig()
+    hand = get_hand("human")
+    task = TaskConfig()
     further = dataclasses.replace(
         task, control=dataclasses.replace(task.control, approach_position_limit=0.04)
     )
-    found = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
-    assert found == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
+    speeds = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
+    assert speeds == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
 
 
 def test_an_unreachable_grasp_is_an_error(ball) -> None:
@@ -133,37 +136,39 @@ def test_an_unreachable_grasp_is_an_error(ball) -> None:
 
 
 def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
-    made = episode()
-    made.about["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
+    recorded = episode()
+    recorded.about["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
     hand = get_hand("human")
-    first = Rotation.from_quat(made.wrist_quaternion[0], scalar_first=True)
+    first = Rotation.from_quat(recorded.wrist_quaternion[0], scalar_first=True)
     turns = Rotation.concatenate(
         [first * Rotation.from_rotvec([0.0, 0.0, a]) for a in (0.3, 0.2, 0.1)]
     )
-    place = made.wrist_position[0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
-    longer = with_reach(made, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
+    place = recorded.wrist_position[0] + np.outer([0.3, 0.2, 0.1], [0.0, 0.6, 0.8])
+    longer = with_reach(recorded, hand, Reach(place, turns, np.tile(hand.q_open, (3, 1))))
     assert longer.phases == {
         "approach": 0.0,
         "grasp": pytest.approx(0.03),
         "hold": pytest.approx(0.11),
     }
     motion = longer.normalised()
-    assert len(motion.time) == 15 and motion.table[:11].all() and not motion.table[11:].any()
+    assert len(motion.time) == 15
+    assert motion.table[:11].all()
+    assert not motion.table[11:].any()
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
-    np.testing.assert_allclose(motion.link_position[3:], made.link_position)
-    assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[
-        :3
-    ].any()
+    np.testing.assert_allclose(motion.link_position[3:], recorded.link_position)
+    assert (motion.object_position == motion.object_position[0]).all()
+    assert not motion.link_force[:3].any()
     # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
     u = longer.require_recorded().wrist_joints
     for t in range(3):
-        own = first * Rotation.from_euler("XYZ", u[t, 3:])
-        assert (own.inv() * turns[t]).magnitude() < 1e-5
+        rotation = first * Rotation.from_euler("XYZ", u[t, 3:])
+        assert (rotation.inv() * turns[t]).magnitude() < 1e-5
         np.testing.assert_allclose(
-            first.apply(u[t, :3]) + made.wrist_position[0], place[t], atol=1e-6
+            first.apply(u[t, :3]) + recorded.wrist_position[0], place[t], atol=1e-6
         )
     # Used as a reference, such a motion is cut to its grasp.
-    assert grasp_part(motion) == (3, 10) and longer.grasp_span == (3, 11)
+    assert grasp_part(motion) == (3, 10)
+    assert longer.grasp_span == (3, 11)
     lifted = dataclasses.replace(
         motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}}
     )
@@ -180,7 +185,9 @@ def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
         begin, end = dataclasses.replace(longer, about={"phases": odd}).grasp_span
         assert 0 <= begin <= end <= len(motion.time)
     drawn = steps_to_draw(100, 150, 400)
-    assert drawn[0] == 0 and {100, 150, 400} < set(drawn) and len(drawn) == 8
+    assert drawn[0] == 0
+    assert {100, 150, 400} < set(drawn)
+    assert len(drawn) == 8
 
 
 def test_resting_poses_by_name_and_number() -> None:
@@ -193,9 +200,9 @@ def test_resting_poses_by_name_and_number() -> None:
     for text in ("0", "99", "sideways"):
         with pytest.raises(CongraspError, match=f"--rest is '{text}'"):
             rest_pose(mug, text)
-    lying = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
+    one_pose = dataclasses.replace(mug, rest_poses=mug.rest_poses[:1])
     with pytest.raises(CongraspError, match="points up in none of its 1 resting poses"):
-        rest_pose(lying, "upright")
+        rest_pose(one_pose, "upright")
 
 
 def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> None:
@@ -203,8 +210,9 @@ def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> No
 
     mug = procedural.generate(7, "mug")
     Catalogue(tmp_path / "mine").add(mug)
-    (found,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
-    assert not errors and found.load().name == "mug_7"
+    (obj,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
+    assert not errors
+    assert obj.load().name == "mug_7"
     trimesh.creation.box((0.05, 0.05, 0.1)).export(tmp_path / "mug_7.stl")
     (other,), _ = find_objects([str(tmp_path / "mug_7.stl")], str(tmp_path / "mine"))
     assert other.source is not None  # a file is a file

@@ -16,6 +16,7 @@ FRAMES = 12
 T = np.linspace(0, 1, FRAMES)
 POSITION = np.stack([0.3 * T, 0.1 * np.sin(3 * T), 0.2 + 0.1 * T], -1)
 ROTATION = Rotation.from_rotvec(np.outer(T, [0.4, -0.3, 0.8]))
+ROS = "x,y,z,qx,qy,qz,qw"
 
 
 def bvh(path, order="ZXY", unit=0.01):
@@ -23,9 +24,11 @@ def bvh(path, order="ZXY", unit=0.01):
     are arbitrary.
     """
     up = Rotation.from_euler("X", -90, degrees=True)
-    place, turn = up.apply(POSITION) / unit, up * ROTATION
+    place = up.apply(POSITION) / unit
+    turn = up * ROTATION
     shoulder = Rotation.from_rotvec(np.outer(T, [0.2, 0.5, -0.1]))
-    arm, hand = np.array([3.0, -20.0, 1.0]), np.array([0.0, -25.0, 2.0])
+    arm = np.array([3.0, -20.0, 1.0])
+    hand = np.array([0.0, -25.0, 2.0])
     elbow = Rotation.from_rotvec(np.outer(T, [-0.3, 0.0, 0.6]))
     root = place - shoulder.apply(arm) - (shoulder * elbow).apply(hand)
     turns = [shoulder, elbow, (shoulder * elbow).inv() * turn]
@@ -61,20 +64,23 @@ Frame Time: 0.02
 """
     angles = [turn.as_euler(order, degrees=True) for turn in turns]
     rows = np.concatenate([root, *angles, np.zeros((FRAMES, 3))], 1)
-    path.write_text(text + "\n".join(" ".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
+    lines = []
+    for row in rows:
+        lines.append(" ".join(f"{x:.6f}" for x in row))
+    path.write_text(text + "\n".join(lines) + "\n")
     return path
 
 
-def check(found):
-    np.testing.assert_allclose(found.position, POSITION, atol=1e-6)
-    assert (found.rotation * ROTATION.inv()).magnitude().max() < 1e-6
+def check(path):
+    np.testing.assert_allclose(path.position, POSITION, atol=1e-6)
+    assert (path.rotation * ROTATION.inv()).magnitude().max() < 1e-6
 
 
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
 def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
-    found = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
-    check(found)
-    assert found.seconds == 0.02
+    path = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
+    check(path)
+    assert path.seconds == 0.02
     file.write_text(
         file.read_text().replace("position", "POSITION").replace("rotation", "Rotation")
     )
@@ -153,12 +159,10 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
         f"stamp,frame_id,note,{ROS},rest",
         [[i, "", '"a, b"', *row, ""] for i, row in enumerate(rows)],
     )
-    save(
-        "dec.csv",
-        ROS.replace(",", ";"),
-        [[str(x).replace(".", ",") for x in row] for row in rows],
-        ";",
-    )
+    with_commas = []
+    for row in rows:
+        with_commas.append([str(x).replace(".", ",") for x in row])
+    save("dec.csv", ROS.replace(",", ";"), with_commas, ";")
     save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
     plain = np.c_[POSITION, ROTATION.as_quat(scalar_first=True)].tolist()
     save("end.csv", "# three words here", [[*r[:6], f"{r[6]} # a"] for r in plain])
@@ -260,8 +264,8 @@ def test_a_clock_that_runs_back_is_refused_however_long_the_file_is(tmp_path, ti
 
 def test_another_wrist_frame_is_converted(tmp_path):
     # Fingers towards +x and the back of the hand +y: the thumb of a right hand then points to -z.
-    own = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
-    quaternion = (ROTATION * own.inv()).as_quat(scalar_first=True)
+    frame = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
+    quaternion = (ROTATION * frame.inv()).as_quat(scalar_first=True)
     np.savez(tmp_path / "a.npz", position=POSITION, quaternion=quaternion)
     check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
 

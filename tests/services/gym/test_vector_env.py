@@ -29,9 +29,9 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def vector():
-    made = congrasp.make_vec(num_envs=COUNT, **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, **SHORT)
+    yield environments
+    environments.close()
 
 
 @pytest.mark.slow
@@ -46,19 +46,21 @@ def test_environments_restart_in_the_same_step(vector):
     first one of the next episode.
     """
     first, infos = vector.reset(seed=3)
-    assert first in vector.observation_space and infos == {}
+    assert first in vector.observation_space
+    assert infos == {}
     assert vector.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     still = np.zeros(vector.action_space.shape, np.float32)
     steps = [vector.step(still) for _ in range(SHORT["approach_steps"] + SHORT["hold_steps"])]
     for observation, reward, terminated, truncated, infos in steps[:-1]:
-        assert (
-            observation in vector.observation_space
-            and reward.shape == (COUNT,)
-            and np.isfinite(reward).all()
-        )
-        assert not (terminated | truncated).any() and infos == {}
+        assert observation in vector.observation_space
+        assert reward.shape == (COUNT,)
+        assert np.isfinite(reward).all()
+        assert not (terminated | truncated).any()
+        assert infos == {}
     observation, _, terminated, truncated, infos = steps[-1]
-    assert (terminated ^ truncated).all() and infos["_final_obs"].all() and infos["_metrics"].all()
+    assert (terminated ^ truncated).all()
+    assert infos["_final_obs"].all()
+    assert infos["_metrics"].all()
     assert infos["final_obs"] in vector.observation_space
     assert (np.abs(infos["final_obs"] - observation).max(-1) > 0.01).all()
     np.testing.assert_array_equal(
@@ -78,20 +80,20 @@ def test_a_seed_decides_everything(vector):
         observations = [vector.reset(seed=seed)[0]]
         return np.stack([*observations, *(vector.step(action)[0] for action in actions)])
 
-    once, again, other = run(1), run(1), run(2)
+    once = run(1)
+    again = run(1)
+    other = run(2)
     np.testing.assert_array_equal(once, again)
     assert np.abs(once - other).max() > 0.01
 
 
 def test_gymnasium_makes_it_by_its_id():
-    made = gym.make_vec(
+    environments = gym.make_vec(
         "congrasp.services.gym:congrasp/Grasp-v0", COUNT, "vector_entry_point", **SHORT
     )
-    assert (
-        isinstance(made.unwrapped, GraspVectorEnv)
-        and made.reset(seed=0)[0].shape == made.observation_space.shape
-    )
-    made.close()
+    assert isinstance(environments.unwrapped, GraspVectorEnv)
+    assert environments.reset(seed=0)[0].shape == environments.observation_space.shape
+    environments.close()
 
 
 @pytest.mark.parametrize(
@@ -116,16 +118,16 @@ LENGTH = SHORT["approach_steps"] + SHORT["hold_steps"]
 
 @pytest.fixture(scope="module")
 def next_step():
-    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode="NextStep", **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, autoreset_mode="NextStep", **SHORT)
+    yield environments
+    environments.close()
 
 
 @pytest.fixture(scope="module")
 def manual():
-    made = congrasp.make_vec(num_envs=COUNT, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
-    yield made
-    made.close()
+    environments = congrasp.make_vec(num_envs=COUNT, autoreset_mode=AutoresetMode.DISABLED, **SHORT)
+    yield environments
+    environments.close()
 
 
 def still(envs):
@@ -137,9 +139,12 @@ def test_environments_restart_in_the_next_step(next_step):
     next_step.reset(seed=3)
     for _ in range(LENGTH):
         last, _, terminated, truncated, infos = next_step.step(still(next_step))
-    assert (terminated ^ truncated).all() and infos["_metrics"].all()
+    assert (terminated ^ truncated).all()
+    assert infos["_metrics"].all()
     first, reward, terminated, truncated, infos = next_step.step(still(next_step))
-    assert infos == {} and not reward.any() and not (terminated | truncated).any()
+    assert infos == {}
+    assert not reward.any()
+    assert not (terminated | truncated).any()
     assert (np.abs(first - last).max(-1) > 0.01).all()
     ends = [next_step.step(still(next_step))[2:4] for _ in range(LENGTH)]
     assert [bool((a | b).all()) for a, b in ends] == [False] * (LENGTH - 1) + [True]
@@ -169,12 +174,12 @@ def test_each_environment_has_its_own_seed(manual):
     np.testing.assert_array_equal(manual.reset(seed=np.int64(7))[0][:2], together[:2])
     different = manual.reset(seed=[0, 2**32, 2**40, 2**64])[0]
     assert len(np.unique(different, axis=0)) == COUNT
-    kept = manual.reset(seed=[None, 7, None, None])[0]
-    np.testing.assert_array_equal(kept[1], together[0])
-    assert len(np.unique([*kept, *different], axis=0)) == 2 * COUNT
+    observations = manual.reset(seed=[None, 7, None, None])[0]
+    np.testing.assert_array_equal(observations[1], together[0])
+    assert len(np.unique([*observations, *different], axis=0)) == 2 * COUNT
 
 
-def test_an_environment_alone_draws_what_it_draws_among_others(manual):
+def test_an_environment_draws_the_same_alone_and_among_others(manual):
     env = GraspEnv(**SHORT)
     np.testing.assert_array_equal(env.reset(seed=3)[0], manual.reset(seed=[1, 3, 5, 7])[0][1])
     env.close()
@@ -196,7 +201,8 @@ def test_arrays_may_be_changed_by_the_caller(vector):
     for array in step[:4]:
         array[...] = 0
     after = vector.step(still(vector))
-    assert after[0].any() and after[1].any()
+    assert after[0].any()
+    assert after[1].any()
 
 
 SHAPE = (COUNT, 26)
@@ -273,7 +279,8 @@ def test_wrappers_of_gymnasium_accept_vectors(next_step):
         for _ in range(LENGTH + 2):
             observation, reward, *_ = envs.step(still(envs))
         assert observation.shape == next_step.observation_space.shape
-        assert np.isfinite(observation).all() and np.isfinite(reward).all()
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward).all()
 
 
 def test_wrappers_of_gymnasium_accept_a_single_environment():
@@ -306,4 +313,5 @@ def test_a_loop_like_those_of_cleanrl_collects_returns(next_step):
         if "episode" in infos:
             returns += infos["episode"]["r"][infos["_episode"]].tolist()
     assert np.sum(used) == 3 * LENGTH * COUNT
-    assert len(returns) == 3 * COUNT and np.isfinite(returns).all()
+    assert len(returns) == 3 * COUNT
+    assert np.isfinite(returns).all()

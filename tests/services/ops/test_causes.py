@@ -25,13 +25,18 @@ CASES = {
 }
 
 
+LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); "
+
+
 @pytest.mark.parametrize("code", [1, -6])
 @pytest.mark.parametrize("after", ["", PIPE, "info: The actor actor-0 left.\n"])
 @pytest.mark.parametrize(("log", "cause"), CASES.values(), ids=CASES)
 def test_first_fatal_error_is_the_cause(log, cause, after, code):
     end = end_of("learner", code, f"info: Update 3.\n{log}{after}")
-    assert cause in end and "Broken pipe" not in end
-    assert "\n" not in end and end.startswith("The learner ")
+    assert cause in end
+    assert "Broken pipe" not in end
+    assert "\n" not in end
+    assert end.startswith("The learner ")
 
 
 def test_allocator_that_tries_again_is_no_cause():
@@ -50,7 +55,6 @@ class Program(Child):
         return [sys.executable, "-c", self.arguments[0]]
 
 
-LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30)); "
 DEATHS = {
     "bytes": (f"{LIMITED}bytes(4 << 30)", "out of memory"),
     "import": ("import no_such_module", "no_such_module"),
@@ -66,7 +70,8 @@ def test_death_of_a_process_names_its_cause(tmp_path, code, cause):
     child = Program("learner", [code], tmp_path / "learner.log")
     child.start()
     child.process.wait(60)
-    assert cause in child.death() and cause in child.cause()
+    assert cause in child.death()
+    assert cause in child.cause()
 
 
 def test_children_import_no_module_of_the_working_folder(tmp_path):

@@ -25,13 +25,15 @@ def folder(tmp_path):
     return tmp_path / "certs"
 
 
-def test_a_certificate_says_run_role_number_hosts_and_end(folder):
-    made = read(
+def test_a_certificate_contains_run_role_number_hosts_and_expiry(folder):
+    certificate = read(
         issue(folder, "learner", hosts=["10.0.0.5", "gpu.example", "10.0.0.5"], days=30) / "tls.crt"
     )
-    assert (made.name, made.identity) == ("human.learner.0", ("human", "learner", 0))
-    assert made.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
-    assert made.expires.utcoffset() == datetime.timedelta(0) and 29.99 < made.days <= 30
+    assert certificate.name == "human.learner.0"
+    assert certificate.identity == ("human", "learner", 0)
+    assert certificate.hosts == ("localhost", "127.0.0.1", "10.0.0.5", "gpu.example")
+    assert certificate.expires.utcoffset() == datetime.timedelta(0)
+    assert 29.99 < certificate.days <= 30
     assert read(issue(folder, "learner") / "tls.crt").name == "human.learner.1"
     other = issue(folder, "learner", run="a.b-c")
     assert (
@@ -53,7 +55,7 @@ def test_a_certificate_says_run_role_number_hosts_and_end(folder):
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the command openssl is not here")
-def test_openssl_agrees_who_may_listen(folder, tmp_path):
+def test_openssl_accepts_listeners_only(folder, tmp_path):
     create_authority(tmp_path / "other")
 
     def verify(ca, certificate, purpose):
@@ -69,20 +71,19 @@ def test_openssl_agrees_who_may_listen(folder, tmp_path):
         ]
         return subprocess.run(command, capture_output=True, check=False, timeout=20).returncode == 0
 
-    learner, actor = issue(folder, "learner") / "tls.crt", issue(folder, "actor") / "tls.crt"
+    learner = issue(folder, "learner") / "tls.crt"
+    actor = issue(folder, "actor") / "tls.crt"
     ca = folder / "ca.crt"
-    assert (
-        verify(ca, learner, "sslserver")
-        and verify(ca, learner, "sslclient")
-        and verify(ca, actor, "sslclient")
-    )
+    assert verify(ca, learner, "sslserver")
+    assert verify(ca, learner, "sslclient")
+    assert verify(ca, actor, "sslclient")
     assert not verify(ca, actor, "sslserver")
     assert not verify(tmp_path / "other" / "ca.crt", actor, "sslclient")
 
 
 def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
-    made = issue(folder, "actor")
-    for key in (folder / "ca.key", made / "tls.key"):
+    certificate = issue(folder, "actor")
+    for key in (folder / "ca.key", certificate / "tls.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(CongraspError, match=r"already contains a certificate authority.*--force"):
@@ -91,7 +92,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
         issue(folder, "actor", number=0)
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     issue(folder, "actor", number=0, force=True)
-    assert (made / "tls.key").read_bytes() != before[made / "tls.key"]
+    assert (certificate / "tls.key").read_bytes() != before[certificate / "tls.key"]
     create_authority(folder, force=True)
     assert (folder / "ca.key").read_bytes() != before[folder / "ca.key"]
 
@@ -112,7 +113,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
         ("actor", {"days": float("nan")}, "days"),
     ],
 )
-def test_what_makes_no_sense_is_not_issued(folder, role, options, words):
+def test_invalid_certificate_requests_are_refused(folder, role, options, words):
     with pytest.raises(CongraspError, match=words):
         issue(folder, role, **options)
     assert [one.name for one in certificates(folder)] == ["ca"]
@@ -148,8 +149,9 @@ def test_a_common_name_that_is_none_of_ours_is_nobodys(name):
     assert parse_identity("r.s.actor.255") == ("r.s", "actor", 255)
 
 
-def test_what_is_revoked_is_listed_where_others_connect_and_never_issued_again(folder):
-    learner, actor = issue(folder, "learner"), issue(folder, "actor")
+def test_revoked_certificates_are_listed_and_not_reissued(folder):
+    learner = issue(folder, "learner")
+    actor = issue(folder, "actor")
     assert revoke(folder, "actor", 0) == "human.actor.0"
     assert revoke(folder, "actor", 3) == "human.actor.3"
     assert Credentials(learner, "learner").revoked() == {"human.actor.0", "human.actor.3"}

@@ -38,29 +38,31 @@ def findings(**options):
     return {finding.what: finding for finding in doctor.examine(**options)}
 
 
-def test_this_machine_is_looked_at(capsys):
+def test_doctor_prints_a_line_for_each_check(capsys):
     assert set(ALWAYS) <= findings().keys()
     code = command()
     lines = capsys.readouterr().out.splitlines()
     if code == 0:
         assert lines.pop().startswith("Next: congrasp train --preset check")
-    assert len(lines) >= len(ALWAYS) and all(line.startswith(("ok ", "BAD")) for line in lines)
+    assert len(lines) >= len(ALWAYS)
+    assert all(line.startswith(("ok ", "BAD")) for line in lines)
     assert code == int(any(line.startswith("BAD") for line in lines))
 
 
-def test_another_version_of_mujoco_is_named_with_the_one_that_is_needed(monkeypatch, capsys):
+def test_another_mujoco_version_names_the_required_one(monkeypatch, capsys):
     real = importlib.metadata.version
     monkeypatch.setattr(
         importlib.metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name)
     )
-    found = findings()
-    assert not found["mujoco"].fine and "4.0.0: ==3.17.0 is needed" in found["mujoco"].text
-    assert "4.0.0 and 3.17.0 do not match" in found["mujoco, mujoco-mjx"].text
+    by_check = findings()
+    assert not by_check["mujoco"].fine
+    assert "4.0.0: ==3.17.0 is needed" in by_check["mujoco"].text
+    assert "4.0.0 and 3.17.0 do not match" in by_check["mujoco, mujoco-mjx"].text
     assert command() == 1
     assert any(line.startswith("BAD  mujoco") for line in capsys.readouterr().out.splitlines())
 
 
-def test_a_package_that_is_missing_comes_with_the_command_that_installs_it(monkeypatch):
+def test_a_missing_package_names_the_install_command(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -69,13 +71,14 @@ def test_a_package_that_is_missing_comes_with_the_command_that_installs_it(monke
 
 
 def test_a_port_in_use_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_PORT", free_port())
+    monkeypatch.setattr(doctor, "PORT", free_port())
     assert "are free" in findings()["ports"].text
     with socket.socket() as busy:
-        busy.bind(("127.0.0.1", doctor._PORT))
+        busy.bind(("127.0.0.1", doctor.PORT))
         busy.listen()
-        found = findings()["ports"]
-    assert f"{doctor._PORT} is in use" in found.text and "--listen" in found.text
+        ports = findings()["ports"]
+    assert f"{doctor.PORT} is in use" in ports.text
+    assert "--listen" in ports.text
 
 
 def _slow(patch):
@@ -85,11 +88,11 @@ def _slow(patch):
 
 
 CHECKS = {
-    "python": doctor._python,
-    "gpu": doctor._gpu,
-    "jax": doctor._jax,
-    "disk": lambda: doctor._disk(pathlib.Path()),
-    "clock": doctor._clock,
+    "python": doctor.check_python,
+    "gpu": doctor.check_gpu,
+    "jax": doctor.check_jax,
+    "disk": lambda: doctor.check_disk(pathlib.Path()),
+    "clock": doctor.check_clock,
 }
 CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda form: "now"}
 
@@ -116,58 +119,77 @@ CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda 
             "3.10.4: 3.11, 3.12",
             lambda m: m.setattr(doctor.platform, "python_version", lambda: "3.10.4"),
         ),
-        ("jax", "NVIDIA GPU is not found", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
-        ("gpu", "install the NVIDIA driver", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
+        (
+            "jax",
+            "NVIDIA GPU is not found",
+            lambda m: m.setattr(doctor, "NVIDIA_DEVICE", os.devnull),
+        ),
+        (
+            "gpu",
+            "install the NVIDIA driver",
+            lambda m: m.setattr(doctor, "NVIDIA_DEVICE", os.devnull),
+        ),
         ("jax", "RuntimeError: no such device", lambda m: m.setattr(jax, "devices", _broken)),
     ],
 )
-def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
+def test_each_failed_check_names_its_problem(monkeypatch, what, words, patch):
     if what == "python":
         monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
     with monkeypatch.context() as change:
         patch(change)
-        (found,) = doctor._tried(CHECKS[what])
-    assert found.what == what and not found.fine and re.search(words, found.text), found.text
+        (finding,) = doctor.run_check(CHECKS[what])
+    assert finding.what == what, finding.text
+    assert not finding.fine, finding.text
+    assert re.search(words, finding.text), finding.text
 
 
 def _broken():
     raise RuntimeError("no such device")
 
 
-def test_an_old_driver_is_named_with_the_one_that_is_needed(monkeypatch):
+def test_an_old_driver_names_the_required_one(monkeypatch):
     answer = "NVIDIA H100, 81559, 1024, 535.1\nNVIDIA H100, 81559, 0, 580.65\n"
-    monkeypatch.setattr(doctor, "_NVIDIA", os.devnull)
+    monkeypatch.setattr(doctor, "NVIDIA_DEVICE", os.devnull)
     monkeypatch.setattr(
         subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 0, answer)
     )
-    found = {finding.what: finding for finding in doctor._gpu()}
-    assert not found["gpu 0"].fine and "driver 535.1: 580 or newer is needed" in found["gpu 0"].text
-    assert (
-        found["gpu 1"].fine and found["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
-    )
+    by_check = {finding.what: finding for finding in doctor.check_gpu()}
+    assert not by_check["gpu 0"].fine
+    assert "driver 535.1: 580 or newer is needed" in by_check["gpu 0"].text
+    assert by_check["gpu 1"].fine
+    assert by_check["gpu 1"].text == "NVIDIA H100, 80 GiB (0 used), driver 580.65"
 
 
-def test_certificates_are_looked_at(tmp_path):
-    (none,) = doctor._certificates(tmp_path)
-    assert not none.fine and "congrasp certs init" in none.text
+def test_certificates_near_their_expiry_are_reported(tmp_path):
+    (none,) = doctor.check_certificates(tmp_path)
+    assert not none.fine
+    assert "congrasp certs init" in none.text
     create_authority(tmp_path)
     issue(tmp_path, "actor", days=100.0)
     issue(tmp_path, "observer", days=3.0)
-    found = {finding.text.split(":")[0]: finding for finding in doctor._certificates(tmp_path)}
-    actor, observer = found["quickstart.actor.0"], found["quickstart.observer.0"]
-    assert actor.fine and not observer.fine and "issue --force" in observer.text
+    by_certificate = {
+        finding.text.split(":")[0]: finding for finding in doctor.check_certificates(tmp_path)
+    }
+    actor = by_certificate["quickstart.actor.0"]
+    observer = by_certificate["quickstart.observer.0"]
+    assert actor.fine
+    assert not observer.fine
+    assert "issue --force" in observer.text
 
 
-def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
+def test_learner_connection_and_clock_offset_are_checked(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
         hub = learner_hub(server, "r").hub
-        assert [finding.fine for finding in doctor._learner(endpoint, "r")] == [True, True]
+        assert [finding.fine for finding in doctor.check_learner(endpoint, "r")] == [True, True]
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})
-        _, clock = doctor._learner(endpoint, "r")
-        assert not clock.fine and clock.text.startswith(("+7.0", "+6.9"))
-        (other,) = doctor._learner(endpoint, "other")
-        assert not other.fine and "No response for congrasp/other/status" in other.text
-    (unreached,) = doctor._learner(endpoint, "r")
-    assert not unreached.fine and "Start the learner" in unreached.text
+        _, clock = doctor.check_learner(endpoint, "r")
+        assert not clock.fine
+        assert clock.text.startswith(("+7.0", "+6.9"))
+        (other,) = doctor.check_learner(endpoint, "other")
+        assert not other.fine
+        assert "No response for congrasp/other/status" in other.text
+    (unreached,) = doctor.check_learner(endpoint, "r")
+    assert not unreached.fine
+    assert "Start the learner" in unreached.text

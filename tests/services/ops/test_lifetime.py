@@ -67,7 +67,8 @@ def test_a_forced_end_takes_the_children_along():
         child = psutil.Process(int(pid))
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=20)
-    assert ready == "ready" and process.returncode == 143
+    assert ready == "ready"
+    assert process.returncode == 143
     if running := child.is_running() and child.status() != psutil.STATUS_ZOMBIE:
         child.kill()
     assert not running

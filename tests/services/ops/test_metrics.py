@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import errno
+import itertools
 import json
 import logging
 import os
@@ -57,31 +58,28 @@ def scrape(port: int) -> dict[tuple[str, ...], float]:
     """Samples by their name and the values of their labels."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as reply:
         families = text_string_to_metric_families(reply.read().decode())
-        return {
-            (one.name, *one.labels.values()): one.value
-            for family in families
-            for one in family.samples
-        }
+        samples = itertools.chain.from_iterable(family.samples for family in families)
+        return {(sample.name, *sample.labels.values()): sample.value for sample in samples}
 
 
 def test_a_learner_shows_its_status_and_its_last_update():
-    metrics, port = LearnerMetrics(lambda: STATUS), free_port()
+    metrics = LearnerMetrics(lambda: STATUS)
+    port = free_port()
     metrics.update({"episode/success": 0.5, "update_seconds": 0.25})
     with exposed(port, "127.0.0.1", metrics):
-        found = scrape(port)
-    assert found["congrasp_learner_version",] == 7 and found["congrasp_learner_ready",] == 1
-    assert found["congrasp_learner_rollouts_total", "consumed"] == 7
-    assert found["congrasp_learner_tickets_total", "granted"] == 9
+        scraped = scrape(port)
+    assert scraped["congrasp_learner_version",] == 7
+    assert scraped["congrasp_learner_ready",] == 1
+    assert scraped["congrasp_learner_rollouts_total", "consumed"] == 7
+    assert scraped["congrasp_learner_tickets_total", "granted"] == 9
     assert (
-        found["congrasp_learner_tickets_running",] + found["congrasp_learner_tickets_capacity",]
+        scraped["congrasp_learner_tickets_running",] + scraped["congrasp_learner_tickets_capacity",]
         == 4
     )
-    assert (
-        found["congrasp_learner_actor_lag", "a", "1"] == 1
-        and found["congrasp_learner_roles", "actor"] == 1
-    )
-    assert found["congrasp_learner_update", "episode/success"] == 0.5
-    assert found["process_resident_memory_bytes",] > 0
+    assert scraped["congrasp_learner_actor_lag", "a", "1"] == 1
+    assert scraped["congrasp_learner_roles", "actor"] == 1
+    assert scraped["congrasp_learner_update", "episode/success"] == 0.5
+    assert scraped["process_resident_memory_bytes",] > 0
 
 
 def test_a_learner_that_starts_is_not_ready():
@@ -94,16 +92,19 @@ def test_a_learner_that_starts_is_not_ready():
 
 
 def test_an_actor_shows_its_last_rollout():
-    metrics, port = ActorMetrics(), free_port()
+    metrics = ActorMetrics()
+    port = free_port()
     metrics.rollout({"version": 3.0, "rollouts": 12.0, "steps_per_second": 99.0})
     with exposed(port, "127.0.0.1", metrics):
-        found = scrape(port)
-    assert found["congrasp_actor_rollouts_total",] == 12 and found["congrasp_actor_version",] == 3
-    assert found["congrasp_actor_steps_per_second",] == 99
+        scraped = scrape(port)
+    assert scraped["congrasp_actor_rollouts_total",] == 12
+    assert scraped["congrasp_actor_version",] == 3
+    assert scraped["congrasp_actor_steps_per_second",] == 99
 
 
 def test_a_server_counts_answers_and_batches_from_many_threads():
-    metrics, port = ServerMetrics(), free_port()
+    metrics = ServerMetrics()
+    port = free_port()
     metrics.health = lambda: {"ready": True, "version": 5, "queue": 2}
 
     def answer(number):
@@ -114,20 +115,20 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
 
     with exposed(port, "127.0.0.1", metrics):
         together(answer, range(4))
-        found = scrape(port)
+        scraped = scrape(port)
     assert (
-        found["congrasp_policy_queries_total", "answered"]
+        scraped["congrasp_policy_queries_total", "answered"]
         == 400
-        == found["congrasp_policy_batch_bucket", "4.0"]
+        == scraped["congrasp_policy_batch_bucket", "4.0"]
     )
-    assert found["congrasp_policy_queries_total", "overloaded"] == 400
-    assert found["congrasp_policy_seconds_bucket", "0.003"] == 0
+    assert scraped["congrasp_policy_queries_total", "overloaded"] == 400
+    assert scraped["congrasp_policy_seconds_bucket", "0.003"] == 0
     assert (
-        found["congrasp_policy_seconds_bucket", "0.005"]
-        == found["congrasp_policy_seconds_count",]
+        scraped["congrasp_policy_seconds_bucket", "0.005"]
+        == scraped["congrasp_policy_seconds_count",]
         == 400
     )
-    assert found["congrasp_policy_version",] == 5
+    assert scraped["congrasp_policy_version",] == 5
 
 
 @contextlib.contextmanager
@@ -153,14 +154,15 @@ def role(*arguments):
 def scraped_until(port, condition):
     def look():
         with contextlib.suppress(OSError):
-            return found if condition(found := scrape(port)) else None
+            return metrics if condition(metrics := scrape(port)) else None
 
     return eventually(look, 0.1)
 
 
 @pytest.mark.timeout(240)
 def test_a_learner_and_an_actor_are_scraped(tmp_path):
-    endpoint, ports = f"tcp/127.0.0.1:{free_port()}", (free_port(), free_port())
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    ports = (free_port(), free_port())
     small = (
         "--network.hidden",
         "32",
@@ -185,33 +187,38 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
     )
     with (
         role(*learner, "--metrics-port", str(ports[0])),
-        role(*actor, "--metrics-port", str(ports[1])) as said,
+        role(*actor, "--metrics-port", str(ports[1])) as actor_output,
     ):
-        wanted = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
-        found = scraped_until(ports[0], lambda found: wanted.items() <= found.items())
-        assert found["congrasp_learner_counters_balanced",] == 1
+        expected = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
+        metrics = scraped_until(ports[0], lambda metrics: expected.items() <= metrics.items())
+        assert metrics["congrasp_learner_counters_balanced",] == 1
         # One rollout an update, for the next version and the one after it.
         assert (
-            found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",]
+            metrics["congrasp_learner_tickets_capacity",]
+            + metrics["congrasp_learner_tickets_running",]
             == 2
         )
         assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
     assert all(
-        line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said
+        line.keys() == {"time", "level", "role", "id", "run", "text", "fields"}
+        for line in actor_output
     )
-    assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
+    assert datetime.datetime.fromisoformat(actor_output[0]["time"]).tzinfo is datetime.UTC
     # On a busy machine notices come first that it still waits.
-    first = next(line for line in said if not line["text"].startswith("Waiting for"))
+    first = next(line for line in actor_output if not line["text"].startswith("Waiting for"))
     assert first["text"] == f"Connected to the learner at {endpoint}."
-    assert (first["role"], first["id"]) == ("actor", "worker")
+    assert first["role"] == "actor"
+    assert first["id"] == "worker"
 
 
 def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
         main(["actor", "--connect", "nonsense", "--log-format", "json"])
-    said = capfd.readouterr()
-    line = json.loads(said.out)
-    assert (end.value.code, line["level"], said.err) == (2, "error", "")
+    printed = capfd.readouterr()
+    line = json.loads(printed.out)
+    assert end.value.code == 2
+    assert line["level"] == "error"
+    assert printed.err == ""
     assert line["text"].startswith("'nonsense' is not an endpoint.")
     with pytest.raises(SystemExit):
         main(["grasp", "nowhere.obj"])
@@ -219,7 +226,7 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")
 
 
-def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
+def test_a_json_log_continues_after_an_error(capfd):
     @contextlib.contextmanager
     def outer():
         try:
@@ -229,7 +236,8 @@ def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
 
     with pytest.raises(CongraspError), outer(), logging_as("json", role="learner", id="0", run="r"):
         raise CongraspError("It is refused.")
-    assert log_error("It is refused.") and not log_error("It is refused.")
+    assert log_error("It is refused.")
+    assert not log_error("It is refused.")
     logging.getLogger("library").warning("after the log")
     lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     assert [(line["level"], line["text"]) for line in lines] == [

@@ -41,22 +41,26 @@ def endpoint():
             yield endpoint
 
 
-def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
+def test_status_lists_roles_and_counters(endpoint, capsys):
     assert Status(connect=endpoint, run="r", json=True)() == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["run"], found["version"], found["counters"]["accepted"]) == ("r", 0, 1)
-    assert [(role["role"], role["id"]) for role in found["roles"]] == [
+    state = json.loads(capsys.readouterr().out)
+    assert state["run"] == "r"
+    assert state["version"] == 0
+    assert state["counters"]["accepted"] == 1
+    assert [(role["role"], role["id"]) for role in state["roles"]] == [
         ("actor", "worker-7"),
         ("learner", "0"),
     ]
-    actor = found["roles"][0]
-    assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
-    assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
+    actor = state["roles"][0]
+    assert actor["rollouts"] == 1
+    assert actor["version"] == 0
+    assert actor["lag"] == 0
+    assert 0 < actor["steps_per_second"] == state["rates"]["steps_per_second"] <= 8
     assert Status(connect=endpoint, run="r")() == 0
     text = capsys.readouterr().out
-    assert (
-        "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
-    )
+    assert "worker-7" in text
+    assert "accepted" in text
+    assert "1 rollout(s) of at most 64 waiting" in text
 
 
 def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
@@ -66,15 +70,16 @@ def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     with listening(tmp_path / "run", endpoint):
         assert Status(tmp_path / "run", json=True)() == 0
         assert json.loads(capsys.readouterr().out)["roles"][0]["id"] == "worker-7"
-        page = View()._of_folder(tmp_path / "run")
+        page = View().of_folder(tmp_path / "run")
         assert page == View(connect=endpoint, run="r", recordings=tmp_path / "run")
     (tmp_path / "run" / POLICY_FILE).touch()
-    page = View()._of_folder(tmp_path / "run")
+    page = View().of_folder(tmp_path / "run")
     assert page == View(run="r", policy=tmp_path / "run" / POLICY_FILE, recordings=tmp_path / "run")
 
 
-def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
-    folder, other = tmp_path / "run", {"connect": "tcp/127.0.0.1:1"}
+def test_a_run_folder_excludes_other_options(tmp_path):
+    folder = tmp_path / "run"
+    other = {"connect": "tcp/127.0.0.1:1"}
     for command, named in (
         *((Status, named) for named in (other, {"run": "r"})),
         *(
@@ -91,9 +96,9 @@ def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
 
 def test_counters_that_do_not_add_up_are_named(endpoint):
     with ZenohTransport(connect=[endpoint]) as transport:
-        found = ask(transport, "r")
-    assert found["warnings"] == []
-    lost = copy.deepcopy(found)
+        state = ask(transport, "r")
+    assert state["warnings"] == []
+    lost = copy.deepcopy(state)
     lost["counters"]["accepted"] += 1
     (words,) = warnings(lost)
     assert (
@@ -105,7 +110,7 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
     assert words == "2 rollouts are counted as queued, but the queue holds 1."
 
 
-def test_watching_goes_on_until_it_is_interrupted(endpoint):
+def test_watching_continues_until_interrupted(endpoint):
     command = [sys.executable, "-m", "congrasp", "status", "--connect", endpoint, "--run", "r"]
     with subprocess.Popen(
         [*command, "--watch", "--every", "0.1", "--json"], stdout=subprocess.PIPE, text=True
@@ -113,7 +118,8 @@ def test_watching_goes_on_until_it_is_interrupted(endpoint):
         versions = [json.loads(process.stdout.readline())["version"] for _ in range(3)]
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=20)
-    assert versions == [0, 0, 0] and process.returncode == 130
+    assert versions == [0, 0, 0]
+    assert process.returncode == 130
 
 
 def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
@@ -121,33 +127,38 @@ def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
         Status(connect=endpoint, run="other")()
 
 
-def test_a_terminal_of_80_columns_shows_whole_names(endpoint):
+def test_names_fit_into_80_columns(endpoint):
     """A long name continues in the next line of its cell."""
-    found = ask_with_tokens(endpoint, 70)
-    role = {**found["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
+    state = ask_with_tokens(endpoint, 70)
+    role = {**state["roles"][0], "id": "node-17.cluster-12345", "incarnation": "f45e4ae5"}
     rates = {"version": 1234567, "rollouts": 12345678, "steps_per_second": 72900.5}
     named = {**role, **rates, "rollouts_per_second": 24.355}
     console = Console(file=io.StringIO(), width=80)
-    console.print(tables({**found, "roles": [named]}))
+    console.print(tables({**state, "roles": [named]}))
     text = console.file.getvalue()
-    assert "…" not in text and "f45e4ae5" in text
+    assert "…" not in text
+    assert "f45e4ae5" in text
     cells = [line.split("│")[2].strip() for line in text.splitlines() if line.count("│") == 9]
     assert "".join(cells) == "node-17.cluster-12345"
 
 
-def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):
+def test_unlisted_processes_are_counted_and_names_escaped(endpoint):
     """600 liveliness tokens of one certificate, some with names that a terminal or a table would
     take for more.
     """
-    found = ask_with_tokens(endpoint, 600)
-    assert len(found["roles"]) == 66 and found["unlisted"] == 600 - 64
-    assert any(role["id"] == "worker-7" for role in found["roles"])
-    named = {**found["roles"][0], "id": "[red]\x1b[2J[/nonsense]" * 10, "refused": 3}
+    state = ask_with_tokens(endpoint, 600)
+    assert len(state["roles"]) == 66
+    assert state["unlisted"] == 600 - 64
+    assert any(role["id"] == "worker-7" for role in state["roles"])
+    named = {**state["roles"][0], "id": "[red]\x1b[2J[/nonsense]" * 10, "refused": 3}
     console = Console(file=io.StringIO(), width=200)
-    console.print(tables({**found, "roles": [named] * 150}))
+    console.print(tables({**state, "roles": [named] * 150}))
     text = console.file.getvalue()
-    assert "[red]" in text and "\x1b" not in text and "refused" in text and len(text) < 50_000
-    assert f"{50 + found['unlisted']} more live process(es)" in text
+    assert "[red]" in text
+    assert "\x1b" not in text
+    assert "refused" in text
+    assert len(text) < 50_000
+    assert f"{50 + state['unlisted']} more live process(es)" in text
 
 
 def ask_with_tokens(endpoint, count):

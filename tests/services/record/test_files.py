@@ -3,6 +3,7 @@
 import errno
 import functools
 import io
+import itertools
 import json
 import pathlib
 import struct
@@ -68,14 +69,15 @@ doctor = functools.partial(python, "-m", "pymcap_cli.cli", "doctor", env={"COLUM
 """Runs `pymcap-cli doctor`."""
 
 
-def test_a_finished_file_is_sound_and_says_what_its_numbers_mean(tmp_path: pathlib.Path) -> None:
+def test_a_finished_file_is_sound_and_describes_its_fields(tmp_path: pathlib.Path) -> None:
     raw = Entry(
         opaque_channel("/rollout/a", "congrasp.Rollout"),
         5,
         encode(Message({"x": np.arange(3)}, {})),
     )
     (path,) = write(tmp_path, [*metric_entries(20), raw])
-    assert path.suffix == ".mcap" and is_complete(path)
+    assert path.suffix == ".mcap"
+    assert is_complete(path)
     checked = doctor(path)
     assert checked.returncode == 0, checked.stdout
     assert "passed" in checked.stdout
@@ -112,12 +114,11 @@ def test_rotation_by_age_and_by_size_keeps_everything(tmp_path: pathlib.Path) ->
     entries = [Entry(blob, i, noise.bytes(1 << 20)) for i in range(6)]
     by_size = write(tmp_path / "size", entries, max_bytes=2 << 20)
     assert len(by_size) >= 2
-    assert [r.data for path in log_files(tmp_path / "size") for r in read_records(path)] == [
-        e.data for e in entries
-    ]
+    records = itertools.chain(*map(read_records, log_files(tmp_path / "size")))
+    assert [record.data for record in records] == [entry.data for entry in entries]
 
 
-def test_what_belongs_together_is_not_split_over_files(tmp_path: pathlib.Path) -> None:
+def test_entries_written_together_are_in_one_file(tmp_path: pathlib.Path) -> None:
     writer = LogWriter(tmp_path, "log", max_seconds=2.5)
     writer.write(*metric_entries(10))
     writer.write(*metric_entries(3, start=10))
@@ -127,7 +128,8 @@ def test_what_belongs_together_is_not_split_over_files(tmp_path: pathlib.Path) -
 
 def test_writers_in_one_folder_leave_each_others_files_alone(tmp_path: pathlib.Path) -> None:
     """Two at once, and two more in the same second after them."""
-    first, second = LogWriter(tmp_path, "log"), LogWriter(tmp_path, "log")
+    first = LogWriter(tmp_path, "log")
+    second = LogWriter(tmp_path, "log")
     for count, writer in ((1, first), (2, second)):
         writer.write(*metric_entries(count))
     first.close()
@@ -138,9 +140,8 @@ def test_writers_in_one_folder_leave_each_others_files_alone(tmp_path: pathlib.P
         *write(tmp_path, metric_entries(3)),
         *write(tmp_path, metric_entries(4)),
     ]
-    assert [len(updates(path)) for path in files] == [1, 2, 3, 4] and sorted(
-        tmp_path.iterdir()
-    ) == sorted(files)
+    assert [len(updates(path)) for path in files] == [1, 2, 3, 4]
+    assert sorted(tmp_path.iterdir()) == sorted(files)
 
 
 @settings(max_examples=30, deadline=None)
@@ -149,8 +150,9 @@ def test_a_file_cut_anywhere_gives_a_beginning(
     tmp_path_factory: pytest.TempPathFactory, share: float
 ) -> None:
     path, _ = flushed_file(tmp_path_factory.mktemp("cut"))
-    whole, cut = path.read_bytes(), path.with_name("cut.mcap.part")
-    cut.write_bytes(whole[: round(share * len(whole))])
+    data = path.read_bytes()
+    cut = path.with_name("cut.mcap.part")
+    cut.write_bytes(data[: round(share * len(data))])
     read = updates(cut)
     assert read == [*range(len(read))]
 
@@ -186,7 +188,7 @@ def test_a_full_disk_is_an_error_and_keeps_what_was_flushed(tmp_path: pathlib.Pa
     assert updates(log_files(tmp_path)[0])[: flushed + 1] == [*range(flushed + 1)]
 
 
-def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
+def test_another_kind_of_file_is_refused(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match="no recording"):
         log_files(tmp_path)
     (tmp_path / "a.mcap").write_text("a text")
@@ -218,50 +220,53 @@ def flushed_file(
 
 @pytest.mark.parametrize("damaged", [0, 2, 4])
 @pytest.mark.parametrize("at", [-5, 32], ids=["contents", "uncompressed size"])
-def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_path, damaged, at):
+def test_reading_continues_after_a_damaged_chunk(tmp_path, damaged, at):
     path, chunks = flushed_file(tmp_path)
-    data, (start, length) = bytearray(path.read_bytes()), chunks[damaged]
+    data = bytearray(path.read_bytes())
+    start, length = chunks[damaged]
     data[start + at % length] ^= 4
     path.write_bytes(data)
-    said: list[str] = []
-    records = list(read_records(path, warn=said.append))
+    notes: list[str] = []
+    records = list(read_records(path, warn=notes.append))
     read = [json.loads(record.data)["update"] for record in records]
     assert read == [i for i in range(15) if i // 3 != damaged]
     assert {(record.topic, record.schema) for record in records} == {
         ("/metrics/learner/0", records[0].schema)
     }
     places = f"damaged in 1 place(s), at byte {start}; at least 3 message(s) were dropped."
-    assert said == [f"{path} is {places}"]
+    assert notes == [f"{path} is {places}"]
 
 
-def test_what_was_dropped_is_warned_of_by_default(
+def test_dropped_chunks_are_warned_of_by_default(
     tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path, ((start, length), *_) = flushed_file(tmp_path)
-    assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 15 and not caplog.messages
+    assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 15
+    assert not caplog.messages
     data = path.read_bytes()
     path.write_bytes(data[: start + 9] + bytes(length) + data[start + 9 + length :])
     assert len(read_metrics(tmp_path)["learner/0/kl"][0]) == 12
-    assert len(caplog.messages) == 1 and "damaged in 1 place(s)" in caplog.messages[0]
+    assert len(caplog.messages) == 1
+    assert "damaged in 1 place(s)" in caplog.messages[0]
 
 
 @settings(max_examples=150, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
-    tmp_path_factory, place, bit
-):
+def test_a_flipped_bit_costs_at_most_one_chunk_with_a_note(tmp_path_factory, place, bit):
     folder = tmp_path_factory.mktemp("flip")
     path, _ = flushed_file(folder)
     data = bytearray(path.read_bytes())
     at = 8 + int(place * (len(data) - 8))
     data[at] ^= 1 << bit
     path.write_bytes(data)
-    said: list[str] = []
-    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
+    notes: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=notes.append)]
     missing = sorted(set(range(15)) - set(read))
-    assert read == sorted(set(read)) and len(missing) in (0, 3)
+    assert read == sorted(set(read))
+    assert len(missing) in (0, 3)
     assert not missing or (missing[0] % 3 == 0 and missing[-1] - missing[0] == 2)
-    assert bool(missing) <= bool(said) and len(said) <= 1
+    assert bool(missing) <= bool(notes)
+    assert len(notes) <= 1
 
 
 @settings(max_examples=60, deadline=None)
@@ -279,9 +284,11 @@ def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(tmp_path_factory, 
         at = 8 + int(place * (len(data) - 8))
         data = data[:at] + content + data[at + replaced :]
     path.write_bytes(data)
-    said: list[str] = []
-    read = [json.loads(record.data)["update"] for record in read_records(path, warn=said.append)]
-    assert read == sorted(set(read)) and set(read) <= set(range(15)) and len(said) <= 1
+    notes: list[str] = []
+    read = [json.loads(record.data)["update"] for record in read_records(path, warn=notes.append)]
+    assert read == sorted(set(read))
+    assert set(read) <= set(range(15))
+    assert len(notes) <= 1
 
 
 def compressed_file(
@@ -324,7 +331,8 @@ def test_a_damaged_chunk_of_any_compression_is_dropped(tmp_path, compression):
     notices: list[str] = []
     records = list(read_records(path, warn=notices.append))
     assert 20 < len(records) < 30
-    assert len(notices) == 1 and "damaged in 1 place" in notices[0]
+    assert len(notices) == 1
+    assert "damaged in 1 place" in notices[0]
 
 
 def notices_of(path: pathlib.Path) -> list[str]:
@@ -391,7 +399,9 @@ def test_a_file_without_its_end_is_named(tmp_path, compression, reader, caplog):
     READERS[reader](path)
     assert len(caplog.messages) == 1
     line = caplog.messages[0]
-    assert str(path) in line and "not finished" in line and " s or more may be missing" in line
+    assert str(path) in line
+    assert "not finished" in line
+    assert " s or more may be missing" in line
 
 
 def test_the_seconds_of_a_cut_chunk_are_counted(tmp_path):
@@ -403,4 +413,5 @@ def test_the_seconds_of_a_cut_chunk_are_counted(tmp_path):
     notices: list[str] = []
     list(read_records(path, warn=notices.append))
     lost = (second.message_end_time - chunks[0].message_end_time) / SECOND
-    assert lost > 2 and f"{lost:.1f} s" in notices[0]
+    assert lost > 2
+    assert f"{lost:.1f} s" in notices[0]

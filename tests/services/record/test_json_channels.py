@@ -47,7 +47,8 @@ def test_schema_grows_with_new_fields_and_keeps_the_old() -> None:
             "name": {"type": "string"},
         },
     }
-    assert grown.topic == first.topic and grown.schema_name == first.schema_name
+    assert grown.topic == first.topic
+    assert grown.schema_name == first.schema_name
 
 
 def test_topics_have_schemas_of_their_own() -> None:

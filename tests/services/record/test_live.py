@@ -58,8 +58,8 @@ class Viewer:
                 self._subscribe(list(self.advertised.values()))
 
     def _subscribe(self, channels: list[dict[str, str]]) -> None:
-        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        subscriptions = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
     def latest(self, topic: str) -> int:
         """Value of the field `number` of the last message."""
@@ -81,7 +81,8 @@ def viewer(server: LiveServer, max_queue: int = 16) -> ClientConnection:
 
 
 def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.Path) -> None:
-    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    transport = MemoryTransport(MemoryHub())
+    keys = Keys("r")
     with (
         LiveServer(0) as server,
         Recorder(transport, "r", tmp_path, sinks=[server]) as recorder,
@@ -101,18 +102,21 @@ def test_a_recorders_channels_reach_a_viewer_while_it_records(tmp_path: pathlib.
             transport.publish(keys.log("episode", "actor", "a0"), episode_message(150))
             seen.listen(3.0)
         seen.wait_for("/episode/a0/scene", 1)
-    assert recorder.error == "" and recorder.files[0].suffix == ".mcap"
+    assert recorder.error == ""
+    assert recorder.files[0].suffix == ".mcap"
     payload = json.loads(seen.frames["/metrics/learner/0"][-1][1])
     assert payload["values"] == {"kl": 0.5}
     channel = seen.advertised["/metrics/learner/0"]
-    assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+    assert channel["encoding"] == "json"
+    assert channel["schemaEncoding"] == "jsonschema"
     assert seen.advertised["/episode/a0/tf"]["schemaName"] == "foxglove.FrameTransforms"
     stamps = [stamp for stamp, _ in seen.frames["/episode/a0/tf"]]
     assert {round((b - a) / 1e9 / CONTROL_DT) for a, b in itertools.pairwise(stamps)} == {1}
 
 
 def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathlib.Path) -> None:
-    transport, keys = MemoryTransport(MemoryHub()), Keys("r")
+    transport = MemoryTransport(MemoryHub())
+    keys = Keys("r")
     with LiveServer(0) as server, Recorder(transport, "r", None, sinks=[server]):
         channel = JsonChannels()
         server.write(channel.entry("/late", time.time_ns() + 3600 * 10**9, {"a": 1}))
@@ -129,7 +133,8 @@ def test_entries_wait_for_their_time_and_newcomers_get_the_scene(tmp_path: pathl
 
 def test_a_schema_that_grows_replaces_its_channel() -> None:
     with LiveServer(0) as server, viewer(server) as socket:
-        seen, channels = Viewer(socket), JsonChannels()
+        seen = Viewer(socket)
+        channels = JsonChannels()
         for fields in ({"a": 1}, {"a": 1, "b": 2}):
             for _ in range(400):
                 server.write(channels.entry("/m", time.time_ns(), fields))
@@ -173,7 +178,7 @@ def test_other_sites_in_a_browser_cannot_watch(headers: dict[str, str], admitted
     assert answer.startswith("HTTP/1.1 101 " if admitted else "HTTP/1.1 403 ")
 
 
-def test_a_busy_port_is_said_in_words() -> None:
+def test_a_busy_port_is_one_line() -> None:
     with (
         LiveServer(0) as server,
         pytest.raises(CongraspError, match=f"cannot listen on 127.0.0.1:{server.port}"),
@@ -223,7 +228,7 @@ def test_viewer_of_another_address_is_admitted_when_full() -> None:
 
 def test_viewer_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits for it is limited, and another viewer misses nothing."""
-    monkeypatch.setattr("congrasp.services.record.live_gate._UNREAD_S", 1.0)
+    monkeypatch.setattr("congrasp.services.record.live_gate.UNREAD_S", 1.0)
     entries = 48
     text = "x" * (1 << 20)
     channels = JsonChannels()

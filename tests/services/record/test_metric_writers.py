@@ -1,5 +1,6 @@
 """Metrics of a learner on TensorBoard and Weights & Biases, as their own readers find them."""
 
+import itertools
 import pathlib
 import struct
 from collections.abc import Sequence
@@ -20,7 +21,9 @@ from tests.episodes import episode_message
 
 def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
     """A run of which a learner, an actor and an episode are recorded."""
-    keys, config, logs = Keys("r"), RunConfig(name="r"), folder / "logs"
+    keys = Keys("r")
+    config = RunConfig(name="r")
+    logs = folder / "logs"
     with (
         MemoryTransport(MemoryHub()) as transport,
         recorded(transport, config, folder, logs, names) as running,
@@ -42,15 +45,16 @@ def events(folder: pathlib.Path) -> list[list[Event]]:
     """What is in each event file, by the framing that TensorFlow documents: length, its CRC, data,
     its CRC.
     """
-    found = []
+    all_events = []
     for path in sorted(folder.iterdir()):
-        data, at = path.read_bytes(), 0
-        found.append([])
+        data = path.read_bytes()
+        at = 0
+        all_events.append([])
         while at < len(data):
             (length,) = struct.unpack_from("<Q", data, at)
-            found[-1].append(Event.FromString(data[at + 12 : at + 12 + length]))
+            all_events[-1].append(Event.FromString(data[at + 12 : at + 12 + length]))
             at += 16 + length
-    return found
+    return all_events
 
 
 def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
@@ -60,17 +64,20 @@ def test_tensorboard_has_the_learners_metrics_and_a_resumed_run_replaces_them(
     assert [path.name for path in (tmp_path / "tensorboard").iterdir()] == ["learner-0"]
     (first,) = events(tmp_path / "tensorboard" / "learner-0")
     assert first[0].file_version == "brain.Event:2"
-    scalars = {(e.step, v.tag): v.simple_value for e in first for v in e.summary.value}
-    assert set(scalars) == {
-        (update, tag) for update in range(5) for tag in ("episode/success", "kl")
-    }
+    scalars = {}
+    for event in first:
+        for value in event.summary.value:
+            scalars[event.step, value.tag] = value.simple_value
+    assert set(scalars) == set(itertools.product(range(5), ("episode/success", "kl")))
     assert scalars[3, "episode/success"] == pytest.approx(0.3)
-    assert (first[1].step, first[1].session_log.status) == (0, SessionLog.START)
+    assert first[1].step == 0
+    assert first[1].session_log.status == SessionLog.START
     publish(tmp_path, ["tensorboard"], range(3, 6))
     second = [
-        found for found in events(tmp_path / "tensorboard" / "learner-0") if found[1].step == 3
+        event for event in events(tmp_path / "tensorboard" / "learner-0") if event[1].step == 3
     ]
-    assert len(second) == 1 and second[0][1].session_log.status == SessionLog.START
+    assert len(second) == 1
+    assert second[0][1].session_log.status == SessionLog.START
     # The MCAP has the same, whatever the writer does.
     np.testing.assert_array_equal(read_metrics(tmp_path / "logs")["learner/0/kl"][0], range(6))
 
@@ -84,11 +91,12 @@ def test_weights_and_biases_offline(
     data = file.read_bytes()
     for text in (b"episode/success", b"kl", b"congrasp", b"0.25", b"environments"):
         assert text in data, text
-    assert data.count(b"episode/success") >= 3 and b"pace" not in data
+    assert data.count(b"episode/success") >= 3
+    assert b"pace" not in data
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, monkeypatch, capsys):
+def test_a_failing_metric_writer_does_not_stop_the_recording(tmp_path, monkeypatch, capsys):
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 

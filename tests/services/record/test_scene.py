@@ -76,7 +76,8 @@ def test_capsules_lie_in_their_links_frames(entries: list[Entry]) -> None:
     entities = {e.id: e for e in SceneUpdate.FromString(entry.data).entities}
     for link in HAND.links:
         entity = entities[f"hand/{link.name}"]
-        assert entity.frame_id == f"a0/{link.name}" and entity.frame_locked
+        assert entity.frame_id == f"a0/{link.name}"
+        assert entity.frame_locked
         assert len(entity.cylinders) == len(link.capsules)
         for cylinder, capsule in zip(entity.cylinders, link.capsules, strict=True):
             along = Rotation.from_quat(
@@ -146,7 +147,8 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
         [raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1
     )
     np.testing.assert_array_equal(points, arrays["surface_points"])
-    red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
+    red = raw[:, offsets["red"]].astype(int)
+    green = raw[:, offsets["green"]].astype(int)
     np.testing.assert_array_equal(red > green, arrays["surface_avoid"])
 
 
@@ -169,42 +171,44 @@ def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entr
     for link, parts in zip(HAND.links, surface_parts(HAND), strict=True):
         (entry,) = of(entries, f"hand/{link.name}")
         cloud = PointCloud.FromString(entry.data)
-        assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
+        assert cloud.frame_id == f"a0/{link.name}"
+        assert entry.channel.latched
         raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
         points = raw[:, :12].copy().view("<f4")
         corners = np.concatenate([part.points[part.faces] for part in parts])
         assert max(above(corners, point) for point in points[::20].astype(float)) < 1e-6
         assert np.linalg.norm(np.ptp(points, axis=0)) > 0.01
         colours = {tuple(np.multiply(part.colour, 255).astype(int)) for part in parts}
-        assert set(map(tuple, raw[:, 12:15])) == colours and (raw[:, 15] == 255).all()
+        assert set(map(tuple, raw[:, 12:15])) == colours
+        assert (raw[:, 15] == 255).all()
         count += len(points)
     assert 2000 < count < 2100
 
 
-def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
+def test_an_independent_reader_finds_the_skin_in_place(
     tmp_path: Path,
 ) -> None:
     """The messages' classes come from the file, and the turn is a quaternion's by the textbook."""
-    step, k = 9, [link.name for link in HAND.links].index("thumb_distal")
+    step = 9
+    k = [link.name for link in HAND.links].index("thumb_distal")
     writer = LogWriter(tmp_path, "log")
     writer.write(*Converter()(KEY, episode_message(), START))
     writer.close()
     with writer.files[0].open("rb") as file:
-        found = [
+        drawn = [
             (channel.topic, message)
             for _, channel, _, message in make_reader(
                 file, decoder_factories=[DecoderFactory()]
             ).iter_decoded_messages(["/episode/a0/tf", "/episode/a0/scene"])
         ]
-    (scene,) = [message for topic, message in found if topic.endswith("scene")]
-    frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
+    (scene,) = [message for topic, message in drawn if topic.endswith("scene")]
+    frame = [message for topic, message in drawn if topic.endswith("tf")][step].transforms[k + 1]
     (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
-    assert (
-        frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
-        and frame.parent_frame_id == "a0"
-    )
+    assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal"
+    assert frame.parent_frame_id == "a0"
     mesh, nail = entity.triangles
-    w, axis = frame.rotation.w, vector(frame.rotation)
+    w = frame.rotation.w
+    axis = vector(frame.rotation)
     local = np.array([vector(point) for point in [*mesh.points, *nail.points]])
     world = (
         local
@@ -212,12 +216,13 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
         + 2 * np.cross(axis, np.cross(axis, local))
         + vector(frame.translation)
     )
-    arrays, skin = episode_message().arrays, skin_of(HAND)
+    arrays = episode_message().arrays
+    skin = skin_of(HAND)
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True).as_matrix()
     posed = skin.posed(arrays["link_position"][step], turns)[0]
-    own = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
-    assert len(own) > 3
-    assert cKDTree(world).query(own)[0].max() < 1e-4
+    of_link = posed[skin.weights[:, k] > 0.999]  # what moves with this link alone
+    assert len(of_link) > 3
+    assert cKDTree(world).query(of_link)[0].max() < 1e-4
     corners = world[np.array(mesh.indices).reshape(-1, 3)]
     middle = world.mean(0)
     outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -230,20 +235,21 @@ def test_a_recording_holds_the_hand_once_and_small(entries: list[Entry]) -> None
     hand = sum(entity.ByteSize() for entity in scene.entities if entity.id.startswith("hand/"))
     one_frame = len(skin_of(HAND).points) * 3 * 9  # three doubles and their tags
     assert hand < 3 * one_frame
-    assert not any(
-        e.id.startswith("hand/")
-        for x in of(entries, "contacts")
-        for e in SceneUpdate.FromString(x.data).entities
-    )
+    for entry in of(entries, "contacts"):
+        update = SceneUpdate.FromString(entry.data)
+        assert not any(entity.id.startswith("hand/") for entity in update.entities)
+
+
+def entities_of(update):
+    """Entities of an update of the scene, by their names."""
+    return {entity.id: entity for entity in update.entities}
 
 
 def test_table_and_forces_are_drawn_while_they_last(entries: list[Entry]) -> None:
     updates = [SceneUpdate.FromString(entry.data) for entry in of(entries, "contacts")]
-    has_table = [any(e.id == "table" for e in update.entities) for update in updates]
+    has_table = ["table" in entities_of(update) for update in updates]
     assert has_table == [True] * 8 + [False] * 4
-    arrows = [
-        len(next(e for e in update.entities if e.id == "forces").arrows) for update in updates
-    ]
+    arrows = [len(entities_of(update)["forces"].arrows) for update in updates]
     assert arrows == [0] * 6 + [5] * 6
     for update in updates:
         assert all(
@@ -258,8 +264,10 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
     assert last["reward"] == pytest.approx(
         {"contact": 0.5, "distance": -0.1, "total": 0.4}, abs=1e-6
     )
-    assert last["force"]["thumb_distal"] == pytest.approx(FORCE) and last["force"]["palm"] == 0
-    assert last["links_in_contact"] == 5 and last["table"] is False
+    assert last["force"]["thumb_distal"] == pytest.approx(FORCE)
+    assert last["force"]["palm"] == 0
+    assert last["links_in_contact"] == 5
+    assert last["table"] is False
     assert list(last["q"]) == [joint.name for joint in HAND.joints]
     index = [joint.name for joint in HAND.joints].index("index_pip")
     assert last["q"]["index_pip"] == pytest.approx(float(episode_message().arrays["q"][-1, index]))
@@ -267,60 +275,60 @@ def test_signals_of_a_step(entries: list[Entry]) -> None:
 
 def test_the_raw_episode_is_kept_whole(entries: list[Entry]) -> None:
     (entry,) = of(entries, "raw")
-    kept, sent = decode(entry.data), episode_message()
-    assert kept.meta == sent.meta
-    assert all(np.array_equal(kept.arrays[name], sent.arrays[name]) for name in sent.arrays)
+    recorded = decode(entry.data)
+    sent = episode_message()
+    assert recorded.meta == sent.meta
+    assert all(np.array_equal(recorded.arrays[name], sent.arrays[name]) for name in sent.arrays)
 
 
 def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side() -> None:
     convert = Converter()
-    first, second = (
-        convert(KEY, episode_message(), START),
-        convert(KEY, episode_message(), START + 1),
-    )
+    first = convert(KEY, episode_message(), START)
+    second = convert(KEY, episode_message(), START + 1)
     assert min(e.time for e in second) > max(e.time for e in first)
     other = convert("congrasp/run/log/episode/actor/b", episode_message(), START)
-    transforms = [
-        FrameTransforms.FromString(next(e for e in es if e.channel.topic.endswith("/tf")).data)
-        for es in (first, other)
-    ]
-    places = [
-        next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x
-        for tf in transforms
-    ]
+
+    def place(entries):
+        entry = next(entry for entry in entries if entry.channel.topic.endswith("/tf"))
+        transforms = FrameTransforms.FromString(entry.data).transforms
+        in_world = next(frame for frame in transforms if frame.parent_frame_id == "world")
+        return in_world.translation.x
+
+    places = [place(first), place(other)]
     assert places == [0.0, pytest.approx(SPACING_M)]
 
 
 def test_a_clock_that_is_set_back_drops_no_episode() -> None:
-    convert, day = Converter(), 86_400_000_000_000
+    convert = Converter()
+    day = 86_400_000_000_000
     first = convert(KEY, episode_message(), START)
     left = max(entry.time for entry in first) - START
     times = [entry.time for entry in convert(KEY, episode_message(), START - day)]
     assert left < min(times) - (START - day) < 2 * left
 
 
-def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
-    whole = episode_message()
+def test_invalid_colours_and_paths_as_names_are_refused(tmp_path):
+    message = episode_message()
     colours = {
         "colour_points": np.zeros((2, 3), np.float32),
         "colour_values": np.zeros((2, 3), np.uint8),
     }
-    Episode.from_message(Message(whole.arrays | colours, whole.meta))
+    Episode.from_message(Message(message.arrays | colours, message.meta))
     for name in colours:
         with pytest.raises(
             CongraspError, match="colour_points without colour_values, or the reverse"
         ):
-            Episode.from_message(Message(whole.arrays | {name: colours[name]}, whole.meta))
+            Episode.from_message(Message(message.arrays | {name: colours[name]}, message.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
-        Episode.from_message(Message(whole.arrays | far, whole.meta))
-    evil = Episode.from_message(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
+        Episode.from_message(Message(message.arrays | far, message.meta))
+    evil = Episode.from_message(Message(message.arrays, {**message.meta, "object": "../evil"}))
     with pytest.raises(CongraspError, match="object of a motion"):
         save_motion(tmp_path / "motion.npz", evil)
     with pytest.raises(CongraspError, match="object of a motion"):
         default_name(evil, "glb")
     motion = dataclasses.replace(
-        Episode.from_message(whole).normalised(),
+        Episode.from_message(message).normalised(),
         colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)),
     )
     save_motion(tmp_path / "motion.npz", motion)

@@ -44,7 +44,7 @@ def running(batcher, gate):
     return answer
 
 
-def test_a_batch_holds_what_weighs_no_more_than_its_size(gate):
+def test_a_batch_is_limited_by_weight(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=10, weigh=lambda item: item)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(weight, 10.0) for weight in (3, 1, 2, 4, 1, 1)]
@@ -65,7 +65,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher.close()
 
 
-def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
+def test_peers_take_turns_and_a_flooding_peer_is_refused(gate):
     batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0, peer=Peer("greedy")) for i in (1, 2, 3)]
@@ -86,7 +86,7 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
 @pytest.fixture
 def several(monkeypatch):
     """However long ago another peer has asked, it counts."""
-    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6)
+    monkeypatch.setattr("congrasp.services.serve.batching.ALONE_S", 1e6)
 
 
 class Letters(Gate):
@@ -106,7 +106,8 @@ class Letters(Gate):
 
     def run(self, *items):
         """Submits (peer, item) while the first is held back; their futures."""
-        batcher, first = self.batcher(), Future()
+        batcher = self.batcher()
+        first = Future()
         (peer, item), *rest = items
         threading.Thread(
             target=lambda: first.set_result(batcher.submit(item, 10.0, Peer(peer))), daemon=True
@@ -131,9 +132,10 @@ class Letters(Gate):
     ],
 )
 def test_peers_share_a_batch_however_long_their_items_are(several, items, batches):
-    gate, asked = Letters(), [item.split(":") for item in items.split()]
-    futures, batcher = gate.run(*asked)
-    assert [future.result(10) for future in futures] == [item.upper() for _, item in asked]
+    gate = Letters()
+    queries = [item.split(":") for item in items.split()]
+    futures, batcher = gate.run(*queries)
+    assert [future.result(10) for future in futures] == [item.upper() for _, item in queries]
     assert gate.batches == batches
     batcher.close()
 
@@ -158,7 +160,8 @@ def test_an_item_of_which_a_part_fails_is_run_no_further(several):
 def test_a_query_whose_deadline_passed_is_not_computed(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=4)
     running(batcher, gate)
-    late, patient = batcher.submit(1, 0.001), batcher.submit(2, 10.0)
+    late = batcher.submit(1, 0.001)
+    patient = batcher.submit(2, 10.0)
     time.sleep(0.02)
     gate.go.set()
     assert patient.result(10) == 20
@@ -169,7 +172,8 @@ def test_a_query_whose_deadline_passed_is_not_computed(gate):
 
 
 def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
-    threads, go = [], threading.Event()
+    threads = []
+    go = threading.Event()
 
     def run(items, queued):
         threads.append(threading.get_ident())
@@ -186,7 +190,9 @@ def test_a_lone_item_runs_in_its_callers_thread_and_a_crowd_in_another():
     crowd = [batcher.submit(i, 10.0) for i in (3, 4)]
     go.set()
     assert [future.result(10) for future in (held.result(10), *crowd)] == [2, 3, 4]
-    assert threads[0] == alone and threads[2] not in (alone, threads[1]) and len(threads) == 3
+    assert threads[0] == alone
+    assert threads[2] not in (alone, threads[1])
+    assert len(threads) == 3
     batcher.close()
     pool.shutdown()
 
@@ -205,7 +211,7 @@ def test_a_failure_reaches_its_own_batch_alone():
     batcher.close()
 
 
-def test_closing_refuses_what_waits_and_what_comes(gate):
+def test_closing_refuses_waiting_and_new_items(gate):
     batcher = Batcher(gate, size=1, window=0.0, depth=4)
     first = running(batcher, gate)
     waiting = batcher.submit(1, 10.0)

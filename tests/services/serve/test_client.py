@@ -85,7 +85,9 @@ def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     server.close()
     first, second, third = server.fields
     assert server.described == 1
-    assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
+    assert answer.version == 3
+    assert answer.active == ("words",)
+    assert answer.server_ms == 0.5
     np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
     np.testing.assert_allclose(first["q_target"], REQUEST.q, rtol=1e-6)
     np.testing.assert_array_equal(second["q_target"], np.full(20, 1.0))
@@ -96,7 +98,7 @@ def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     np.testing.assert_allclose(second["q_initial"], REQUEST.q, rtol=1e-6)
 
 
-def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
+def test_the_client_reconnects_to_a_restarted_server(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
         client.reset(REQUEST)
@@ -122,7 +124,8 @@ def test_the_layout_is_requested_again_when_another_server_has_another_one(endpo
         server = CannedServer(endpoint, points=3)
         eventually(lambda: answered(client))
         client.act(STATE)
-        assert server.described == 1 and server.fields[1]["surface_points"].shape == (3, 3)
+        assert server.described == 1
+        assert server.fields[1]["surface_points"].shape == (3, 3)
         assert [float(fields["time"]) for fields in server.fields] == [2.0, 3.0]
     server.close()
 
@@ -141,6 +144,6 @@ def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
     server.close()
 
 
-def test_nobody_there_is_said_in_one_line(endpoint):
+def test_a_missing_server_is_one_line(endpoint):
     with pytest.raises(TransportError, match="No response from"):
         PolicyClient(endpoint, wait=0.5)

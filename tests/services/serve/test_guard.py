@@ -14,8 +14,9 @@ from congrasp.common.request import GraspRequest
 from congrasp.services.client.guard import Guard
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer
+from congrasp.services.client.query_thread import QueryThread
 from congrasp.services.client.ticker import Ticker
-from tests.waits import Clock
+from tests.waits import Clock, eventually
 
 FINGERS = 2
 OPEN = np.array([0.3, -0.3])
@@ -43,7 +44,9 @@ class ScriptedPolicy:
     """
 
     def __init__(self, outcome):
-        self.outcome, self.states, self.requests = outcome, [], []
+        self.outcome = outcome
+        self.states = []
+        self.requests = []
 
     def reset(self, request):
         self.requests.append(request)
@@ -75,29 +78,30 @@ def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):
 
 
 def test_answers_are_followed_from_the_targets_that_were_commanded():
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.9, 0.9])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.9, 0.9])))
     with guarded(policy, clock) as guard:
         first = guard.step(STATE)
         clock.now += 0.01
         second = guard.step(STATE)
-    assert first.mode == second.mode == "follow" and second.answer is policy.outcome
+    assert first.mode == second.mode == "follow"
+    assert second.answer is policy.outcome
     # 1 N.m over 2 N.m/rad ahead of the joint; its limit
     np.testing.assert_allclose(first.q_target, [0.5, 0.4])
     np.testing.assert_allclose(first.q_torque, [1.0, 0.8])
     np.testing.assert_array_equal(policy.states[0]["q_target"], np.zeros(FINGERS))
     np.testing.assert_array_equal(policy.states[1]["q_target"], first.q_target)
     assert policy.requests == [REQUEST]
-    assert guard.counters.follow == guard.counters.answers == 2 and guard.counters.position == 2
+    assert guard.counters.follow == guard.counters.answers == 2
+    assert guard.counters.position == 2
 
 
 def test_velocities_that_are_not_measured_are_estimated_from_positions():
     """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m
     being its gain.
     """
-    clock, policy = (
-        Clock(100.0),
-        ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0]))),
-    )
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
     limits = dataclasses.replace(
         LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0)
     )
@@ -127,7 +131,8 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
 
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
 def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episode(fallback):
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback=fallback) as guard:
         guard.step(STATE)
         policy.outcome = TransportError("Nobody is there.")
@@ -144,12 +149,14 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
             "hold",
             fallback,
         ]
-        assert guard.trouble == "Nobody is there." and guard.counters.lost == 5
+        assert guard.trouble == "Nobody is there."
+        assert guard.counters.lost == 5
         np.testing.assert_allclose(command.q_target, OPEN if fallback == "open" else [0.2, 0.1])
         policy.outcome = answer(np.array([-0.5, 0.0]))
         clock.now += 0.5
         latched = guard.step(STATE)
-        assert latched.mode == fallback and guard.trouble == ""
+        assert latched.mode == fallback
+        assert guard.trouble == ""
         np.testing.assert_allclose(latched.q_target, command.q_target)
         guard.reset(REQUEST)
         assert guard.step(STATE).mode == "follow"
@@ -166,8 +173,9 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
         ({"q": np.full(FINGERS, np.nan)}, "freeze"),
     ],
 )
-def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+def test_a_possibly_held_object_is_dropped_only_by_open(changed, mode):
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
         guard.step({**STATE, **({} if "q" in changed or mode == "open" else changed)})
         policy.outcome = TransportError("Nobody is there.")
@@ -187,27 +195,30 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
 
 
 def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
-        kept = guard.step(STATE)
+        command = guard.step(STATE)
         guard.freeze()
         policy.outcome = answer(np.array([0.9, 0.9]))
         clock.now += 0.5
         frozen = guard.step(STATE)
-        assert (kept.mode, frozen.mode) == ("follow", "freeze")
-        np.testing.assert_allclose(frozen.q_target, kept.q_target)
+        assert command.mode == "follow"
+        assert frozen.mode == "freeze"
+        np.testing.assert_allclose(frozen.q_target, command.q_target)
         guard.open()
         clock.now += 0.5
         assert guard.step(STATE).mode == "open"
 
 
-def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
+def test_a_camera_policy_is_queried_without_object_pose():
     """Its hand opens after a silence, unless the table's absence says that something may be
     held.
     """
     state = {name: STATE[name] for name in ("q", "u")}
     for table, mode in ((True, "open"), (False, "freeze")):
-        clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+        clock = Clock(100.0)
+        policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
         with guarded(policy, clock, fallback="open") as guard:
             guard.reset(dataclasses.replace(REQUEST, object_pose=None, cloud=np.zeros((8, 3))))
             assert guard.step({**state, "table": table}).mode == "follow"
@@ -227,7 +238,8 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
 
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
     """2 N.m/rad from the joints at 0 to the targets at 0.2 and 0.1 rad."""
-    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(answer(np.array([0.2, 0.1])))
     blind = {name: np.full_like(value, np.nan) for name, value in STATE.items()}
     with guarded(policy, clock, fallback="open") as guard:
         guard.step(STATE)
@@ -280,8 +292,9 @@ def test_the_palm_stays_above_the_table():
         np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
-def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
-    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
+def test_an_episode_starts_from_the_last_finger_targets_unless_moved():
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(TransportError("Nobody is there."))
     elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
     with guarded(policy, clock) as guard:
         guard.reset(elsewhere)
@@ -290,8 +303,9 @@ def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_
         np.testing.assert_array_equal(guard.step({}).q_target, elsewhere.q)
 
 
-def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
-    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
+def test_the_hand_follows_again_when_answers_return():
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(TransportError("Nobody is there."))
     with guarded(policy, clock) as guard:
         assert guard.step(STATE).mode == "hold"
         policy.outcome = answer(np.array([0.1, 0.1]))
@@ -309,32 +323,30 @@ def test_an_answer_to_an_old_state_is_thrown_away():
 
     with guarded(ScriptedPolicy(late), clock) as guard:
         command = guard.step(STATE)
-    assert command.mode == "hold" and guard.counters.stale == 1
+    assert command.mode == "hold"
+    assert guard.counters.stale == 1
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
-def test_after_an_answer_that_came_late_the_next_is_waited_for():
-    slow, done = threading.Event(), threading.Event()
+def test_a_late_answer_does_not_replace_the_next_one():
+    done = threading.Event()
 
     def act(state):
-        if not slow.is_set():
-            slow.set()
-            done.wait(20.0)
+        done.wait(20.0)
         return answer(state["q"])
 
-    clock = Clock(100.0)
-    with guarded(ScriptedPolicy(act), clock) as guard:
-        guard._wait = 0.0
-        assert guard.step(STATE).mode == "hold"
-        done.set()
-        while guard._queries._outcome is None:
-            time.sleep(0.001)
-        guard._wait = 0.4
-        clock.now += 0.1
-        assert guard.step({**STATE, "q": np.full(2, 0.1)}).answer.q_target[0] == 0.1
+    queries = QueryThread(ScriptedPolicy(act))
+    queries.begin(REQUEST)
+    assert queries.exchange(STATE, 0.0, timeout=0.0) is None
+    done.set()
+    eventually(lambda: not queries.is_busy)
+    outcome = queries.exchange({**STATE, "q": np.full(2, 0.1)}, 1.0, timeout=20.0)
+    queries.close()
+    assert outcome.state_time == 1.0
+    assert outcome.answer.q_target[0] == 0.1
 
 
-def test_a_policy_that_hangs_does_not_hold_the_loop_up():
+def test_a_hanging_policy_does_not_block_the_loop():
     release, policy = (
         threading.Event(),
         ScriptedPolicy(lambda state: (release.wait(20.0), answer(np.ones(2)))[1]),
@@ -346,19 +358,18 @@ def test_a_policy_that_hangs_does_not_hold_the_loop_up():
     modes = []
     while not modes or modes[-1] != "freeze":
         modes.append(guard.step(STATE).mode)
-    assert (
-        len(policy.states) == 1
-        and guard.counters.late == len(modes)
-        and set(modes[:-1]) == {"hold"}
-    )
+    assert len(policy.states) == 1
+    assert guard.counters.late == len(modes)
+    assert set(modes[:-1]) == {"hold"}
     guard.reset(REQUEST)
     release.set()  # what comes back now is of the episode before
     guard.step(STATE)
-    assert guard.counters.answers <= 1 and not guard.counters.stale
+    assert guard.counters.answers <= 1
+    assert not guard.counters.stale
     guard.close()
 
 
-def test_the_policy_is_told_what_is_not_measured():
+def test_missing_measurements_are_nan_in_the_query():
     """A client's query would have zeros there."""
     policy = ScriptedPolicy(answer(np.zeros(FINGERS)))
     with guarded(policy, Clock(100.0)) as guard:
@@ -383,14 +394,12 @@ def test_the_policy_is_told_what_is_not_measured():
         (None, "lost"),
     ],
 )
-def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
+def test_an_invalid_answer_is_counted_and_holds(outcome, counter):
     with guarded(ScriptedPolicy(outcome), Clock(100.0)) as guard:
         command = guard.step(STATE)
-    assert (
-        command.mode == "hold"
-        and getattr(guard.counters, counter) == 1
-        and guard.counters.answers == 0
-    )
+    assert command.mode == "hold"
+    assert getattr(guard.counters, counter) == 1
+    assert guard.counters.answers == 0
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
 
 
@@ -415,10 +424,12 @@ TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
     st.lists(st.tuples(OUTCOMES, STATES, TIMES, st.booleans()), min_size=1, max_size=12),
     st.sampled_from(["freeze", "open"]),
 )
-def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
-    clock, policy = Clock(100.0), ScriptedPolicy(None)
+def test_no_command_ever_leaves_the_limits(steps, fallback):
+    clock = Clock(100.0)
+    policy = ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
         last = np.zeros(FINGERS + 6)
+        has_floor = False
         for outcome, state, passed, begins in steps:
             policy.outcome = outcome
             if begins:
@@ -428,18 +439,20 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
                     )
                 )
                 last[FINGERS:] = 0.0
+                has_floor = True
             clock.now += passed
             command = guard.step(state)
             target = np.append(command.q_target, command.u_target)
-            assert (target >= LIMITS.lower).all() and (target <= LIMITS.upper).all()
+            assert (target >= LIMITS.lower).all()
+            assert (target <= LIMITS.upper).all()
             assert (np.abs(target - last) <= LIMITS.speed * 0.5 + 1e-12).all()
             assert (np.abs(np.append(command.q_torque, command.u_torque)) <= LIMITS.torque).all()
-            assert command.u_target[2] >= -1e-9 or not guard._limiter._floor
+            assert command.u_target[2] >= -1e-9 or not has_floor
             last = target
     assert guard.counters.steps == len(steps)
 
 
-def test_what_makes_no_guard_is_refused():
+def test_invalid_guard_options_are_refused():
     for wrong in (
         {"wait": 0.01},
         {"stale": 0.0},
@@ -463,8 +476,11 @@ def test_a_ticker_counts_the_ticks_that_it_leaves_out():
     first = ticker.wait()
     time.sleep(0.055)
     late = ticker.wait()
-    assert late - first >= 0.055 and ticker.ticks == 2 and ticker.missed >= 4
-    assert ticker.longest_ms >= 40.0 and ticker.jitter_ms(100) == ticker.longest_ms
+    assert late - first >= 0.055
+    assert ticker.ticks == 2
+    assert ticker.missed >= 4
+    assert ticker.longest_ms >= 40.0
+    assert ticker.jitter_ms(100) == ticker.longest_ms
     assert ticker.wait() > late  # at the next multiple of the period, not at once
     with pytest.raises(CongraspError, match="100 Hz"):
         Ticker(200.0)

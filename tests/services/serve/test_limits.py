@@ -16,7 +16,8 @@ from congrasp.services.client.floor import Floor
 from congrasp.services.client.limiter import Limited, Limiter
 from congrasp.services.client.limits import JointLimits
 
-JOINTS, PERIOD = 9, 0.01
+JOINTS = 9
+PERIOD = 0.01
 
 
 def with_wrist(fingers, slides, hinges):
@@ -33,7 +34,8 @@ LIMITS = JointLimits(
     acceleration=with_wrist([0.0, 200.0, 0.0], 30.0, 0.0),
     palm=np.array([[0.0, 0.0, -0.05, 0.02], [0.1, 0.0, 0.0, 0.03]]),
 )
-SLIDES, HINGES = slice(-6, -3), slice(-3, None)
+SLIDES = slice(-6, -3)
+HINGES = slice(-3, None)
 FLOOR = Floor(
     np.array([0.0, 0.6, 0.8, 0.1]),
     (np.array([0.1, 0.2, 0.2]), np.array([0.8, 0.0, 0.6, 0.0])),
@@ -67,14 +69,16 @@ STEPS = st.lists(
 @settings(max_examples=60, deadline=None)
 @example([([], [], [], -1e-187), ([], [], [], 0.0)], [0.0] * JOINTS)
 @given(STEPS, st.lists(NEAR, min_size=JOINTS, max_size=JOINTS))
-def test_positions_speeds_and_torques_stay_within_the_limits_whatever_comes_in(steps, start):
+def test_limiter_output_stays_within_limits_for_any_input(steps, start):
     limiter = Limiter(LIMITS, np.array(start), period=PERIOD, floor=FLOOR)
     last = limiter.target
     least = min(FLOOR.clearance(last[-6:]), 0.0)
     for target, position, velocity, now in steps:
         limited = limiter.limit(target, position, velocity, now)
-        assert np.isfinite(limited.target).all() and np.isfinite(limited.torque).all()
-        assert (limited.target >= LIMITS.lower).all() and (limited.target <= LIMITS.upper).all()
+        assert np.isfinite(limited.target).all()
+        assert np.isfinite(limited.torque).all()
+        assert (limited.target >= LIMITS.lower).all()
+        assert (limited.target <= LIMITS.upper).all()
         assert (np.abs(limited.target - last) <= LIMITS.speed * PERIOD + 1e-12).all()
         assert (np.abs(limited.torque) <= LIMITS.torque).all()
         for three, fastest, strongest in ((SLIDES, 1.5, 24.0), (HINGES, 6.0, 3.0)):
@@ -98,33 +102,35 @@ def test_over_any_times_a_target_is_no_faster_than_its_limit(times):
     assert (np.abs(limiter.target - begin) <= LIMITS.speed * passed + 1e-12).all()
 
 
-def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits():
+def test_a_target_moves_at_the_speed_and_torque_limits():
     limits = JointLimits(*(np.append(x, np.ones(6)) for x in (-1.0, 1.0, 6.0, 0.6, 3.0, 0.1)))
     limits = dataclasses.replace(limits, lower=-limits.upper)
     limiter = Limiter(limits, np.zeros(7), period=PERIOD)
 
     def limit(*given):
         *three, now = given
-        found = limiter.limit(*(np.append(x, np.zeros(6)) for x in three), now)
-        return Limited(found.target[0], found.torque[0], found.by)
+        limited = limiter.limit(*(np.append(x, np.zeros(6)) for x in three), now)
+        return Limited(limited.target[0], limited.torque[0], limited.by)
 
     assert limit(0.01, 0.0, 0.0, 0.0).target == pytest.approx(0.01)  # the first period
     fast = limit(0.5, 0.4, 0.0, 0.01)
-    assert fast.target == pytest.approx(0.07) and fast.by == ("speed",)  # 6 rad/s for 10 ms
+    assert fast.target == pytest.approx(0.07)
+    assert fast.by == ("speed",)  # 6 rad/s for 10 ms
     # The servo reaches 0.6 N.m / 3 N.m/rad = 0.2 rad ahead of the joint
     strong = limit(0.12, -0.1, 0.0, 0.02)
-    assert strong.target == pytest.approx(0.1) and strong.by == ("torque",)
+    assert strong.target == pytest.approx(0.1)
+    assert strong.by == ("torque",)
     assert strong.torque == pytest.approx(0.6)
     moving = limit(0.12, 0.1, -3.0, 0.03)  # 3 * 0.02 + 0.1 * 3 = 0.36 N.m
-    assert (
-        moving.target == pytest.approx(0.12)
-        and moving.by == ()
-        and moving.torque == pytest.approx(0.36)
-    )
+    assert moving.target == pytest.approx(0.12)
+    assert moving.by == ()
+    assert moving.torque == pytest.approx(0.36)
     held = limit(math.nan, 0.1, 0.0, 0.04)
-    assert held.target == pytest.approx(0.12) and held.by == ("not_finite",)
+    assert held.target == pytest.approx(0.12)
+    assert held.by == ("not_finite",)
     unmeasured = limit(0.15, math.nan, 0.0, 0.05)
-    assert unmeasured.target == pytest.approx(0.12) and unmeasured.by == ("not_finite", "torque")
+    assert unmeasured.target == pytest.approx(0.12)
+    assert unmeasured.by == ("not_finite", "torque")
     # 3 N.m/rad from 0.1 rad, where the joint was last
     assert unmeasured.torque == pytest.approx(0.06)
 
@@ -148,26 +154,25 @@ def test_wrist_targets_have_limits_of_speed_acceleration_and_force_by_their_norm
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / 0.1
     # Straight
     np.testing.assert_allclose(np.array(places)[:, 2] * 3, np.array(places)[:, 1] * 4, atol=1e-9)
-    assert (
-        speeds.max() == pytest.approx(2.0)
-        and (np.abs(np.diff(speeds, prepend=0.0)) <= 2.0 + 1e-9).all()
-    )
+    assert speeds.max() == pytest.approx(2.0)
+    assert (np.abs(np.diff(speeds, prepend=0.0)) <= 2.0 + 1e-9).all()
     # And stops there at once: 2 / 0.1
     np.testing.assert_allclose(speeds[:6], [2.0, 2.0, 2.0, 2.0, 2.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(places[-1], goal, atol=1e-9)
     far = Limiter(limits, np.zeros(7), period=0.1).limit(
         100.0 * goal, np.zeros(7), np.zeros(7), 0.0
     )
-    assert np.linalg.norm(far.torque) <= 5.0 and far.by == ("torque", "speed")
+    assert np.linalg.norm(far.torque) <= 5.0
+    assert far.by == ("torque", "speed")
     slow = dataclasses.replace(limits, acceleration=np.full(7, 2.0))
-    limiter, places = Limiter(slow, np.zeros(7), period=0.1), [np.zeros(7)]
+    limiter = Limiter(slow, np.zeros(7), period=0.1)
+    places = [np.zeros(7)]
     for step in range(40):
         places.append(limiter.limit(goal, places[-1], np.zeros(7), 0.1 * step).target)
     speeds = np.diff(np.array(places) @ goal) / 0.1
     np.testing.assert_allclose(speeds[:4], [0.2, 0.4, 0.6, 0.8], atol=1e-9)
-    assert (np.abs(np.diff(speeds)) <= 0.2 + 1e-9).all() and (
-        np.array(places) @ goal <= 1.0 + 1e-9
-    ).all()
+    assert (np.abs(np.diff(speeds)) <= 0.2 + 1e-9).all()
+    assert (np.array(places) @ goal <= 1.0 + 1e-9).all()
     np.testing.assert_allclose(places[-1], goal, atol=1e-6)
 
 
@@ -198,8 +203,10 @@ def test_limits_of_a_hand_are_those_of_its_model():
     assert limits.torque[0] == 0.7
     mass = sum(link.mass for link in hand.links) + 0.65
     # A = 15 m/s^2
-    assert limits.torque[16] == pytest.approx(15.0 * mass) and 23.0 < limits.torque[16] < 25.0
-    assert limits.kp[-1] == hand.wrist.hinge_kp and len(limits.speed) == 22
+    assert limits.torque[16] == pytest.approx(15.0 * mass)
+    assert 23.0 < limits.torque[16] < 25.0
+    assert limits.kp[-1] == hand.wrist.hinge_kp
+    assert len(limits.speed) == 22
     older = JointLimits.of_hand(hand, ControlConfig(wrist_acceleration=0.0))
     assert older.torque[16] == hand.wrist.slide_limit
     again = JointLimits(**json.loads(json.dumps(limits.as_lists())))
@@ -210,16 +217,15 @@ def test_limits_of_a_hand_are_those_of_its_model():
 def test_a_limit_of_the_grip_is_one_of_the_torque_by_the_way_to_the_fingertip():
     hand = get_hand("allegro")
     limits = JointLimits.of_hand(hand, grip=5.0)
-    last, root = hand.links[hand.tip_links[1]], hand.finger_roots[1]
+    last = hand.links[hand.tip_links[1]]
+    root = hand.finger_roots[1]
     first = next(link for link in hand.links if link.name == root)
     for link in (first, last):
         joint = link.joints[0]
         lever = np.linalg.norm(np.subtract(last.tip, joint.anchor))
         expected = min(5.0 * lever, joint.torque_limit)
-        assert (
-            limits.torque[hand.joints.index(joint)] == pytest.approx(expected)
-            and 0.02 < lever < 0.2
-        )
+        assert limits.torque[hand.joints.index(joint)] == pytest.approx(expected)
+        assert 0.02 < lever < 0.2
 
 
 @pytest.mark.parametrize(

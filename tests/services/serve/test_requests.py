@@ -69,7 +69,8 @@ def completed(query):
 
 
 def test_fields_land_in_their_places_and_absent_sensors_read_zero():
-    sent, (query, received) = arrays(), parse()
+    sent = arrays()
+    query, received = parse()
     assert query.vectors.shape == (1, LAYOUT.size)
     for name, value in sent.items():
         np.testing.assert_array_equal(received[name], np.asarray(value, np.float32), err_msg=name)
@@ -78,7 +79,7 @@ def test_fields_land_in_their_places_and_absent_sensors_read_zero():
     np.testing.assert_array_equal(received["asked"], [1, 0, 0, 0])
 
 
-def test_the_bits_say_what_was_asked_in_the_order_of_the_constraints():
+def test_flags_follow_the_order_of_the_constraints():
     pose = {"pose_q": np.zeros(20), "pose_position": np.zeros(3), "pose_quaternion": IDENTITY}
     query, fields = parse(("pose", "affordance"), **pose)
     assert query.asked == ("affordance", "pose")
@@ -102,9 +103,10 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
     """It is the hand's own at the start, in the object's frame; along the heading it says
     nothing.
     """
-    own = grasp_frame(get_hand("human")).cross
-    wrist, thing = Rotation.from_euler("x", 0.4), Rotation.from_quat(turn, scalar_first=True)
-    held = thing.inv().apply(wrist.apply(own))
+    cross = grasp_frame(get_hand("human")).cross
+    wrist = Rotation.from_euler("x", 0.4)
+    thing = Rotation.from_quat(turn, scalar_first=True)
+    held = thing.inv().apply(wrist.apply(cross))
     across = np.cross(held, [0.36, 0.48, 0.8])
     direction = held if along else across / np.linalg.norm(across)
     _, received = parse(
@@ -117,12 +119,14 @@ def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
 
 
 @pytest.mark.parametrize("count", [3, 8, 20])
-def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
+def test_surface_points_are_resampled_to_the_policys_number(count):
     points = np.arange(count)[:, None] * np.ones(3)
     _, received = parse(surface_points=points, surface_avoid=np.arange(count) >= count // 2)
-    kept = received["surface_points"][:, 0]
-    assert kept[0] == 0 and np.all(np.diff(kept) >= 0) and len(set(kept)) == min(count, 8)
-    np.testing.assert_array_equal(received["surface_avoid"], kept >= count // 2)
+    coordinates = received["surface_points"][:, 0]
+    assert coordinates[0] == 0
+    assert np.all(np.diff(coordinates) >= 0)
+    assert len(set(coordinates)) == min(count, 8)
+    np.testing.assert_array_equal(received["surface_avoid"], coordinates >= count // 2)
 
 
 @pytest.mark.parametrize(
@@ -185,10 +189,8 @@ def test_odd_constraints_are_refused_in_one_short_line():
 
 
 def test_a_query_of_another_layout_is_refused():
-    vector, meta = (
-        packed(LAYOUT, arrays()).arrays["packed"],
-        {"constraints": ["heading"], "layout": LAYOUT.digest},
-    )
+    vector = packed(LAYOUT, arrays()).arrays["packed"]
+    meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
     assert len(LAYOUT.parse(Message({"packed": np.tile(vector, (64, 1))}, meta)).vectors) == 64
     for count in (0, 65):
         with pytest.raises(CongraspError, match=f"The query has {count} states"):
@@ -222,7 +224,8 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
         for query, row in zip(queries, np.asarray(checks), strict=True)
     ]
     assert [error is not None for error in errors] == [False, True, False, True]
-    assert "'u' is not finite" in str(errors[1]) and "base_quaternion" in str(errors[3])
+    assert "'u' is not finite" in str(errors[1])
+    assert "base_quaternion" in str(errors[3])
     _, alone = parse()
     for name, value in fields.items():
         np.testing.assert_allclose(
@@ -285,20 +288,19 @@ def test_normals_are_estimated_once_for_a_surface(monkeypatch):
         "estimated_normals",
         lambda points: calls.append(points) or estimated_normals(points),
     )
-    layout, own = (
-        Layout(HAND, CLOSER),
-        np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32),
-    )
+    layout = Layout(HAND, CLOSER)
+    sent_normals = np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
     vectors = np.zeros((5, layout.size), np.float32)
     for row, surface in enumerate((0, 1, 0, 0, 1)):
-        vectors[row, layout.offsets["surface_points"] :][:24] = own[surface].reshape(-1)
+        vectors[row, layout.offsets["surface_points"] :][:24] = sent_normals[surface].reshape(-1)
     vectors[3, layout.offsets["surface_normals"] :][:24] = UP.reshape(-1)
     layout.estimate_normals(vectors.copy())
     layout.estimate_normals(vectors)
     assert len(calls) == 2
-    found, expected = layout.unpack(vectors)["surface_normals"], np.asarray(estimated_normals(own))
+    normals = layout.unpack(vectors)["surface_normals"]
+    expected = np.asarray(estimated_normals(sent_normals))
     np.testing.assert_allclose(
-        found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
+        normals, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5
     )
 
 
@@ -318,5 +320,5 @@ def test_estimated_normals_of_a_cloud_point_toward_its_camera():
     task = dataclasses.replace(CLOSER, observation="camera")
     sheet = np.random.default_rng(2).uniform(-0.05, 0.05, (8, 3)) * [1, 1, 0]
     for side in (1.0, -1.0):
-        found = normals_of(task, cloud=sheet, camera_position=np.array([0.1, 0.0, side]))
-        np.testing.assert_allclose(found, side * UP, atol=1e-3)
+        normals = normals_of(task, cloud=sheet, camera_position=np.array([0.1, 0.0, side]))
+        np.testing.assert_allclose(normals, side * UP, atol=1e-3)

@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import pathlib
 import threading
-import types
 from unittest import mock
 
 import numpy as np
@@ -22,7 +21,6 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
-from congrasp.services.serve.requests import Query
 from congrasp.services.serve.server import (
     DEPTH,
     SHARE,
@@ -30,6 +28,7 @@ from congrasp.services.serve.server import (
     PolicyServer,
     follow_file,
     follow_run,
+    join_parts,
 )
 from congrasp.services.train.command import untrained
 from tests import task
@@ -66,16 +65,16 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
         client.reset(episode.request)
         first, second = (client.act(episode.state) for _ in range(2))
         health = client.health()
-        assert health["ready"] and health["hand"] == "human"
-        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health[
-            "states_per_second"
-        ] > 100
-    assert (
-        first.q_target.shape == (20,)
-        and first.u_target.shape == (6,)
-        and first.action.shape == (26,)
-    )
-    assert first.version == 0 and first.active == ("The heading guides the wrist.",)
+        assert health["ready"]
+        assert health["hand"] == "human"
+        assert health["queue_limit"] == DEPTH
+        assert health["peer_limit"] == SHARE
+        assert health["states_per_second"] > 100
+    assert first.q_target.shape == (20,)
+    assert first.u_target.shape == (6,)
+    assert first.action.shape == (26,)
+    assert first.version == 0
+    assert first.active == ("The heading guides the wrist.",)
     # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the
     # limits.
     expected = first.q_target + 0.1 * second.action[:20]
@@ -102,14 +101,13 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     )
     assert grown["congrasp_policy_queries_total", "refused"] == 1
     assert grown["congrasp_policy_batch_count",] == 3 == grown["congrasp_policy_batch_sum",]
-    assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
+    assert after["congrasp_policy_ready",] == 1
+    assert after["congrasp_policy_version",] == 0
 
 
-def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
-    served, monkeypatch
-):
+def test_swapping_weights_fails_no_query(served, monkeypatch):
     path, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
     policy = task.policy()
     swapped = threading.Event()
 
@@ -123,15 +121,16 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
         return versions
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool, PolicyClient(endpoint) as watcher:
-        asked = pool.map(ask, range(4))
+        versions_of_clients = pool.map(ask, range(4))
         try:
             for version in range(1, 101):
                 bundles.save(dataclasses.replace(policy, version=version), path)
                 eventually(lambda version=version: watcher.health()["version"] == version, 0.0)
         finally:
             swapped.set()
-        for versions in asked:
-            assert versions == sorted(versions) and versions[-1] == 100
+        for versions in versions_of_clients:
+            assert versions == sorted(versions)
+            assert versions[-1] == 100
             assert len(set(versions)) > 10
 
 
@@ -144,12 +143,12 @@ def test_a_latency_test_sends_no_more_than_its_rate(served):
 
 
 @pytest.mark.parametrize("beside_others", [False, True])
-def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(
+def test_several_states_equal_single_queries_and_keep_the_episode(
     served, beside_others, monkeypatch
 ):
     """Beside other clients the eleven are inferred in three parts."""
     _, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
+    monkeypatch.setattr("congrasp.services.serve.batching.ALONE_S", 1e6 if beside_others else 0.0)
     if beside_others:
         with PolicyClient(endpoint, timeout=5.0) as other:
             other.reset(episode.request)
@@ -165,7 +164,8 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
         together = client.act_each(states)
         first = client.act(states[0])
     for one, other in zip([*together, first], [*alone, alone[0]], strict=True):
-        assert (one.version, one.active) == (other.version, other.active)
+        assert one.version == other.version
+        assert one.active == other.active
         for name in ("action", "q_target", "u_target"):
             np.testing.assert_allclose(
                 getattr(one, name), getattr(other, name), atol=1e-5, err_msg=name
@@ -173,17 +173,20 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
 
 
-def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
-    old, new = object(), object()
+def part_of_answer(policy: object, value: float) -> Answer:
+    return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
 
-    def part(policy: object, value: float) -> Answer:
-        return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
 
-    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
-    server = types.SimpleNamespace(_infer=lambda queries, queued: [repeated])
-    query = Query(np.zeros((4, 5), np.float32), ())
-    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is repeated
-    joined = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+def test_a_query_answered_in_parts_by_two_policies_is_repeated():
+    parts = [part_of_answer(object(), 1.0), part_of_answer(object(), 2.0)]
+    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), object(), 0.25, 0.75)
+    assert join_parts(parts, lambda: repeated) is repeated
+
+
+def test_parts_of_an_answer_by_one_policy_are_joined():
+    new = object()
+    parts = [part_of_answer(new, 1.0), part_of_answer(new, 2.0)]
+    joined = join_parts(parts, lambda: pytest.fail("the query is repeated"))
     np.testing.assert_array_equal(joined.inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
     assert joined.inference.active == [["x"]] * 4
     assert joined.policy is new
@@ -193,10 +196,8 @@ def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
 
 def test_bad_lists_of_states_are_refused(served):
     _, endpoint, episode = served
-    good, bad = (
-        episode.state,
-        {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])},
-    )
+    good = episode.state
+    bad = {**episode.state, "object_quaternion": np.array([0.0, 0.0, 0.0, 2.0])}
     with PolicyClient(endpoint, timeout=60.0) as client:
         client.reset(episode.request)
         with pytest.raises(
@@ -210,9 +211,10 @@ def test_bad_lists_of_states_are_refused(served):
         assert len(client.act_each([good] * 64)) == 64
 
 
-def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, metrics, monkeypatch):
+def test_queries_beyond_the_queue_are_refused_at_once(served, metrics, monkeypatch):
     _, endpoint, episode = served
-    entered, go = threading.Semaphore(0), threading.Event()
+    entered = threading.Semaphore(0)
+    go = threading.Event()
     infer = PolicyFunction.__call__
 
     def hold(self, weights, queries):
@@ -232,19 +234,19 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         ]
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
         stack.callback(go.set)
-        asked = [pool.submit(ask, clients[0])]
+        futures = [pool.submit(ask, clients[0])]
         assert entered.acquire(timeout=60)
-        asked += [pool.submit(ask, client) for client in clients[1:-1]]
+        futures += [pool.submit(ask, client) for client in clients[1:-1]]
         eventually(lambda: clients[-1].health()["queue"] >= DEPTH)
         with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
-        assert not any(future.done() for future in asked)
+        assert not any(future.done() for future in futures)
         go.set()
-        assert len({future.result(60) for future in asked}) == 1
+        assert len({future.result(60) for future in futures}) == 1
 
 
-def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(served):
+def test_a_mismatched_newer_policy_is_refused(served):
     path, endpoint, _ = served
     with PolicyClient(endpoint) as client:
         version = client.health()["version"]
@@ -259,7 +261,8 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
 
 
 def test_following_a_run_pulls_only_what_is_newer():
-    keys, policy = Keys("r"), task.policy()
+    keys = Keys("r")
+    policy = task.policy()
     with MemoryTransport(MemoryHub()) as transport:
         pull = follow_run(transport, "r", "s")
         with pytest.raises(TransportError):
@@ -276,7 +279,7 @@ def test_following_a_run_pulls_only_what_is_newer():
 
 def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
     """Its policy stays until the learner answers again with a newer one."""
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
     monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
     first = task.policy()
     newer = dataclasses.replace(first, version=first.version + 1)
@@ -297,7 +300,7 @@ def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
         server.close()
 
 
-def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
+def test_a_server_needs_a_readable_policy(tmp_path: pathlib.Path):
     with MemoryTransport(MemoryHub()) as transport:
         with pytest.raises(CongraspError, match="cannot be read"):
             PolicyServer(transport, "p", follow_file(tmp_path / "none.safetensors"))
@@ -311,6 +314,6 @@ def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: path
             transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
 
 
-def test_a_name_that_cannot_be_one_is_refused_before_a_policy_is_loaded():
+def test_an_invalid_name_is_refused_before_loading():
     with pytest.raises(CongraspError, match="'a/b' cannot be the name of a run"):
         PolicyServer(mock.Mock(), "a/b", mock.Mock(side_effect=AssertionError))

@@ -63,10 +63,10 @@ def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    made = Site(tmp_path_factory.mktemp("recordings"))
-    yield made
-    made.server.close()
-    made.session.close()
+    opened = Site(tmp_path_factory.mktemp("recordings"))
+    yield opened
+    opened.server.close()
+    opened.session.close()
 
 
 @pytest.fixture

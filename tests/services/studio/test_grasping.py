@@ -61,7 +61,8 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None
     other = dataclasses.replace(newer, spec=dataclasses.replace(newer.spec, hand="allegro"))
     source.next = lambda: other
     policy.refresh()
-    assert policy.newest()["version"] == newer.version and "allegro" in policy.newest()["trouble"]
+    assert policy.newest()["version"] == newer.version
+    assert "allegro" in policy.newest()["trouble"]
 
     def away() -> PolicyBundle | None:
         raise TransportError("nobody is there")
@@ -79,13 +80,18 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None
 def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> None:
     policy = PolicyGrasping(Source(), "file")
     studio = Studio(policy.hand, policy.task, objects().get("mug"))
-    episodes, aside = grasping._episodes(policy.hand, policy.task, studio.labelled, studio.request)
+    episodes, aside = grasping.varied_episodes(
+        policy.hand, policy.task, studio.labelled, studio.request
+    )
     goal = episodes.goal["heading"]
     np.testing.assert_allclose(goal.position[0], studio.arrow.position, atol=1e-6)
     np.testing.assert_allclose(goal.direction[0], studio.arrow.direction, atol=1e-6)
-    assert aside[0] == 0 and (aside[1:] > 0).all() and aside.max() < 0.04
+    assert aside[0] == 0
+    assert (aside[1:] > 0).all()
+    assert aside.max() < 0.04
     cosine = goal.direction @ studio.arrow.direction
-    assert (cosine > np.cos(0.5)).all() and cosine[1:].max() < 1 - 1e-6
+    assert (cosine > np.cos(0.5)).all()
+    assert cosine[1:].max() < 1 - 1e-6
     np.testing.assert_allclose((goal.direction * goal.cross).sum(-1), 0.0, atol=1e-5)
 
 
@@ -99,15 +105,16 @@ def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> N
     ],
 )
 def test_the_drawn_grasp_is_shown_unless_a_variation_is_clearly_better(held, error, index, says):
-    found = outcome(held, error)
-    removal = int(found.trace.table[:, 0].sum()) - 1
-    assert grasping._best(found, (), removal, 0.0) == index
-    assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
-    assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))
+    attempts = outcome(held, error)
+    removal = int(attempts.trace.table[:, 0].sum()) - 1
+    assert grasping.best_attempt(attempts, (), removal, 0.0) == index
+    assert says in grasping.variation_note(attempts, index, np.full(ATTEMPTS, 0.004))
+    assert bool(says) == bool(grasping.variation_note(attempts, index, np.full(ATTEMPTS, 0.004)))
 
 
 def test_a_job_shows_its_elapsed_seconds() -> None:
-    jobs, done = Jobs(), threading.Event()
+    jobs = Jobs()
+    done = threading.Event()
     jobs.start(f"compiling, {SECONDS} s of about 60", lambda progress: done.wait(60) and None)
     assert jobs.state()["text"] == "compiling, 0 s of about 60"
     with pytest.raises(CongraspError, match="Please wait: compiling, 0 s"):

@@ -18,12 +18,12 @@ from congrasp.services.studio.grasping import why_nothing_held
 from congrasp.services.studio.page import drawing, for_page, lanes
 from tests.episodes import episode, older
 
-STEPS, REMOVAL = 30, 18
-TOLERANCES = {
-    (name, error.unit): error.tolerance
-    for name in ("heading", "trajectory")
-    for error in get_constraint(name).errors
-}
+STEPS = 30
+REMOVAL = 18
+TOLERANCES = {}
+for _name in ("heading", "trajectory"):
+    for _error in get_constraint(_name).errors:
+        TOLERANCES[_name, _error.unit] = _error.tolerance
 
 
 def with_error(made: Episode, **values: float | np.ndarray) -> Message:
@@ -50,27 +50,26 @@ def test_every_active_constraint_has_a_lane_and_no_other() -> None:
 
 
 def test_the_fake_grasp_meets_its_constraints() -> None:
-    found = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
-    heading = found["heading"]
+    shown_lanes = lanes(episode(STEPS, removal=REMOVAL, mask=(0, 1, 1, 1)))
+    heading = shown_lanes["heading"]
     np.testing.assert_allclose(heading.errors["rad"], 0.0, atol=1e-3)
-    assert heading.met[-1] and heading.counts.tolist() == [False] * REMOVAL + [True] * (
-        STEPS - REMOVAL
-    )
-    pose = found["pose"]
-    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6) and pose.errors["m"][
-        -1
-    ] == pytest.approx(0, abs=1e-6)
-    assert not pose.met[0] and pose.met[-1]
-    trajectory = found["trajectory"]
+    assert heading.met[-1]
+    assert heading.counts.tolist() == [False] * REMOVAL + [True] * (STEPS - REMOVAL)
+    pose = shown_lanes["pose"]
+    assert pose.errors["rad"][-1] == pytest.approx(0.0, abs=1e-6)
+    assert pose.errors["m"][-1] == pytest.approx(0, abs=1e-6)
+    assert not pose.met[0]
+    assert pose.met[-1]
+    trajectory = shown_lanes["trajectory"]
     assert trajectory.counts.tolist() == [True] * REMOVAL + [False] * (STEPS - REMOVAL)
     np.testing.assert_allclose(trajectory.errors["m"], 0.0, atol=1e-6)
     assert trajectory.met.all()
 
 
 def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    about = {**made.about, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}
-    lifted = lanes(dataclasses.replace(made, table=np.ones(STEPS, bool), about=about))
+    recorded = episode(STEPS, removal=REMOVAL)
+    about = {**recorded.about, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}
+    lifted = lanes(dataclasses.replace(recorded, table=np.ones(STEPS, bool), about=about))
     assert lifted["contact"].counts.tolist() == [False] * 20 + [True] * (STEPS - 20)
     assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
 
@@ -78,39 +77,38 @@ def test_with_a_lift_contact_counts_from_the_lift_on() -> None:
 @pytest.mark.parametrize("name", ["heading", "trajectory"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
 def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> None:
-    made, most = episode(STEPS, removal=REMOVAL), TOLERANCES[name, unit]
-    lane = lanes(with_error(made, **{f"{name}_{unit}": most + 0.001}))[name]
+    recorded = episode(STEPS, removal=REMOVAL)
+    most = TOLERANCES[name, unit]
+    lane = lanes(with_error(recorded, **{f"{name}_{unit}": most + 0.001}))[name]
     np.testing.assert_allclose(lane.errors[unit], most + 0.001, atol=1e-6)
-    assert (
-        not lane.met.any()
-        and lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
-    )
+    assert not lane.met.any()
+    assert lanes(with_error(recorded, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
 
 
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    assert lanes(made)["affordance"].met.all()
-    touching = np.linalg.norm(made.link_force, axis=-1).max(-1) > 0.05
-    lane = lanes(with_error(made, affordance_ratio=np.where(touching, 0.2, 0.0)))["affordance"]
+    recorded = episode(STEPS, removal=REMOVAL)
+    assert lanes(recorded)["affordance"].met.all()
+    touching = np.linalg.norm(recorded.link_force, axis=-1).max(-1) > 0.05
+    lane = lanes(with_error(recorded, affordance_ratio=np.where(touching, 0.2, 0.0)))["affordance"]
     np.testing.assert_array_equal(lane.met, ~touching)
     assert lane.errors["share"][-1] == pytest.approx(0.2)
 
 
 def test_only_the_fingers_of_a_pose_count_under_a_wrist_path() -> None:
-    made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
-    pose = lanes(made)["pose"]
-    assert pose.met[-1] and set(pose.errors) == {"rad"} and "distance" not in pose.legend
+    recorded = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 1, 0, 1)), pose_m=0.2)
+    pose = lanes(recorded)["pose"]
+    assert pose.met[-1]
+    assert set(pose.errors) == {"rad"}
+    assert "distance" not in pose.legend
 
 
 def test_every_constraint_with_recorded_errors_has_a_lane() -> None:
-    made = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
-    message = made.to_message()
+    recorded = with_error(episode(STEPS, removal=REMOVAL, mask=(0, 0, 0, 0)), fingers_ratio=0.25)
+    message = recorded.to_message()
     arrays = {**message.arrays, "active/fingers": np.bool_(True)}
     lane = lanes(Episode.from_message(Message(arrays, message.meta)))["fingers"]
-    assert (
-        not lane.met.any()
-        and lane.legend == "share of touching links of other fingers: 0 % at most"
-    )
+    assert not lane.met.any()
+    assert lane.legend == "share of touching links of other fingers: 0 % at most"
 
 
 def test_the_page_gets_one_message_with_everything_it_plays() -> None:
@@ -130,12 +128,13 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
 
 
 def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> None:
-    made = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
-    recorded = Episode.from_message(older(made.to_message()))
-    found = lanes(recorded)
-    assert set(found) == {"contact"}
-    np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
-    page, now = for_page(recorded), for_page(made)
+    current = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
+    recorded = Episode.from_message(older(current.to_message()))
+    shown_lanes = lanes(recorded)
+    assert set(shown_lanes) == {"contact"}
+    np.testing.assert_array_equal(shown_lanes["contact"].met, lanes(current)["contact"].met)
+    page = for_page(recorded)
+    now = for_page(current)
     kinds = ("arrow/", "polyline/", "ghost/", "paint/")
     drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
     assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
@@ -147,14 +146,16 @@ VIEW = {"position": [0.5, -0.6, 0.4], "target": [0.0, 0.0, 0.06], "field_of_view
 
 
 def image(view: dict[str, object], frame: int = 5) -> np.ndarray:
-    found = drawing(episode(6, removal=4), "3", "png", view, frame, lambda share: None)
-    assert found.name == f"cylinder-0-3-{frame}.png"
-    return np.asarray(Image.open(io.BytesIO(found.data))).astype(int)
+    picture = drawing(episode(6, removal=4), "3", "png", view, frame, lambda share: None)
+    assert picture.name == f"cylinder-0-3-{frame}.png"
+    return np.asarray(Image.open(io.BytesIO(picture.data))).astype(int)
 
 
 def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the object's pixels: the affordance paints it red and green."""
-    red, green, blue = seen[..., 0], seen[..., 1], seen[..., 2]
+    red = seen[..., 0]
+    green = seen[..., 1]
+    blue = seen[..., 2]
     return np.nonzero(
         ((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue))
     )
@@ -163,7 +164,8 @@ def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_a_picture_has_the_camera_of_the_page() -> None:
     seen = image(VIEW)
     rows, columns = painted(seen)
-    assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
+    assert seen.shape == (720, 1280, 3)
+    assert abs(np.median(columns) - 640) < 40
     # From twice as far the object is half as large along each side.
     assert len(painted(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(
         len(rows) / 4, rel=0.25
@@ -172,8 +174,10 @@ def test_a_picture_has_the_camera_of_the_page() -> None:
 
 def test_a_video_has_a_frame_for_every_40_ms() -> None:
     shares: list[float] = []
-    made = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
-    assert made.name == "cylinder-0-3.mp4" and shares[-1] == 1.0 and shares == sorted(shares)
+    video = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
+    assert video.name == "cylinder-0-3.mp4"
+    assert shares[-1] == 1.0
+    assert shares == sorted(shares)
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(),
         "-i",
@@ -184,8 +188,9 @@ def test_a_video_has_a_frame_for_every_40_ms() -> None:
         "rgb24",
         "-",
     ]
-    frames = subprocess.run(command, input=made.data, capture_output=True, check=True).stdout
-    assert len(frames) == len(shares) * 854 * 480 * 3 and len(shares) == 2  # steps 0 and 4
+    frames = subprocess.run(command, input=video.data, capture_output=True, check=True).stdout
+    assert len(frames) == len(shares) * 854 * 480 * 3
+    assert len(shares) == 2  # steps 0 and 4
 
 
 @pytest.mark.parametrize(
@@ -248,7 +253,8 @@ def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without,
     assert note.startswith(
         "None of 8 attempts held. The one shown: pushed away before the table was removed."
     )
-    assert says in note and tried.keys() == set(asked)
+    assert says in note
+    assert tried.keys() == set(asked)
     for name, weaker in tried.items():
         assert set(weaker.constraints) == {"heading", *asked} - {name}
         assert (weaker.avoid is None) == (name == "affordance" or "affordance" not in asked)

@@ -38,12 +38,12 @@ def grasp(page: Any, site: Site) -> str:
     """
     before = {motion["id"] for motion in site.session.state()["motions"]}
     page.click("#grasp")
-    (made,) = eventually(
+    (file,) = eventually(
         lambda: {motion["id"] for motion in site.session.state()["motions"]} - before
     )
-    page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
+    page.wait_for_selector(f"[data-motion='{file}'][data-shown]")
     page.wait_for_selector("#player:not([hidden])")
-    return str(made)
+    return str(file)
 
 
 def handle(page: Any, name: str) -> tuple[float, float]:
@@ -59,16 +59,17 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     small = np.asarray(
         Image.fromarray(seen.astype(np.uint8)).resize((96, 72), Image.Resampling.BOX)
     ).astype(int)
-    wanted = np.asarray(Image.open(REFERENCE).convert("RGB")).astype(int)
+    reference = np.asarray(Image.open(REFERENCE).convert("RGB")).astype(int)
     # Buttons lie over the picture's upper and lower edge; fonts differ between machines.
-    difference = np.abs(small - wanted).max(-1)[12:-6]
+    difference = np.abs(small - reference).max(-1)[12:-6]
     assert (difference > 40).mean() < 0.02, (
         "the picture is another than tests/services/studio/first_picture.png"
     )
     assert orange(seen).mean() > 0.01
     grey = np.ptp(seen, axis=-1) < 14
     shadow = grey & (abs(seen.mean(-1) - 0.8 * 219) < 8)  # on the table, which is 219 bright
-    assert shadow[: len(seen) // 2].sum() < shadow[len(seen) // 2 :].sum() and shadow.mean() > 0.003
+    assert shadow[: len(seen) // 2].sum() < shadow[len(seen) // 2 :].sum()
+    assert shadow.mean() > 0.003
 
 
 @pytest.mark.slow
@@ -78,19 +79,23 @@ def test_the_brush_paints_the_surface_along_its_stroke(opened: Any, site: Site) 
     opened.click("[data-tool=avoid]")
     opened.mouse.move(x, y)  # the brush shows its preview, and paints nothing
     hovered = red(picture(opened)).sum()
-    assert hovered > before + 50 and site.studio["avoid_share"] == 0
+    assert hovered > before + 50
+    assert site.studio["avoid_share"] == 0
     opened.mouse.move(x, 5)
     assert red(picture(opened)).sum() < before + 10
     drag(opened, [(x, y), (x + 12, y + 4)])
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
     painted = site.studio["avoid_share"]
-    assert painted > 0 and red(picture(opened)).sum() > before + 100
+    assert painted > 0
+    assert red(picture(opened)).sum() > before + 100
     opened.keyboard.press("Control+z")
     opened.wait_for_selector("[data-mask=affordance][data-on=false]")
-    assert site.studio["avoid_share"] == 0 and opened.is_disabled("#undo") is False
+    assert site.studio["avoid_share"] == 0
+    assert opened.is_disabled("#undo") is False
     opened.keyboard.press("Control+Shift+Z")
     opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    assert site.studio["avoid_share"] == painted and opened.is_disabled("#redo")
+    assert site.studio["avoid_share"] == painted
+    assert opened.is_disabled("#redo")
     opened.click("[data-tool=graspable]")
     drag(opened, [(x, y), (x + 12, y + 4)])
     eventually(lambda: site.studio["avoid_share"] < painted)
@@ -151,10 +156,12 @@ def test_constraints_without_a_drawing_tool_are_set_by_flags(page: Any) -> None:
 
     page.goto(server.url)
     page.wait_for_selector("body[data-first-picture]")
-    assert page.is_visible("[data-ask=affordance]") and not page.is_visible("[data-ask=pose]")
+    assert page.is_visible("[data-ask=affordance]")
+    assert not page.is_visible("[data-ask=pose]")
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
-    assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == [
+    assert "Only the named fingers" in page.inner_text("#explanation")
+    assert fingers() == [
         "thumb",
         "index",
     ]
@@ -181,7 +188,8 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(
     opened: Any, site: Site, tmp_path: pathlib.Path
 ) -> None:
     assert opened.input_value("#hand") == "of the run"
-    still, tail = picture(opened), handle(opened, "tail")
+    still = picture(opened)
+    tail = handle(opened, "tail")
     opened.fill("[data-phase=lift]", "0.15")
     opened.press("[data-phase=lift]", "Enter")
     eventually(lambda: site.session.state()["phases"]["lift"] == 0.15)
@@ -201,10 +209,10 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(
     box = opened.locator("#timeline").bounding_box()
     opened.mouse.click(box["x"] + 0.97 * box["width"], box["y"] + 10)
     opened.wait_for_selector("[data-lane=heading][data-met=true]")
-    assert opened.inner_text("#time") != "0.00 s" and "7.5 N" in opened.inner_text("#lanes")
-    assert "Contact force, N" in opened.inner_text(
-        "#values"
-    ) and "Reward per step" in opened.inner_text("#values")
+    assert opened.inner_text("#time") != "0.00 s"
+    assert "7.5 N" in opened.inner_text("#lanes")
+    assert "Contact force, N" in opened.inner_text("#values")
+    assert "Reward per step" in opened.inner_text("#values")
     assert "w_c: for all links in contact" in opened.get_attribute(
         "#values tr:has-text('Contact') >> nth=-1", "title"
     )
@@ -225,7 +233,8 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(
     assert Image.open(tmp_path / "motion.png").size == (1280, 720)
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
-    assert site.grasping.asked[-1][0].name == "mug_1" and site.grasping.asked[-1][2] == (
+    assert site.grasping.asked[-1][0].name == "mug_1"
+    assert site.grasping.asked[-1][2] == (
         0.0,
         0.15,
         2.0,
@@ -245,18 +254,18 @@ def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) ->
     opened.wait_for_selector("#names:not([hidden])")
     opened.wait_for_selector("#play:has-text('Play')")
     both = picture(opened)
-    left, right = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
+    left = both[:, : both.shape[1] // 2]
+    right = both[:, both.shape[1] // 2 :]
     # The affordance was of the second alone
-    assert red(left).mean() > 0.001 and red(right).mean() < 0.0002
+    assert red(left).mean() > 0.001
+    assert red(right).mean() < 0.0002
     assert orange(right).mean() > 0.005
     assert opened.inner_text("#values tr").split() == ["motion", second, "motion", first]
     opened.select_option("#layout", "over")
     over = picture(opened)
     middle = over[:, over.shape[1] // 4 : 3 * over.shape[1] // 4]
-    assert (
-        red(middle).sum() > 0.8 * red(over).sum() > 0
-        and red(over[:, : over.shape[1] // 4]).sum() == 0
-    )
+    assert red(middle).sum() > 0.8 * red(over).sum() > 0
+    assert red(over[:, : over.shape[1] // 4]).sum() == 0
     opened.click(f"[data-motion='{first}'] .delete")
     opened.wait_for_selector(f"[data-motion='{first}']", state="detached")
     opened.wait_for_selector("#player", state="hidden")
@@ -272,7 +281,9 @@ def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> N
     for place in (0, 300, 10_000):
         opened.locator("#studio").evaluate("(aside, place) => aside.scrollTo(0, place)", place)
         box = opened.locator("#grasp").bounding_box()
-        assert box["y"] > 0 and box["y"] + box["height"] <= 844 and box["width"] > 300
+        assert box["y"] > 0
+        assert box["y"] + box["height"] <= 844
+        assert box["width"] > 300
     corner = picture(opened)[60, 5]  # next to the hand, above the table
     assert corner.max() < 60
     opened.emulate_media(color_scheme="light")
@@ -290,7 +301,8 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(
     opened.set_input_files("#file", tmp_path / "mug.stl")
     opened.wait_for_selector("#facts:has-text('a bit small')")
     assert site.studio["object"]["name"] == "bottle_5"
-    assert opened.input_value("#object") == "bottle_5" and opened.input_value("#unit") == "m"
+    assert opened.input_value("#object") == "bottle_5"
+    assert opened.input_value("#unit") == "m"
     assert orange(picture(opened)).mean() > 0.005
     (tmp_path / "unknown.stl").write_bytes(b"something")
     opened.set_input_files("#file", tmp_path / "unknown.stl")
@@ -312,9 +324,7 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(
 
 
 @pytest.mark.slow
-def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(
-    opened: Any, site: Site
-) -> None:
+def test_a_training_page_leads_from_a_dip_to_its_episodes(opened: Any, site: Site) -> None:
     opened.click("#show-training")
     opened.wait_for_selector("tr[data-actor=a099]", state="attached")
     # The studio's policy may be older than the run's, which a tile shows
@@ -338,9 +348,8 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     box = curve.bounding_box()
     curve.click(position={"x": box["width"] * DIP / 59, "y": 30})
     opened.wait_for_selector("#found [data-episode]")
-    assert "2 episodes within" in opened.inner_text(
-        "#found"
-    ) and f"update {DIP}" in opened.inner_text("#found")
+    assert "2 episodes within" in opened.inner_text("#found")
+    assert f"update {DIP}" in opened.inner_text("#found")
     opened.click("#found [data-episode]")
     opened.wait_for_selector("#result:has-text('thing-2')")
     opened.click("#show-studio")
@@ -354,7 +363,5 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     eventually(
         lambda: opened.locator("#curves figure").count() == len(site.window.view()["names"]) == 6
     )
-    assert (
-        opened.inner_text("#run-trouble") == ""
-        and opened.inner_text("[data-tile=update] b") == "59"
-    )
+    assert opened.inner_text("#run-trouble") == ""
+    assert opened.inner_text("[data-tile=update] b") == "59"

@@ -53,9 +53,9 @@ class Page:
             {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}},
         )
         answer = connection.getresponse()
-        found = answer.status, answer.read()
+        reply = answer.status, answer.read()
         connection.close()
-        return found
+        return reply
 
     def get(self, path: str) -> dict[str, Any]:
         return json.loads(self.ask("GET", path)[1])
@@ -65,9 +65,9 @@ class Page:
         return self.get("/api/state")
 
     def do(self, action: str, **values: Any) -> dict[str, Any]:
-        code, found = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
+        code, reply = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
         assert code == 200
-        return json.loads(found)
+        return json.loads(reply)
 
     def upload(self, name: str, content: bytes = b"solid") -> dict[str, Any]:
         kind = "application/octet-stream"
@@ -97,7 +97,7 @@ def page(grasping: fake.FakePolicy) -> Iterator[Page]:
     session.close()
 
 
-def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
+def test_only_the_page_and_its_modules_are_served(page: Page) -> None:
     assert b"<title>congrasp" in page.ask("GET", "/")[1]
     assert page.ask("GET", "/static/picture.js")[0] == 200
     assert page.ask("GET", "/prefix/static/vendor/three.module.min.js")[0] == 200
@@ -117,9 +117,10 @@ def test_a_result_that_is_not_json_is_answered() -> None:
     server = PageServer(
         lambda browser: Routes({"/api/nan": lambda query: {"x": float("nan")}}, {}), "127.0.0.1", 0
     )
-    code, found = Page(server.port).ask("GET", "/api/nan")
+    code, reply = Page(server.port).ask("GET", "/api/nan")
     server.close()
-    assert code == 500 and "ValueError" in json.loads(found)["error"]
+    assert code == 500
+    assert "ValueError" in json.loads(reply)["error"]
 
 
 def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,11 +128,11 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
     idle one ends.
     """
     monkeypatch.setattr(browser_sessions, "MOST", 2)
-    made: list[Session] = []
+    sessions_made: list[Session] = []
 
     def new() -> Session:
-        made.append(fake.session(fake.FakePolicy()))
-        return made[-1]
+        sessions_made.append(fake.session(fake.FakePolicy()))
+        return sessions_made[-1]
 
     sessions = browser_sessions.Sessions(new)
     server = PageServer(sessions.routes, "127.0.0.1", 0)
@@ -148,24 +149,27 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
 
     try:
         cookies = [open_page().partition(";")[0] for _ in range(3)]
-        assert len(set(cookies)) == 3 and all(
-            c.startswith(f"congrasp-{server.port}=") for c in cookies
-        )
-        assert open_page(Cookie=cookies[0]) == "" and "HttpOnly; SameSite=Strict" in open_page(
-            Cookie="congrasp=x"
-        )
+        assert len(set(cookies)) == 3
+        assert all(c.startswith(f"congrasp-{server.port}=") for c in cookies)
+        assert open_page(Cookie=cookies[0]) == ""
+        assert "HttpOnly; SameSite=Strict" in open_page(Cookie="congrasp=x")
         body = json.dumps({"action": "fill", "avoid": True}).encode()
         assert page.ask("POST", "/api/do", body, Cookie=cookies[0])[0] == 200
-        assert [undoable(cookie) for cookie in cookies[:2]] == [True, False] and len(made) == 2
+        assert [undoable(cookie) for cookie in cookies[:2]] == [True, False]
+        assert len(sessions_made) == 2
         assert undoable(cookies[0])  # used more recently than the second
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
             refused = json.loads(
                 page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1]
             )
-            assert "2 browsers, the maximum, use" in refused["error"] and len(made) == 2
+            assert "2 browsers, the maximum, use" in refused["error"]
+            assert len(sessions_made) == 2
         monkeypatch.setattr(browser_sessions, "IDLE", 0.0)
-        assert not undoable(cookies[2]) and len(made) == 3
-        assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
+        assert not undoable(cookies[2])
+        assert len(sessions_made) == 3
+        assert undoable(cookies[0])
+        assert not undoable(cookies[1])
+        assert len(sessions_made) == 4
     finally:
         server.close()
         sessions.close()
@@ -270,12 +274,12 @@ def test_rest_of_a_refused_body_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_other_sites_are_rejected(page: Page) -> None:
-    own = {
+    same_site = {
         "Host": f"localhost:{page.port}",
         "Origin": f"http://localhost:{page.port}",
         "Sec_Fetch_Site": "same-origin",
     }
-    assert page.ask("GET", "/api/state", **own)[0] == 200
+    assert page.ask("GET", "/api/state", **same_site)[0] == 200
     for other in (
         "Host=evil.example:80",
         "Origin=http://evil.example",
@@ -283,7 +287,7 @@ def test_other_sites_are_rejected(page: Page) -> None:
         "Sec_Fetch_Site=same-site",
     ):
         name, _, value = other.partition("=")
-        assert page.ask("GET", "/api/state", **{**own, name: value})[0] == 403, other
+        assert page.ask("GET", "/api/state", **{**same_site, name: value})[0] == 403, other
 
 
 def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
@@ -308,20 +312,19 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         )
         assert code(Host="hub.example.org", Origin="https://hub.example.org") == 200
         # nginx puts the address behind it as Host and leaves the browser's Origin.
-        own = f"127.0.0.1:{server.port}"
-        assert code(Host=own, Origin="https://hub.example.org") == 200
-        refused = page.ask("GET", "/", Host=own, Origin="https://other.example")
+        address = f"127.0.0.1:{server.port}"
+        assert code(Host=address, Origin="https://hub.example.org") == 200
+        refused = page.ask("GET", "/", Host=address, Origin="https://other.example")
+        assert refused[0] == 403
+        assert "--allow-host 'other.example'" in json.loads(refused[1])["error"]
         assert (
-            refused[0] == 403 and "--allow-host 'other.example'" in json.loads(refused[1])["error"]
+            code(Host=address, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
         )
-        assert code(Host=own, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
         assert code(Host="localhost:9000", Origin="http://localhost:9001") == 403
         assert code(Host="hub.example.org", Origin="https://evil.example") == 403
         refused = page.ask("GET", "/", Host="other.example.org")
-        assert (
-            refused[0] == 403
-            and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
-        )
+        assert refused[0] == 403
+        assert "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
         assert (
             page.ask("GET", "/user/me/proxy/7480/api/state")[0]
             == page.ask("GET", "/user/me/")[0]
@@ -359,8 +362,9 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
     ],
 )
 def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, says: str) -> None:
-    code, found = page.ask("POST", "/api/do", body)
-    assert code == 200 and says in json.loads(found)["error"]
+    code, reply = page.ask("POST", "/api/do", body)
+    assert code == 200
+    assert says in json.loads(reply)["error"]
 
 
 def test_a_body_without_length_or_beyond_the_limit_is_refused_unread(page: Page) -> None:
@@ -409,7 +413,7 @@ def test_a_request_for_no_host_is_refused_on_every_interface(host: str, code: in
         server.close()
 
 
-def test_hands_are_known_by_name_and_no_file_is_opened(page: Page, tmp_path: pathlib.Path) -> None:
+def test_a_hand_is_named_and_no_file_opened(page: Page, tmp_path: pathlib.Path) -> None:
     file = pathlib.Path(__file__).parents[2] / "hands" / "claw.json"
     assert b"skin_points" in page.ask("GET", "/api/hand?name=allegro")[1]
     assert b"skin_points" in page.ask("GET", "/api/hand?name=human")[1]
@@ -420,7 +424,8 @@ def test_hands_are_known_by_name_and_no_file_is_opened(page: Page, tmp_path: pat
 
 def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
     page.do("paint", points=[[0, 0, 0]], radius=0.01, avoid=float("nan"))
-    assert page.state and page.do("fill", avoid=False)
+    assert page.state
+    assert page.do("fill", avoid=False)
 
 
 def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
@@ -430,8 +435,8 @@ def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
     page = Page(server.port)
     try:
         for name in ("..", "a/..", "a%00.stl", "a%0A.stl", "a" * 300, "%F0%9F%8D%90" * 64):
-            code, found = page.ask("POST", f"/api/upload?name={name}", b"solid")
-            assert (code, "is not a file name" in json.loads(found)["error"]) == (400, True), name
+            code, reply = page.ask("POST", f"/api/upload?name={name}", b"solid")
+            assert (code, "is not a file name" in json.loads(reply)["error"]) == (400, True), name
         for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
             assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
         assert page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=nan")[0] == 400
@@ -452,23 +457,25 @@ def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> 
     def mass() -> float:
         return page.state["studio"]["object"]["mass_g"]
 
-    own = mass()
+    estimated = mass()
     page.do("weigh", mass_g=500)
     page.do("grasp")
-    assert page.wait() and grasping.asked[-1][0].mass == 0.5 and mass() == 500
+    assert page.wait()
+    assert grasping.asked[-1][0].mass == 0.5
+    assert mass() == 500
     page.do("weigh", material="steel")
-    assert (
-        mass() not in (500, own) and "The mass is 9e+09 g" in page.do("weigh", mass_g=9e9)["error"]
-    )
+    assert mass() not in (500, estimated)
+    assert "The mass is 9e+09 g" in page.do("weigh", mass_g=9e9)["error"]
     page.do("weigh")
-    assert mass() == own
+    assert mass() == estimated
 
 
 def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePolicy) -> None:
     page.do("time", approach=1.5, lift=0.2)
     page.do("time", hold=1)
     page.do("grasp")
-    assert page.wait() and grasping.asked[-1][2] == (1.5, 0.2, 1.0)
+    assert page.wait()
+    assert grasping.asked[-1][2] == (1.5, 0.2, 1.0)
     for phase in ({"lift": 0.6}, {"hold": -1}, {"speed": 1.0}):
         assert "approach 0 to 10, lift 0 to 0.5" in page.do("time", **phase)["error"], phase
     assert page.state["phases"] == {"approach": 1.5, "lift": 0.2, "hold": 1.0}
@@ -482,7 +489,8 @@ def test_a_grasp_from_request_to_files(
     page.wait()
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = page.state["motions"]
-    assert motions[0]["held"] and motions[0]["steps"] == fake.STEPS
+    assert motions[0]["held"]
+    assert motions[0]["steps"] == fake.STEPS
     assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
     assert played.arrays["lane/affordance/met"].shape == (fake.STEPS,)
@@ -518,14 +526,16 @@ def test_a_mesh_becomes_an_object_and_an_empty_file_is_refused(page: Page) -> No
     page.wait()
     state = page.state
     assert state["studio"]["object"]["name"] == state["chosen"] == "bottle_5"
-    assert state["upload"]["unit"] == "m" and state["upload"]["file"] == "x.stl"
+    assert state["upload"]["unit"] == "m"
+    assert state["upload"]["file"] == "x.stl"
 
 
 def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page) -> None:
     before = page.state
     page.upload("unknown.stl")
     waiting = page.state
-    assert waiting["chosen"] == before["chosen"] and waiting["shown"] == before["shown"]
+    assert waiting["chosen"] == before["chosen"]
+    assert waiting["shown"] == before["shown"]
     assert {unit["unit"]: unit["size"] for unit in waiting["upload"]["units"]} == {
         "m": "0.9 x 0.9 x 3 m",
         "cm": "0.9 x 0.9 x 3 cm",
@@ -533,32 +543,39 @@ def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page)
         "in": "2.29 x 2.29 x 7.62 cm",
     }
     assert [unit["unit"] for unit in waiting["upload"]["units"] if unit["possible"]] == ["cm", "in"]
-    names, sizes = [], []
+    names = []
+    sizes = []
     for unit in ("cm", "in"):
         page.do("unit", unit=unit)
         page.wait()
-        found = page.state
-        assert found["upload"]["unit"] == unit
-        names.append(found["chosen"])
-        sizes.append(max(found["studio"]["object"]["size_cm"]))
+        state = page.state
+        assert state["upload"]["unit"] == unit
+        names.append(state["chosen"])
+        sizes.append(max(state["studio"]["object"]["size_cm"]))
     assert sizes[1] / sizes[0] == pytest.approx(2.54, rel=0.05)
     # It took the place of the first
-    assert names[0] == names[1] and found["objects"].count(names[0]) == 1
+    assert names[0] == names[1]
+    assert state["objects"].count(names[0]) == 1
     page.do("object", name="mug")
-    assert page.wait() and page.state["upload"] is None
+    assert page.wait()
+    assert page.state["upload"] is None
 
 
 def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathlib.Path) -> None:
     uploads = Uploads(tmp_path, fake.objects(), fake.FakeImporter())
-    first, second = uploads.take("model.stl", b"first"), uploads.take("model.stl", b"second")
-    assert (first.path.read_bytes(), second.path.read_bytes()) == (b"first", b"second")
+    first = uploads.take("model.stl", b"first")
+    second = uploads.take("model.stl", b"second")
+    assert first.path.read_bytes() == b"first"
+    assert second.path.read_bytes() == b"second"
     assert first.view()["file"] == second.view()["file"] == "model.stl"
     with pytest.raises(CongraspError, match=r"^model\.txt is not an STL file"):
         uploads.take("model.txt", b"first")
 
 
 def test_an_upload_during_a_job_is_refused(page, grasping, monkeypatch):
-    begun, free, grasp = threading.Event(), threading.Event(), grasping.grasp
+    begun = threading.Event()
+    free = threading.Event()
+    grasp = grasping.grasp
 
     def wait(*asked: Any) -> Any:
         begun.set()
@@ -572,7 +589,8 @@ def test_an_upload_during_a_job_is_refused(page, grasping, monkeypatch):
     for name in ("x.stl", "unknown.stl"):
         assert "Please wait" in page.upload(name)["error"]
     free.set()
-    assert page.wait() and page.state["upload"] == before
+    assert page.wait()
+    assert page.state["upload"] == before
 
 
 def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -590,20 +608,24 @@ def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.Monke
 
 def test_resting_poses_have_thumbnails_and_edits_are_undone(page: Page) -> None:
     before = page.do("set_rest_pose", rest=1)
-    assert before["studio"]["rest"]["index"] == 1 and before["history"]["undo"] == "resting pose"
+    assert before["studio"]["rest"]["index"] == 1
+    assert before["history"]["undo"] == "resting pose"
     assert page.do("undo")["studio"]["rest"]["index"] == 0
     assert page.do("redo")["studio"]["rest"]["index"] == 1
     code, picture = page.ask("GET", "/api/rest?index=1")
-    assert code == 200 and Image.open(io.BytesIO(picture)).size == (150, 112)
+    assert code == 200
+    assert Image.open(io.BytesIO(picture)).size == (150, 112)
     assert picture != page.ask("GET", "/api/rest?index=0")[1]
     assert b"no resting pose 100" in page.ask("GET", "/api/rest?index=99")[1]
-    assert page.do("object", name="mug")["history"] and page.wait()
+    assert page.do("object", name="mug")["history"]
+    assert page.wait()
     assert page.do("undo")["history"] == {"undo": "", "redo": ""}  # nothing of the object before
 
 
 def test_a_run_is_shown_next_to_the_studio(page: Page) -> None:
     view = page.get("/api/training?names=episode/return")
-    assert list(view["curves"]) == ["episode/return"] and len(view["actors"]) == 5
+    assert list(view["curves"]) == ["episode/return"]
+    assert len(view["actors"]) == 5
     played = decode(page.ask("GET", "/api/motion?id=actor:a003")[1])
     assert played.meta["object"] == "thing-3"
     assert "recordings" in page.get("/api/episodes?time=1&seconds=1")["error"]
@@ -625,4 +647,6 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(page, capsys)
         with pytest.raises(SystemExit) as end:
             main(["view", "--port", "0", *arguments])
         error = capsys.readouterr().err
-        assert end.value.code == 2 and says in error and error.count("\n") == 1, error
+        assert end.value.code == 2, error
+        assert says in error, error
+        assert error.count("\n") == 1, error

@@ -1,6 +1,7 @@
 """Actions of the studio's user, and the effects of the priority rules."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -54,27 +55,30 @@ def test_drawing_tools_follow_from_goal_arrays(studio: Studio) -> None:
 
 def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
     studio.task = dataclasses.replace(studio.task, preshape=False)
-    hand, rest = studio.hand, MUG.rest_poses[0]
+    hand = studio.hand
+    rest = MUG.rest_poses[0]
     start = describe(studio)["start"]
-    wrist, turn = np.array(start["position"][0]), matrix(np.array(start["quaternion"][0]))
+    wrist = np.array(start["position"][0])
+    turn = matrix(np.array(start["quaternion"][0]))
     center = wrist + turn @ grasp_frame(hand).center
     target = rest[:3] + matrix(rest[3:]) @ studio.arrow.position
     np.testing.assert_allclose(center, target + np.array([0, 0, BACK_OFF]), atol=1e-4)
     np.testing.assert_allclose(turn @ grasp_frame(hand).heading, [0, 0, -1], atol=1e-4)
 
 
-def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: Studio) -> None:
+def test_the_brush_labels_points_and_requests_the_affordance(studio: Studio) -> None:
     center = MUG.points[0]
     studio.paint([center], 0.02, avoid=True)
     far = np.linalg.norm(MUG.points - center, axis=-1)
     np.testing.assert_array_equal(studio.canvas.avoid, far <= 0.02)
-    shown = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
-    np.testing.assert_array_equal(studio.canvas.paint.shown, shown <= 0.02)
+    distance = np.linalg.norm(studio.canvas.vertices - center, axis=-1)
+    np.testing.assert_array_equal(studio.canvas.paint.shown, distance <= 0.02)
     assert studio.asked == masks(studio) == {"affordance"}
     np.testing.assert_array_equal(studio.labelled.non_graspable_points, studio.canvas.avoid)
     np.testing.assert_array_equal(studio.request.avoid, studio.canvas.avoid)
     studio.paint([center], 0.03, avoid=False)
-    assert not studio.canvas.avoid.any() and studio.asked == set()
+    assert not studio.canvas.avoid.any()
+    assert studio.asked == set()
 
 
 def test_without_paint_the_affordance_takes_the_parts_of_the_object(studio: Studio) -> None:
@@ -90,7 +94,8 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
     assert any("affordance is overridden" in line for line in studio.explanation)
     studio.ask("trajectory", True)
     assert masks(studio) == {"pose_finger", "trajectory"}
-    assert "guides the wrist" in studio.explanation[0] and "trajectory" in studio.explanation[0]
+    assert "guides the wrist" in studio.explanation[0]
+    assert "trajectory" in studio.explanation[0]
     studio.ask("pose", False)
     studio.ask("affordance", False)
     assert tuple(studio.request.constraints) == ("heading", "trajectory")
@@ -99,15 +104,14 @@ def test_the_rules_are_explained_and_set_the_masks(studio: Studio) -> None:
 def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studio) -> None:
     studio.paint([studio.arrow.position - INWARD * studio.arrow.direction], 0.03, avoid=True)
     view = describe(studio)
-    assert view["active"]["overruled"] and any(
-        "redirected to the graspable region" in line for line in view["explanation"]
-    )
+    assert view["active"]["overruled"]
+    assert any("redirected to the graspable region" in line for line in view["explanation"])
     # It goes elsewhere, the same way: the paint is left by a step aside.
     assert np.linalg.norm(np.subtract(view["active"]["position"], studio.arrow.position)) > 0.02
     np.testing.assert_allclose(view["active"]["direction"], studio.arrow.direction, atol=1e-6)
 
 
-def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
+def test_the_arrow_has_the_depth_of_training_and_rolls(studio: Studio) -> None:
     studio.set_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross
@@ -147,7 +151,8 @@ def test_a_drawn_path_keeps_its_beginning_and_ends_at_the_wrist_of_the_grasp(
     studio.close_hand()
     np.testing.assert_allclose(path[-1], studio.fields["pose"]["position"], atol=1e-6)
     studio.ask("pose", False)
-    assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
+    assert studio.trouble == ""
+    assert studio.explanation[0].startswith("The wrist trajectory")
 
 
 def test_suggestions_are_drawn_as_in_training(studio: Studio) -> None:
@@ -157,7 +162,8 @@ def test_suggestions_are_drawn_as_in_training(studio: Studio) -> None:
     assert studio.trouble == ""
     studio.suggest("trajectory")
     studio.ask("trajectory", True)
-    assert studio.trouble == "" and tuple(studio.request.constraints) == ("heading", "trajectory")
+    assert studio.trouble == ""
+    assert tuple(studio.request.constraints) == ("heading", "trajectory")
 
 
 def test_suggestions_are_for_the_object_without_the_scale_of_training(studio: Studio) -> None:
@@ -202,11 +208,9 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
 def test_another_object_resets_the_request(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
-    assert (
-        studio.asked == set()
-        and "pose" not in studio.fields
-        and describe(studio)["object"]["name"] == "other"
-    )
+    assert studio.asked == set()
+    assert "pose" not in studio.fields
+    assert describe(studio)["object"]["name"] == "other"
 
 
 def same(one: Studio, edit: object) -> bool:
@@ -216,15 +220,16 @@ def same(one: Studio, edit: object) -> bool:
 
 def leaves(tree: object) -> list[object]:
     if isinstance(tree, dict):
-        return [leaf for key in sorted(tree) for leaf in leaves(tree[key])]
+        return list(itertools.chain(*(leaves(tree[key]) for key in sorted(tree))))
     if isinstance(tree, tuple):
-        return [leaf for part in tree for leaf in leaves(part)]
+        return list(itertools.chain(*map(leaves, tree)))
     return [tree]
 
 
 def test_edits_are_undone_and_redone_until_a_new_one(studio: Studio) -> None:
     studio.take(MUG)
-    history, up = History(studio), matrix(MUG.rest_poses[0][3:])[2]
+    history = History(studio)
+    up = matrix(MUG.rest_poses[0][3:])[2]
     edits = [
         ("set_rest_pose", {"rest": 0}),
         ("set_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
@@ -242,13 +247,13 @@ def test_edits_are_undone_and_redone_until_a_new_one(studio: Studio) -> None:
         history.do(name, **values)
         states.append(studio.edit)
         assert history.view() == {"undo": ACTIONS[name], "redo": ""}
-    assert studio.asked == {"trajectory"} and "trajectory" in studio.fields
+    assert studio.asked == {"trajectory"}
+    assert "trajectory" in studio.fields
     for state in states[-2::-1]:
         history.undo()
         assert same(studio, state)
-    assert (
-        history.view() == {"undo": "", "redo": ACTIONS["set_rest_pose"]} and studio.asked == set()
-    )
+    assert history.view() == {"undo": "", "redo": ACTIONS["set_rest_pose"]}
+    assert studio.asked == set()
     history.undo()  # there is nothing more
     for state in states[1:]:
         history.redo()
@@ -263,7 +268,8 @@ def test_edits_are_undone_and_redone_until_a_new_one(studio: Studio) -> None:
 
 
 def test_a_gesture_is_one_edit_and_a_failed_action_is_none(studio: Studio) -> None:
-    history, first = History(studio), studio.edit
+    history = History(studio)
+    first = studio.edit
     for gesture, angle in ((1, 0.1), (1, 0.2), (1, 0.3), (2, 0.4)):
         history.do("set_roll", gesture=gesture, angle=angle)
     with pytest.raises(CongraspError, match="at least 3 cm"):
@@ -272,4 +278,5 @@ def test_a_gesture_is_one_edit_and_a_failed_action_is_none(studio: Studio) -> No
     history.undo()
     assert studio.arrow.roll(studio.up) == pytest.approx(0.3)
     history.undo()
-    assert same(studio, first) and history.view()["undo"] == ""
+    assert same(studio, first)
+    assert history.view()["undo"] == ""

@@ -17,7 +17,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.learner.run_directory import create_run
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
-from congrasp.services.train.command import EPISODE, _next_steps, _Progress
+from congrasp.services.train.command import EPISODE, TrainingProgress, print_next_steps
 from congrasp.services.train.launch import (
     Launch,
     LaunchRecord,
@@ -26,14 +26,22 @@ from congrasp.services.train.launch import (
 )
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import ProcessDied
+from tests.waits import eventually
 
 LAUNCH = Launch(actors=1)
 # 40 steps an update
 CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)
+SUPERVISOR = """
+    import pathlib, sys
+    from congrasp.learner.run_directory import supervised
+    with supervised(pathlib.Path(sys.argv[1])):
+        print("locked", flush=True)
+        sys.stdin.read()
+"""
 
 
 @pytest.fixture
-def said(monkeypatch):
+def printed_lines(monkeypatch):
     """What was printed so far, as lines."""
     output = io.StringIO()
     monkeypatch.setattr(command, "console", Console(file=output, width=200, soft_wrap=True))
@@ -59,10 +67,10 @@ def status(update, **values):
     return {"values": figures, "update": update, "version": update, "actors": 2}
 
 
-def test_progress_counts_the_time_left_from_the_first_update(said, clock):
+def test_progress_counts_the_time_left_from_the_first_update(printed_lines, clock):
     with stage("a stage"):
         pass
-    with _Progress(CONFIG) as progress:
+    with TrainingProgress(CONFIG) as progress:
         clock.seconds += 30  # compiling
         progress.show({"actors": 2})
         clock.seconds += 30
@@ -78,10 +86,12 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
                 },
             )
         )
-    first, *start, early, late = (line.strip() for line in said())
-    assert "First update" in start[0] and any(line.endswith(": a stage") for line in start[1:])
+    first, *start, early, late = (line.strip() for line in printed_lines())
+    assert "First update" in start[0]
+    assert any(line.endswith(": a stage") for line in start[1:])
     assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
-    assert early.startswith("update    1/10") and early.endswith("left ?")
+    assert early.startswith("update    1/10")
+    assert early.endswith("left ?")
     # Two updates took 20 s, so that the seven others take 70.
     for words in (
         "update    3/10",
@@ -95,13 +105,13 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
         assert words in late
 
 
-def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
-    with _Progress(CONFIG) as progress:
+def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(printed_lines, clock):
+    with TrainingProgress(CONFIG) as progress:
         for _ in range(22):
             clock.seconds += 1.0
             progress.show({"actors": 1})
     # The last one at the end
-    assert [line.split()[-4] for line in said()] == [
+    assert [line.split()[-4] for line in printed_lines()] == [
         "1",
         "11",
         "21",
@@ -119,26 +129,28 @@ def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
         soft_wrap=command.console.soft_wrap,
     )
     monkeypatch.setattr(command, "console", narrow)
-    with _Progress(CONFIG) as progress:
+    with TrainingProgress(CONFIG) as progress:
         progress.show(status(1))
-        progress._live._live.refresh()
-        assert "left ?" in output.getvalue()
+        eventually(lambda: "left ?" in output.getvalue())
 
 
-def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
+def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(printed_lines, tmp_path):
     from congrasp.services.cli.main import COMMANDS
 
     (tmp_path / EPISODE).touch()
-    _next_steps(tmp_path)
-    assert any(line.strip() == str(tmp_path / EPISODE) for line in said())
-    commands = [line.split("congrasp ", 1)[1].split()[0] for line in said() if "congrasp " in line]
-    assert commands and set(commands) <= set(COMMANDS)
+    print_next_steps(tmp_path)
+    assert any(line.strip() == str(tmp_path / EPISODE) for line in printed_lines())
+    commands = [
+        line.split("congrasp ", 1)[1].split()[0] for line in printed_lines() if "congrasp " in line
+    ]
+    assert commands
+    assert set(commands) <= set(COMMANDS)
 
 
 @pytest.mark.parametrize(
     ("free", "words"), [(1000, "disk of .* is full.*--resume"), (10**9, "its log is empty")]
 )
-def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, free, words):
+def test_a_run_that_dies_of_a_full_disk_names_it(printed_lines, monkeypatch, tmp_path, free, words):
     def die(*args, **options):
         checkpoint = tmp_path / "checkpoints" / "checkpoint_000000001.safetensors"
         checkpoint.parent.mkdir()
@@ -160,7 +172,9 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
         ({"environments": 0}, "empty"),
     ],
 )
-def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
+def test_a_configuration_that_cannot_run_leaves_no_run_behind(
+    printed_lines, tmp_path, change, words
+):
     with pytest.raises(CongraspError, match=words):
         config = dataclasses.replace(CONFIG, **change)
         command.run_training(config, tmp_path / "run", LAUNCH, resume=False, evaluation=0)
@@ -168,7 +182,7 @@ def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, ch
 
 
 @pytest.mark.parametrize("existed", [False, True])
-def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existed):
+def test_a_failed_start_removes_its_files(printed_lines, monkeypatch, tmp_path, existed):
     run_dir = tmp_path / "new" / "run"
     if existed:
         run_dir.mkdir(parents=True)
@@ -181,11 +195,14 @@ def test_a_failed_start_removes_what_it_made(said, monkeypatch, tmp_path, existe
     monkeypatch.setattr(command, "train", die)
     with pytest.raises(CongraspError, match=r"did not start.*run\.failed\.log"):
         command.run_training(CONFIG, run_dir, LAUNCH, resume=False, evaluation=0)
-    assert run_dir.exists() == existed and not (existed and any(run_dir.iterdir()))
+    assert run_dir.exists() == existed
+    assert not (existed and any(run_dir.iterdir()))
     assert run_dir.with_name("run.failed.log").read_text() == "out of memory"
 
 
-def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch, tmp_path):
+def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(
+    printed_lines, monkeypatch, tmp_path
+):
     def stopped(folder, *args, stop, **options):
         stop.set()
         if folder.name == "with checkpoint":
@@ -195,9 +212,10 @@ def test_a_stop_names_the_way_to_resume_only_with_a_checkpoint(said, monkeypatch
     monkeypatch.setattr(command, "train", stopped)
     for name in ("with checkpoint", "without"):
         command.run_training(CONFIG, tmp_path / name, LAUNCH, resume=False, evaluation=0)
-    kept, removed = (line for line in said() if "was stopped" in line)
-    assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in kept
-    assert "--resume" not in removed and not (tmp_path / "without").exists()
+    resumable, removed = (line for line in printed_lines() if "was stopped" in line)
+    assert f"--run-dir '{tmp_path / 'with checkpoint'}'" in resumable
+    assert "--resume" not in removed
+    assert not (tmp_path / "without").exists()
 
 
 def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):
@@ -207,16 +225,7 @@ def test_a_resume_without_a_folder_names_the_newest_run(monkeypatch, tmp_path):
         command.run_training(CONFIG, None, LAUNCH, resume=True, evaluation=0)
 
 
-SUPERVISOR = """
-    import pathlib, sys
-    from congrasp.learner.run_directory import supervised
-    with supervised(pathlib.Path(sys.argv[1])):
-        print("locked", flush=True)
-        sys.stdin.read()
-"""
-
-
-def test_a_resume_while_a_learner_restarts_is_refused(said, monkeypatch, tmp_path):
+def test_a_resume_while_a_learner_restarts_is_refused(printed_lines, monkeypatch, tmp_path):
     """Between the learner's death and its restart nothing but its supervisor holds a lock."""
     create_run(tmp_path, CONFIG)
     write_launch(tmp_path, LaunchRecord.of_plan(LAUNCH.planned(CONFIG), CONFIG.name))
@@ -234,7 +243,7 @@ def test_a_resume_while_a_learner_restarts_is_refused(said, monkeypatch, tmp_pat
         command.run_training(changed, tmp_path, LAUNCH, resume=True, evaluation=0)
 
 
-def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_path):
+def test_easier_settings_are_printed_at_the_start(printed_lines, monkeypatch, tmp_path):
     def stop(*args, **options):
         raise KeyboardInterrupt
 
@@ -247,7 +256,7 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
     full = get_preset("human").objects.count
     assert (
         f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of "
-        f"32 units" in said()[1]
+        f"32 units" in printed_lines()[1]
     )
 
 

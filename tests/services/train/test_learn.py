@@ -18,7 +18,8 @@ from congrasp.services.train import learn as training
 
 
 def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
-    seen, events = {}, []
+    seen = {}
+    events = []
 
     def learn(run_dir, config, *, wire, inside, stop, monitoring):
         seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
@@ -31,8 +32,10 @@ def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
     stop = threading.Event()
     training.until_first_update(RunConfig(), "native", stop, lambda: events.append("reported"))
     assert events == ["update 0", "reported", "update 1"]
-    assert stop.is_set() and seen["stop"] is stop
-    assert seen["inside"].physics == "native" and seen["config"].updates == 1
+    assert stop.is_set()
+    assert seen["stop"] is stop
+    assert seen["inside"].physics == "native"
+    assert seen["config"].updates == 1
     assert not seen["run_dir"].exists()
 
 
@@ -50,7 +53,8 @@ def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
 
 
 def test_an_engine_in_this_process_is_prepared_before_the_learner(monkeypatch, tmp_path):
-    begun, config = [], RunConfig()
+    begun = []
+    config = RunConfig()
     monkeypatch.setattr(training, "prepare_physics", lambda *engine: begun.append(engine))
     monkeypatch.setattr(training, "run_learner", lambda *run, **options: begun.append("learner"))
     training.learn(
@@ -67,15 +71,18 @@ def machine(tmp_path, monkeypatch):
 
     def become(name, version="1.2"):
         folders = {kind: tmp_path / name / "caches" / kind for kind in ("jax", "warp")}
-        monkeypatch.setattr(cache_archive, "_folders", lambda: folders)
-        monkeypatch.setattr(cache_archive, "_machine", lambda: {"JAX": version, "device": "GPU"})
+        monkeypatch.setattr(cache_archive, "cache_folders", lambda: folders)
+        monkeypatch.setattr(
+            cache_archive, "machine_facts", lambda: {"JAX": version, "device": "GPU"}
+        )
         return tmp_path / name
 
     return become
 
 
 def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
-    caches, file = machine("a") / "caches", tmp_path / "caches.tar"
+    caches = machine("a") / "caches"
+    file = tmp_path / "caches.tar"
 
     def first_update(config, physics, stop, report):
         for name, content in (
@@ -128,7 +135,8 @@ def _written(path, *members, manifest=None):
 
 def _link(kind, target):
     link = tarfile.TarInfo("jax/link")
-    link.type, link.linkname = kind, target
+    link.type = kind
+    link.linkname = target
     return link
 
 
@@ -152,7 +160,8 @@ def _link(kind, target):
     ),
 )
 def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, member):
-    file, here = _written(tmp_path / "caches.tar", "jax/program", member), machine("a")
+    file = _written(tmp_path / "caches.tar", "jax/program", member)
+    here = machine("a")
     with pytest.raises(CongraspError, match="no file of a cache"):
         cache_archive.import_caches(file)
     assert not here.exists()  # not even the members before it

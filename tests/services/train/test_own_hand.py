@@ -41,17 +41,16 @@ def stages(monkeypatch, tmp_path, claw):
     """Which stages ran, in their order, and what they do: `findings` of the check, `steps` of the
     policy.
     """
-    ran, does = [], {"findings": GOOD, "steps": 1000}
+    ran = []
+    does = {"findings": GOOD, "steps": 1000}
 
     def check_or_report(child, patience, progress=lambda line: None):
         ran.append(child.name)
         option = dict(zip(child.arguments, child.arguments[1:], strict=False))
         if child.name == "check":
             write_findings(pathlib.Path(option["--json"]), does["findings"])
-            assert (
-                child.arguments[:3] == ["hands", "check", "claw"]
-                and child.environment["JAX_PLATFORMS"] == "cpu"
-            )
+            assert child.arguments[:3] == ["hands", "check", "claw"]
+            assert child.environment["JAX_PLATFORMS"] == "cpu"
             return int(does["findings"] is BAD)
         content = bundles.content_hash(
             (pathlib.Path(child.arguments[1]) / "policy.safetensors").read_bytes()
@@ -86,11 +85,11 @@ def stages(monkeypatch, tmp_path, claw):
 
 
 def request(hand, out, **changes):
-    asked = Request(hand, "claw", out, False, False, "auto", 8, 2, ("--updates", "3"), 60.0)
-    return dataclasses.replace(asked, **changes)
+    made_request = Request(hand, "claw", out, False, False, "auto", 8, 2, ("--updates", "3"), 60.0)
+    return dataclasses.replace(made_request, **changes)
 
 
-def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
+def test_existing_results_are_not_recomputed(stages, claw, tmp_path):
     ran, _ = stages
     notes = []
     policy = train_hand(request(claw, tmp_path / "out"), notes.append)
@@ -123,18 +122,20 @@ def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
     assert "no GPU" not in "\n".join(notes)
 
 
-def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, claw, tmp_path):
+def test_a_hand_that_fails_its_check_is_trained_only_on_request(stages, claw, tmp_path):
     ran, does = stages
     does["findings"] = BAD
     for _ in range(2):
         with pytest.raises(CongraspError, match=r"'claw' failed its self-check.*--anyway"):
             train_hand(request(claw, tmp_path / "out"), lambda text: None)
-    assert ran == ["check"] and not own_policy_file("claw").exists()
+    assert ran == ["check"]
+    assert not own_policy_file("claw").exists()
     # Mended, it is checked anew.
     does["findings"] = GOOD
     mended = dataclasses.replace(claw, object_scale=0.8)
     train_hand(request(mended, tmp_path / "out"), lambda text: None)
-    assert ran[1] == "check" and len(ran) == 4
+    assert ran[1] == "check"
+    assert len(ran) == 4
     with pytest.raises(CongraspError, match="another hand, or of an earlier version of this hand"):
         train_hand(request(claw, tmp_path / "out"), lambda text: None)
     does["findings"] = BAD
@@ -146,7 +147,8 @@ def test_a_policy_of_more_experience_stays(stages, claw, tmp_path):
     _, does = stages
     does["steps"] = 10**8
     best = train_hand(request(claw, tmp_path / "long", full=True), lambda text: None)
-    does["steps"], notes = 1000, []
+    does["steps"] = 1000
+    notes = []
     train_hand(request(claw, tmp_path / "short"), notes.append)
     assert own_policy_file("claw").read_bytes() == best.read_bytes()
     assert "has more training (100,000,000 steps) and remains" in "\n".join(notes)
@@ -172,14 +174,14 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
         "--training=--updates 3",
     ]
     assert main.run(command) == 0
-    said = capsys.readouterr().out
-    assert (
-        "thumb        opposing_lower - opposing_upper" in said
-        and "congrasp grasp examples/mug.obj --hand claw" in said
-    )
+    printed = capsys.readouterr().out
+    assert "thumb        opposing_lower - opposing_upper" in printed
+    assert "congrasp grasp examples/mug.obj --hand claw" in printed
     file = tmp_path / "hands" / "claw.json"
-    made = file.read_text()
-    assert main.run(command) == 0 and len(ran) == 3 and file.read_text() == made
+    hand_text = file.read_text()
+    assert main.run(command) == 0
+    assert len(ran) == 3
+    assert file.read_text() == hand_text
     assert f"Using the existing hand 'claw' ({file})" in capsys.readouterr().out
     assert main.run(["hands", "list"]) == 0
     (row,) = [
@@ -192,9 +194,7 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.timeout(300)
 @pytest.mark.slow
-def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(
-    claw, monkeypatch, tmp_path
-):
+def test_a_killed_training_of_a_hand_resumes_to_its_policy(claw, monkeypatch, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / HAND).write_text(hand_text(claw))
@@ -219,12 +219,14 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(
     (run_dir / "mark").touch()
     first = max(int(file.stem.rpartition("_")[2]) for file in written())
 
-    monkeypatch.setattr(own_hand, "_report", lambda *arguments: None)
+    monkeypatch.setattr(own_hand, "write_report", lambda *arguments: None)
     last = first + 2
     options = ("--updates", str(last))
     policy = train_hand(request(claw, out, options=options, patience=200.0), lambda text: None)
     assert open_run(run_dir).task.hand == claw.reference
     trained = bundles.load(policy_file(None, "claw"))
-    assert trained.version == last and trained.spec.hand == claw.reference
+    assert trained.version == last
+    assert trained.spec.hand == claw.reference
     assert policy.read_bytes() == own_policy_file("claw").read_bytes()
-    assert first >= 1 and (run_dir / "mark").exists()  # one that begins anew clears its folder
+    assert first >= 1
+    assert (run_dir / "mark").exists()  # a training from scratch clears its folder

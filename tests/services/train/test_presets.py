@@ -34,10 +34,8 @@ def test_an_unknown_preset_lists_those_that_exist():
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_travels_and_its_batch_can_be_cut(name):
     config = get_preset(name)
-    assert (
-        config.name == (name if name != "full" else "human")
-        and run_config_from_json(to_json(config)) == config
-    )
+    assert config.name == (name if name != "full" else "human")
+    assert run_config_from_json(to_json(config)) == config
     get_hand(config.task.hand)
     procedural.family_turns(1, 0, config.objects.families)  # a CongraspError where one is unknown
     transitions = config.environments * config.rollout_steps * config.rollouts_per_update
@@ -47,9 +45,12 @@ def test_a_preset_travels_and_its_batch_can_be_cut(name):
 def test_the_full_task_is_that_of_the_hand_that_a_command_line_names(claw):
     assert get_preset("full") == get_preset("human") == get_preset("allegro", "human")
     assert get_preset("full", "allegro") == get_preset("allegro") == get_preset("human", "allegro")
-    own = defaults(["--preset", "full", "--hand=claw"])["config"]
-    assert own == get_preset("full", "claw") and own.name == "claw" and own.task.hand == claw.text
-    assert with_hand(own, "claw") == own and easier(own) == []
+    config = defaults(["--preset", "full", "--hand=claw"])["config"]
+    assert config == get_preset("full", "claw")
+    assert config.name == "claw"
+    assert config.task.hand == claw.text
+    assert with_hand(config, "claw") == config
+    assert easier(config) == []
     for name in ("full", "human", "quickstart"):
         with pytest.raises(CongraspError, match="no hand 'paw'"):
             get_preset(name, "paw")
@@ -58,7 +59,7 @@ def test_the_full_task_is_that_of_the_hand_that_a_command_line_names(claw):
     assert get_preset("quickstart", "allegro") == dataclasses.replace(quick, task=task)
 
 
-def test_what_was_made_easier_is_said_and_nothing_else():
+def test_easier_settings_alone_are_listed():
     assert easier(get_preset("human")) == []
     words = easier(get_preset("quickstart"))
     assert {"hands approach from above only", "friction is soft"} <= set(words)
@@ -80,7 +81,7 @@ RULES = {
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_the_hands_of_the_package_have_what_the_rules_give(name):
+def test_hands_of_the_package_follow_the_rules(name):
     hand = get_hand(name)
     assert rules(hand) == RULES[name]
     assert fitting_scale(grasp_frame(hand).opening) == hand.object_scale
@@ -88,16 +89,31 @@ def test_the_hands_of_the_package_have_what_the_rules_give(name):
 
 @pytest.mark.parametrize("name", RULES)
 def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
-    own, human = recipe(get_hand(name)), recipe(get_hand("human"))
+    config = recipe(get_hand(name))
+    human = recipe(get_hand("human"))
     ruled = dataclasses.asdict(rules(get_hand(name)))
     share = ruled.pop("p_affordance")
     weights = dataclasses.replace(human.curriculum.reward, **ruled)
-    assert own.curriculum == dataclasses.replace(human.curriculum, reward=weights)
-    assert own.task.reward == dataclasses.replace(human.task.reward, force_max=ruled["force_max"])
-    task = dataclasses.replace(
-        human.task, hand=name, reward=own.task.reward, **{"p_affordance": share}
+    assert config.curriculum == dataclasses.replace(human.curriculum, reward=weights)
+    assert config.task.reward == dataclasses.replace(
+        human.task.reward, force_max=ruled["force_max"]
     )
-    assert own == dataclasses.replace(human, name=name, task=task, curriculum=own.curriculum)
+    task = dataclasses.replace(
+        human.task, hand=name, reward=config.task.reward, **{"p_affordance": share}
+    )
+    assert config == dataclasses.replace(human, name=name, task=task, curriculum=config.curriculum)
+
+
+def with_torques(hand, factor):
+    """A hand whose torque limits are `factor` times as large."""
+    links = []
+    for link in hand.links:
+        joints = [
+            dataclasses.replace(joint, torque_limit=factor * joint.torque_limit)
+            for joint in link.joints
+        ]
+        links.append(dataclasses.replace(link, joints=tuple(joints)))
+    return dataclasses.replace(hand, links=tuple(links))
 
 
 def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever():
@@ -106,40 +122,16 @@ def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever
     # tip and makes 4.6 N.
     allegro = get_hand("allegro")
     assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
-    links = tuple(
-        dataclasses.replace(
-            link,
-            joints=tuple(
-                dataclasses.replace(joint, torque_limit=2 * joint.torque_limit)
-                for joint in link.joints
-            ),
-        )
-        for link in allegro.links
-    )
-    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(
-        2 * tip_forces(allegro)
-    )
+    assert tip_forces(with_torques(allegro, 2.0)) == pytest.approx(2 * tip_forces(allegro))
 
 
 def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
     allegro = get_hand("allegro")
 
-    def with_torque(factor):
-        links = tuple(
-            dataclasses.replace(
-                link,
-                joints=tuple(
-                    dataclasses.replace(j, torque_limit=factor * j.torque_limit)
-                    for j in link.joints
-                ),
-            )
-            for link in allegro.links
-        )
-        return rules(dataclasses.replace(allegro, links=links))
-
-    found = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
-    assert [one.p_affordance for one in found] == sorted(
-        (one.p_affordance for one in found), reverse=True
+    configs = [rules(with_torques(allegro, factor)) for factor in (0.5, 1, 4, 20)]
+    assert [one.p_affordance for one in configs] == sorted(
+        (one.p_affordance for one in configs), reverse=True
     )
-    assert found[0].p_affordance == 0.8 and found[-1].p_affordance == 0.6
-    assert len({one.force_max for one in found}) == 1
+    assert configs[0].p_affordance == 0.8
+    assert configs[-1].p_affordance == 0.6
+    assert len({one.force_max for one in configs}) == 1

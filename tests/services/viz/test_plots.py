@@ -1,5 +1,6 @@
 """Figures of runs and of evaluations: every metric once, and what their files say."""
 
+import itertools
 import json
 import pathlib
 
@@ -38,7 +39,8 @@ METRICS = {
 
 
 def record(directory: pathlib.Path, updates: int = 30) -> None:
-    writer, channels = LogWriter(directory, "log"), JsonChannels()
+    writer = LogWriter(directory, "log")
+    channels = JsonChannels()
     for i in range(updates):
         values = nest({name: value * (1 + i / updates) for name, value in METRICS.items()})
         writer.write(channels.entry("/metrics/learner/0", i, {"update": i, "values": values}))
@@ -65,10 +67,11 @@ def test_settings_of_matplotlib_change_no_figure(tmp_path: pathlib.Path) -> None
 def test_every_metric_is_in_exactly_one_panel() -> None:
     series = {f"learner/0/{name}": (np.arange(3), np.arange(3.0)) for name in METRICS}
     groups = figures({"run": series})
-    shown = [
-        metric for _, panels in groups.values() for panel in panels for metric in panel.metrics
-    ]
-    assert sorted(shown) == sorted(METRICS)
+    plotted = []
+    for _, panels in groups.values():
+        for panel in panels:
+            plotted += panel.metrics
+    assert sorted(plotted) == sorted(METRICS)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [
         ("term/contact",),
         ("term/force_excess",),
@@ -88,7 +91,7 @@ def test_a_run_becomes_png_files(
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     figures = ("learning", "reward_terms", "episodes", "details")
     assert [file.name for file in files] == [
-        f"{name}.{kind}" for name in figures for kind in ("png", "pdf")
+        f"{name}.{kind}" for name, kind in itertools.product(figures, ("png", "pdf"))
     ]
     assert all(file.read_bytes().startswith(b"%PDF-") for file in files if file.suffix == ".pdf")
     assert all(file.parent == tmp_path / "run" / "plots" for file in files)
@@ -100,7 +103,8 @@ def test_a_run_becomes_png_files(
 
 
 def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Path) -> None:
-    rising, flat = np.arange(4.0), np.full(4, 2.0)
+    rising = np.arange(4.0)
+    flat = np.full(4, 2.0)
     one = {
         "learner/0/kl": rising,
         "learner/0/term/drop": flat,
@@ -112,10 +116,9 @@ def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Pa
         "learner/0/term/drop": flat,
         "learner/0/term/contact": 3 * flat,
     }
-    runs = {
-        name: {metric: (np.arange(4), values) for metric, values in run.items()}
-        for name, run in (("a", one), ("b", two))
-    }
+    runs = {}
+    for name, run in (("a", one), ("b", two)):
+        runs[name] = {metric: (np.arange(4), values) for metric, values in run.items()}
     groups = figures(runs)
     assert [panel.metrics for panel in groups["reward_terms"][1]] == [("term/contact",)]
     figure = draw("Learning", groups["learning"][1], runs)
@@ -210,7 +213,8 @@ def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> Non
     heading, composed, fingers = table.rows
     assert heading[:5] == ["heading", "40", "75.0 % (59.8-85.8)", "96.9 %", "0.0 %"]
     at = table.columns.index("Heading error, rad")
-    assert heading[at : at + 2] == ["0.250", "0.137"] and composed[at : at + 2] == ["", ""]
+    assert heading[at : at + 2] == ["0.250", "0.137"]
+    assert composed[at : at + 2] == ["", ""]
     at = table.columns.index("Affordance error, share")
     assert composed[at : at + 2] == ["0.250", "0.045"]
     at = table.columns.index("Fingers error, share")
@@ -233,7 +237,7 @@ def test_an_evaluation_becomes_png_and_pdf(
     assert plot((tmp_path / "e.json",)) == 0
     files = [pathlib.Path(line) for line in capsys.readouterr().out.split()]
     assert [f.name for f in files] == [
-        f"{n}.{k}" for n in ("table", "success", "errors") for k in ("png", "pdf")
+        f"{n}.{k}" for n, k in itertools.product(("table", "success", "errors"), ("png", "pdf"))
     ]
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF-"}
     assert all(file.read_bytes().startswith(starts[file.suffix]) for file in files)

@@ -1,6 +1,7 @@
 """Pictures show all shapes, in their places and colours."""
 
 import dataclasses
+import itertools
 import pathlib
 from typing import Any
 
@@ -53,7 +54,9 @@ from congrasp.services.viz.views import (
 from tests.children import python
 from tests.episodes import CONTROL_DT, episode, episode_message
 
-WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+WHITE = (0.9, 0.9, 0.9)
+RED = (0.8, 0.1, 0.1)
+BLUE = (0.1, 0.1, 0.8)
 FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
 
 
@@ -93,31 +96,33 @@ def test_a_ball_covers_its_projection() -> None:
     radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(15)) * 100
     assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
     rows, columns = np.nonzero(seen)
-    assert rows.mean() == pytest.approx(99.5, abs=0.1) and columns.mean() == pytest.approx(
-        99.5, abs=0.1
-    )
+    assert rows.mean() == pytest.approx(99.5, abs=0.1)
+    assert columns.mean() == pytest.approx(99.5, abs=0.1)
 
 
 def test_right_is_right_and_up_is_up():
     # Seen from +x, +y lies to the right.
     seen = visible([ball(0.03, at=(0, 0.15, 0.15))], FRONT, (100, 100)) == 0
     rows, columns = np.nonzero(seen)
-    assert rows.mean() < 40 and columns.mean() > 60
+    assert rows.mean() < 40
+    assert columns.mean() > 60
 
 
 def test_the_nearer_shape_hides_the_other() -> None:
     seen = visible([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))], FRONT, (101, 101))
-    assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
+    assert seen[50, 50] == 1
+    assert seen[35, 50] == 0
+    assert seen[0, 0] == -1
 
 
 def test_a_transparent_shape_takes_its_share_of_the_colour() -> None:
     pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
-    plain, through = (
-        render_scene([ball()], FRONT, (61, 61)),
-        render_scene([ball(), pane], FRONT, (61, 61)),
-    )
-    center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
-    assert center[0] < center_plain[0] and center[2] > center_plain[2]
+    plain = render_scene([ball()], FRONT, (61, 61))
+    through = render_scene([ball(), pane], FRONT, (61, 61))
+    center_plain = plain[30, 30].astype(int)
+    center = through[30, 30].astype(int)
+    assert center[0] < center_plain[0]
+    assert center[2] > center_plain[2]
     assert center[0] > 40  # the red ball is still seen
     hidden = box((0.02, 0.04, 0.04), BLUE, (-0.3, 0, 0), alpha=0.5)
     np.testing.assert_array_equal(
@@ -164,12 +169,16 @@ def test_a_border_between_two_colours_is_sharp_and_straight() -> None:
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array(
-        [[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)]
+        [
+            [0.1, y, z]
+            for y, z in itertools.product(np.linspace(-0.1, 0.1, 11), np.linspace(-0.1, 0.1, 11))
+        ]
     )
     paint = Colours(points, np.where(points[:, 2:] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
     painted = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)
     image = render_scene([painted], FRONT, (60, 60)).astype(int)
-    assert image[20, 30, 0] > 2 * image[20, 30, 2] and image[40, 30, 2] > 2 * image[40, 30, 0]
+    assert image[20, 30, 0] > 2 * image[20, 30, 2]
+    assert image[40, 30, 2] > 2 * image[40, 30, 0]
 
 
 def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
@@ -182,7 +191,8 @@ def test_smooth_normals_are_those_of_the_surface_and_keep_sharp_edges() -> None:
         return float(np.degrees(np.arccos(np.clip((unit * exact).sum(-1), -1, 1))).max())
 
     assert len(corners) > 2 * len(sphere.faces)
-    assert degrees_off(flat_normals(corners)) > 5 and degrees_off(smooth) < 2
+    assert degrees_off(flat_normals(corners)) > 5
+    assert degrees_off(smooth) < 2
     box = trimesh.creation.box((1, 1, 1))
     corners, smooth = cut(*smooth_corners(box.vertices, box.faces))
     np.testing.assert_allclose(
@@ -203,11 +213,13 @@ def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     mesh = trimesh.Trimesh(
         corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
     )
-    assert mesh.area == pytest.approx(box.area) and mesh.volume == pytest.approx(box.volume)
+    assert mesh.area == pytest.approx(box.area)
+    assert mesh.volume == pytest.approx(box.volume)
 
 
 def test_between_and_arrow_connect_their_points() -> None:
-    start, end = np.array([0.1, -0.2, 0.3]), np.array([-0.2, 0.1, 0.1])
+    start = np.array([0.1, -0.2, 0.3])
+    end = np.array([-0.2, 0.1, 0.1])
     capsule = between(start, end, 0.01, RED)
     axis = Rotation.from_quat(capsule.quaternion, scalar_first=True).apply([0, 0, capsule.size[1]])
     np.testing.assert_allclose(
@@ -248,7 +260,8 @@ def test_a_following_camera_keeps_hand_and_object_in_view() -> None:
     long = episode(80)
     for step, camera in zip(range(0, 80, 4), cameras(), strict=True):
         places = projected(camera, extent(long, step))
-        assert np.abs(places[:, 0]).max() < 16 / 9 and np.abs(places[:, 1]).max() < 1
+        assert np.abs(places[:, 0]).max() < 16 / 9
+        assert np.abs(places[:, 1]).max() < 1
 
 
 def test_a_following_camera_shows_the_object_a_third_wide_if_the_hand_fits() -> None:
@@ -263,7 +276,10 @@ def test_a_following_camera_shows_the_object_a_third_wide_if_the_hand_fits() -> 
 def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
     table = np.arange(75) < 50
     steps = key_steps(table, 8)
-    assert steps[0] == 0 and steps[-1] == 74 and 50 in steps and len(steps) == 8
+    assert steps[0] == 0
+    assert steps[-1] == 74
+    assert 50 in steps
+    assert len(steps) == 8
     assert key_steps(np.ones(3, bool), 8) == [0, 1, 2]
 
 
@@ -334,9 +350,9 @@ def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
 def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> None:
     best, aside = views(episode(), [11])
     assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
-    made = episode()
+    recorded = episode()
     hand = get_hand("human")
-    capsules = capsule_shapes(hand, made.link_position[11], made.link_quaternion[11])
+    capsules = capsule_shapes(hand, recorded.link_position[11], recorded.link_quaternion[11])
     shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
     tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # in contact
 
@@ -345,8 +361,10 @@ def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> N
         return int(tips[seen[seen >= 0]].sum())
 
     others = [shown(View(float(azimuth), best.elevation)) for azimuth in range(0, 360, 30)]
-    assert shown(best) > 1.2 * min(others) and shown(best) > np.median(others)
-    assert view_of("") is None and view_of("-30, 20") == View(-30.0, 20.0)
+    assert shown(best) > 1.2 * min(others)
+    assert shown(best) > np.median(others)
+    assert view_of("") is None
+    assert view_of("-30, 20") == View(-30.0, 20.0)
     for text in ("30", "30 95", "left 20"):
         with pytest.raises(CongraspError, match="--camera is"):
             view_of(text)
@@ -367,16 +385,15 @@ def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
         images, ["a", "b", "c"], 2, "a title that is much too long for so narrow a sheet"
     )
     assert sheet.shape == (44 + 2 * (20 + 24) + 10, 2 * 40 + 10, 3)
-    assert (
-        (sheet[44:64, 10:40] == 0).all()
-        and (sheet[44:64, 50:80] == 80).all()
-        and (sheet[88:108, 10:40] == 160).all()
-    )
+    assert (sheet[44:64, 10:40] == 0).all()
+    assert (sheet[44:64, 50:80] == 80).all()
+    assert (sheet[88:108, 10:40] == 160).all()
     wide = [np.zeros((20, 100, 3), np.uint8)] * 2
     labels = contact_sheet(wide, ["tendon_of_a_joint_and_of_another_one_and_more -0.35"] * 2, 2)[
         30:54
     ]
-    assert (labels[:, 114:120] == labels[0, 0]).all() and (labels[:, 12:112] != labels[0, 0]).any()
+    assert (labels[:, 114:120] == labels[0, 0]).all()
+    assert (labels[:, 12:112] != labels[0, 0]).any()
     labels = contact_sheet(
         wide, [f"the_proximal_joint_of_the_{x}_finger_is_bent -0.35" for x in ("ring", "long")], 2
     )
@@ -438,11 +455,10 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (6, 6 * 2 * CONTROL_DT)
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
-    bare, marked = (
-        episode_shapes(episode(), 11, overlays=False),
-        episode_shapes(episode(), 11),
-    )
-    assert len(bare) == 3 and len(marked) > 3
+    bare = episode_shapes(episode(), 11, overlays=False)
+    marked = episode_shapes(episode(), 11)
+    assert len(bare) == 3
+    assert len(marked) > 3
 
 
 def test_pictures_need_no_writable_folder() -> None:

@@ -15,7 +15,8 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.services.assets.captures.human import TO_HUMAN, joint_positions
 from congrasp.services.assets.captures.references import separated
 
-FRAMES, GRASP = 90, 60
+FRAMES = 90
+GRASP = 60
 """Frames of a sequence, and the one in which the fingers have closed."""
 ORIGIN = np.array([0.02, -0.01, 0.03])
 """Where the box's centre lies in its mesh file, m."""
@@ -62,9 +63,9 @@ class Known:
     def waypoints(self, count: int = 15) -> tuple[np.ndarray, Rotation]:
         """The expected trajectory, at equal distances along the path."""
         length = np.concatenate([[0], np.linalg.norm(np.diff(self.path, axis=0), axis=-1).cumsum()])
-        wanted = np.linspace(0, length[-1], count)
-        position = np.stack([np.interp(wanted, length, axis) for axis in self.path.T], -1)
-        return position, Slerp(length, self.turns)(wanted)
+        lengths = np.linspace(0, length[-1], count)
+        position = np.stack([np.interp(lengths, length, axis) for axis in self.path.T], -1)
+        return position, Slerp(length, self.turns)(lengths)
 
 
 def make(
@@ -83,7 +84,8 @@ def make(
     q = q_closed(np.random.default_rng(0))
     rng = np.random.default_rng(seed)
     tips = joint_positions(q)[:2, 3]
-    middle, across = tips.mean(0), tips[1] - tips[0]
+    middle = tips.mean(0)
+    across = tips[1] - tips[0]
     width = float(np.linalg.norm(across))
     # The box's x axis is the pinch; its other edges are shorter than a hand, and any roll about the
     # pinch will do.
@@ -92,7 +94,8 @@ def make(
     y /= np.linalg.norm(y)
     box = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], -1))  # object frame to wrist frame
     size = np.array([width - 0.016, 0.03, 0.03 + tail])
-    grasp_turn, grasp_at = box.inv(), -box.inv().apply(middle) + [0, 0, tail / 2]
+    grasp_turn = box.inv()
+    grasp_at = -box.inv().apply(middle) + [0, 0, tail / 2]
 
     outward = grasp_turn.apply([0, 1.0, 0.3]) / np.linalg.norm([0, 1.0, 0.3])
     side = np.cross(outward, rng.normal(size=3))
@@ -135,19 +138,19 @@ def make(
     )
 
 
-def write_mesh(known: Known, path: pathlib.Path) -> None:
+def write_mesh(scene: Known, path: pathlib.Path) -> None:
     """The box's mesh in metres."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    known.mesh().export(path)
+    scene.mesh().export(path)
 
 
-def check(arrays: dict[str, np.ndarray], m: int, known: Known) -> None:
+def check(arrays: dict[str, np.ndarray], m: int, scene: Known) -> None:
     """Pose and trajectory m of a set are the known ones within 1 mm and 0.01 rad."""
-    position, turns = known.waypoints(arrays["trajectory/position"].shape[2])
-    found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
+    position, turns = scene.waypoints(arrays["trajectory/position"].shape[2])
+    rotation = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
     np.testing.assert_allclose(arrays["trajectory/position"][0, m], position, atol=1e-3)
-    assert (found * turns.inv()).magnitude().max() < 0.01
-    np.testing.assert_allclose(arrays["pose/q"][0, m], known.q, atol=0.01)
+    assert (rotation * turns.inv()).magnitude().max() < 0.01
+    np.testing.assert_allclose(arrays["pose/q"][0, m], scene.q, atol=0.01)
     np.testing.assert_allclose(arrays["pose/position"][0, m], position[-1], atol=1e-3)
     last = Rotation.from_quat(arrays["pose/quaternion"][0, m], scalar_first=True)
     assert (last * turns[-1].inv()).magnitude() < 0.01

@@ -54,7 +54,7 @@ def write(case, root, session, *, meta=None, change=lambda poses: None):
     known.write_mesh(case, root / "models" / "025_mug" / "textured_simple.obj")
 
 
-def test_a_known_answer_comes_back(run_import, tmp_path, mano):
+def test_a_synthetic_grasp_is_recovered(run_import, tmp_path, mano):
     case = known.make("lift", "025_mug", 7)
     write(case, tmp_path, "20200709_141754")
     sets, report = run_import("dexycb", tmp_path, "--mano", mano)
@@ -62,7 +62,7 @@ def test_a_known_answer_comes_back(run_import, tmp_path, mano):
     known.check(sets["025_mug"].arrays, 0, case)
 
 
-def test_what_is_wrong_with_a_session_is_said(run_import, tmp_path, mano):
+def test_a_faulty_session_names_its_fault(run_import, tmp_path, mano):
     case = known.make("lift", "025_mug", 8)
 
     def unseen(poses):
@@ -103,6 +103,6 @@ def test_what_is_wrong_with_a_session_is_said(run_import, tmp_path, mano):
     }
 
 
-def test_the_mano_file_is_asked_for(run_import, tmp_path):
+def test_a_missing_mano_file_is_requested(run_import, tmp_path):
     with pytest.raises(CongraspError, match="require the file MANO_RIGHT"):
         run_import("dexycb", tmp_path)

@@ -17,7 +17,8 @@ def write(case, root, wrist, *, labels=None, change=lambda data: None):
     vertices = 8
     if labels is None:
         labels = np.zeros((frames, vertices), int)
-        labels[known.GRASP :, 0], labels[known.GRASP :, 1] = 55, 43
+        labels[known.GRASP :, 0] = 55
+        labels[known.GRASP :, 1] = 43
     hand = {
         "global_orient": known.mano_root(case.wrist_rotation).as_rotvec(),
         "hand_pose": np.zeros((frames, 24)),
@@ -54,7 +55,7 @@ def write(case, root, wrist, *, labels=None, change=lambda data: None):
     )
 
 
-def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tmp_path, mano):
+def test_a_synthetic_grasp_is_recovered_with_the_subjects_template(run_import, tmp_path, mano):
     template = content()["v_template"] + np.array([0.003, -0.002, 0.004])
     folder = tmp_path / "tools" / "subject_meshes" / "male"
     folder.mkdir(parents=True)
@@ -63,17 +64,15 @@ def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tm
     case = known.make("box_lift_1", "box", 3)
     write(case, tmp_path, skeleton()[0][0] + np.array([0.003, -0.002, 0.004]))
     sets, report = run_import("grab", tmp_path, "--mano", mano)
-    assert (
-        not report.dropped
-        and report.kept[0]["residual_rad"] < 1e-3
-        and report.kept[0]["residual_tip_m"] < 1e-4
-    )
+    assert not report.dropped
+    assert report.kept[0]["residual_rad"] < 1e-3
+    assert report.kept[0]["residual_tip_m"] < 1e-4
     known.check(sets["box"].arrays, 0, case)
     # No labelled parts: everything may be grasped
     assert not sets["box"].arrays["surface/avoid"].any()
 
 
-def test_without_a_mano_file_the_human_hands_bones_stand_in(run_import, tmp_path):
+def test_without_a_mano_file_the_human_hands_bones_are_used(run_import, tmp_path):
     case = known.make("box_lift_1", "box", 4)
     write(case, tmp_path, MEAN_WRIST)
     sets, _ = run_import("grab", tmp_path / "grab" / "s1" / "box_lift_1.npz")
@@ -92,7 +91,7 @@ def test_grabnet_names_the_grasping_frame(run_import, tmp_path):
     assert [row["frame"] for row in report.kept] == [70]
 
 
-def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
+def test_a_faulty_file_names_its_fault(run_import, tmp_path):
     case = known.make("box_lift", "box", 6)
 
     def variant(name, change, **options):
@@ -113,7 +112,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     variant("box_lefttouch_1", lambda data: None, labels=np.full((known.FRAMES, 8), 25))
     variant("cup_lift_1", lambda data: data.update(obj_name="cup"))
     sets, report = run_import("grab", tmp_path)
-    assert [row["sequence"] for row in report.kept] == ["s1/box_right_1"] and list(sets) == ["box"]
+    assert [row["sequence"] for row in report.kept] == ["s1/box_right_1"]
+    assert list(sets) == ["box"]
     assert {
         row["sequence"].removeprefix("s1/").removesuffix("_1"): row["rule"]
         for row in report.dropped

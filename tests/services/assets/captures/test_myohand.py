@@ -67,13 +67,14 @@ def test_the_arm_is_that_of_the_model():
         assert (turn * other.inv()).magnitude() < 1e-5
 
 
-def test_a_known_answer_comes_back(run_import, tmp_path):
+def test_a_synthetic_grasp_is_recovered(run_import, tmp_path):
     cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed) for seed in range(2)]
     for case in cases:
         write(case, tmp_path / "data" / f"{case.name}.npz")
     known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", tmp_path / "data", "--meshes", tmp_path / "meshes")
-    assert not report.dropped and [row["frame"] for row in report.kept] == [known.GRASP] * 2
+    assert not report.dropped
+    assert [row["frame"] for row in report.kept] == [known.GRASP] * 2
     for m, case in enumerate(cases):
         known.check(sets["box"].arrays, m, case)
     assert sets["box"].meta["demonstrations"] == [case.name for case in cases]
@@ -83,9 +84,7 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
 
 @pytest.mark.parametrize("headings", ["sampled", "demonstrated"])
 @pytest.mark.slow
-def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(
-    run_import, tmp_path, headings
-):
+def test_a_fifth_of_all_sequences_is_held_out(run_import, tmp_path, headings):
     for seed, name in enumerate("abcde"):
         case = known.make(f"MyoHand_{name}_lift", name, seed)
         write(case, tmp_path / "data" / f"{case.name}.npz")
@@ -93,11 +92,12 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
     options = ["--meshes", tmp_path / "meshes", "--headings", headings]
     _, report = run_import("myohand", tmp_path / "data", *options)
     held = [row["object"] for row in report.kept if row["split"] == "held-out"]
-    assert len(report.kept) == 5 and len(held) == 1
+    assert len(report.kept) == 5
+    assert len(held) == 1
     catalogue = Catalogue(tmp_path / "objects")
-    found = [catalogue.get(name) for name in catalogue.list()]
+    imported = [catalogue.get(name) for name in catalogue.list()]
     for split, names in (("training", set("abcde") - set(held)), ("held-out", set(held))):
-        objects, chosen = load_for(tmp_path / "out", found, split)
+        objects, chosen = load_for(tmp_path / "out", imported, split)
         if headings == "demonstrated":  # a heading belongs where its demonstration does
             assert {obj.name for obj in objects} == names
         valid = bank_of(chosen, split).pose_valid[:, 0].any((1, 2))
@@ -106,11 +106,12 @@ def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_o
         } == names
 
 
-def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
+def test_a_faulty_file_names_its_fault(run_import, tmp_path):
     case = known.make("MyoHand_box_lift", "box")
     folder = tmp_path / "data"
     right = write(case, folder / "MyoHand_box_right.npz")
-    robot, pose = right["robot"], right["object"]
+    robot = right["robot"]
+    pose = right["object"]
     write(case, folder / "MyoHand_box_nokey.npz", object=None)
     write(case, folder / "MyoHand_box_back.npz", time=right["time"][::-1])
     write(case, folder / "MyoHand_box_shape.npz", robot=robot[:, :28])
@@ -129,9 +130,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     write(case, folder / "MyoHand_box_limits.npz", robot=limits)
     known.write_mesh(case, tmp_path / "meshes" / "box.stl")
     sets, report = run_import("myohand", folder, "--meshes", tmp_path / "meshes")
-    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"] and list(sets) == [
-        "box"
-    ]
+    assert [row["sequence"] for row in report.kept] == ["MyoHand_box_right"]
+    assert list(sets) == ["box"]
     reasons = {
         row["sequence"].split("_")[-1]: (row["rule"], row["reason"]) for row in report.dropped
     }
@@ -148,7 +148,8 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
         ("lift", "no mesh", "no mesh of 'cup'"),
         ("limits", "joint limits", "ring_pip is 0.45 rad beyond"),
     ):
-        assert reasons[name][0] == rule and words in reasons[name][1]
+        assert reasons[name][0] == rule
+        assert words in reasons[name][1]
 
 
 def test_missing_frames_are_bridged_or_end_the_approach(run_import, tmp_path):

@@ -7,12 +7,12 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures import build, dexycb
-from congrasp.services.assets.captures.dexycb import _betas, _yaml
-from congrasp.services.assets.captures.grab import _template
+from congrasp.services.assets.captures.dexycb import calibrated_shape
+from congrasp.services.assets.captures.grab import hand_template
 from congrasp.services.assets.captures.sequence import Dropped, Meshes
 
 
-def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folders(tmp_path):
+def test_names_in_data_sets_stay_inside_their_folders(tmp_path):
     (tmp_path / "x.obj").write_text("v 0 0 0\n")
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "y.obj").write_text("v 0 0 0\n")
@@ -22,10 +22,10 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
         with pytest.raises(CongraspError, match="cannot name the mesh"):
             meshes.find("a", name)
     with pytest.raises(CongraspError, match="cannot name a calibration"):
-        _betas("a", tmp_path / "in", "/../../x")
+        calibrated_shape("a", tmp_path / "in", "/../../x")
     inside, outside = ({"rhand/vtemp": name} for name in ("y.obj", "../x.obj"))
-    assert _template(tmp_path / "in", inside) == pathlib.Path(tmp_path / "in" / "y.obj")
-    assert _template(tmp_path / "in", outside) is None
+    assert hand_template(tmp_path / "in", inside) == pathlib.Path(tmp_path / "in" / "y.obj")
+    assert hand_template(tmp_path / "in", outside) is None
 
 
 def test_objects_of_one_name_and_different_meshes_get_different_names(tmp_path, monkeypatch):
@@ -46,11 +46,18 @@ def test_objects_of_one_name_and_different_meshes_get_different_names(tmp_path, 
     ]
 
 
+def dropped_for(folder, text):
+    """Reads the one sequence of a data set, whose `meta.yml` has this text."""
+    session = folder / "subject" / "session"
+    session.mkdir(parents=True)
+    (session / "meta.yml").write_text(text)
+    (sequence,) = dexycb.read(folder, Meshes(()), types.SimpleNamespace())
+    return sequence
+
+
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: " * 5, "\x00", "- a", "a: &x [1]\nb: [*x, *x]"])
-def test_settings_that_are_none_are_dropped(tmp_path, text):
-    (tmp_path / "meta.yml").write_text(text)
-    with pytest.raises(Dropped):
-        _yaml("a", tmp_path / "meta.yml")
+def test_damaged_settings_drop_their_sequence(tmp_path, text):
+    assert isinstance(dropped_for(tmp_path, text), Dropped)
 
 
 def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
@@ -65,7 +72,6 @@ def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
 @pytest.mark.parametrize("value", ["a", "[1]", "{b: 1}", "null"])
 def test_settings_of_other_types_drop_their_sequence_alone(tmp_path, value):
     text = f"mano_sides: [right]\nycb_ids: [1]\nycb_grasp_ind: {value}\nmano_calib: [x]\n"
-    (tmp_path / "subject" / "session").mkdir(parents=True)
-    (tmp_path / "subject" / "session" / "meta.yml").write_text(text)
-    (dropped,) = dexycb.read(tmp_path, Meshes(()), types.SimpleNamespace())
-    assert isinstance(dropped, Dropped) and dropped.rule == "wrong layout"
+    dropped = dropped_for(tmp_path, text)
+    assert isinstance(dropped, Dropped)
+    assert dropped.rule == "wrong layout"

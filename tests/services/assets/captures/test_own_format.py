@@ -26,9 +26,8 @@ def test_an_importer_from_outside_needs_a_file_and_a_row(run_import, tmp_path, m
     np.savez(tmp_path / "data" / "cup_lift.capture.npz", **arrays)
     known.write_mesh(case, tmp_path / "meshes" / "box.stl")
     sets, report = run_import("own", tmp_path / "data", "--meshes", tmp_path / "meshes")
-    assert [row["sequence"] for row in report.kept] == ["box_lift"] and sets["box"].meta[
-        "source"
-    ] == "own"
+    assert [row["sequence"] for row in report.kept] == ["box_lift"]
+    assert sets["box"].meta["source"] == "own"
     known.check(sets["box"].arrays, 0, case)
     assert [(row["sequence"], row["rule"]) for row in report.dropped] == [("cup_lift", "no mesh")]
     (tmp_path / "empty").mkdir()

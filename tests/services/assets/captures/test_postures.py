@@ -22,7 +22,7 @@ def test_captured_posture_counts_fingers_without_contact_as_idle():
     index_tip = np.asarray(keypoints(HUMAN, link_transforms(HUMAN, q[0])))[links + 1]
     far_away = np.array([1.0, 0.0, 0.0])
     index_at_ball = -index_tip
-    found = posture_deviations(
+    deviations = posture_deviations(
         HUMAN,
         q,
         np.stack([far_away, index_at_ball]),
@@ -31,5 +31,5 @@ def test_captured_posture_counts_fingers_without_contact_as_idle():
     )
     touching = np.zeros((1, len(HUMAN.links)), bool)
     without_contact = unnatural(HUMAN, jnp.asarray(q[:1]), jnp.asarray(touching))
-    np.testing.assert_allclose(found[0], without_contact[0], atol=1e-6)
-    assert found[1] < found[0] - 0.02
+    np.testing.assert_allclose(deviations[0], without_contact[0], atol=1e-6)
+    assert deviations[1] < deviations[0] - 0.02

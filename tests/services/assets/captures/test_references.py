@@ -1,6 +1,4 @@
-"""References from captures: when fingers have closed, fingers apart, resting poses, and other
-hands.
-"""
+"""References from captures: when fingers have closed, resting poses, and other hands."""
 
 import dataclasses
 import pathlib
@@ -16,11 +14,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import widest_gap
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
-from congrasp.common.hands.motors import coupled
-from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
-from congrasp.common.task.plausibility import hand_hand
 from congrasp.common.task.sampling.object_headings import HEADINGS
 from congrasp.common.task.sampling.set_bank import bank_of
 from congrasp.common.task.sampling.set_description import describe
@@ -34,11 +29,8 @@ from congrasp.services.assets.captures.contact import LATER, before_carried, opp
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.references import (
     DEEPEST,
-    OVERLAP,
     check_reference,
-    deepest,
     depth,
-    separated,
     width,
 )
 from congrasp.services.assets.captures.report import Report
@@ -52,10 +44,12 @@ from tests.services.assets.captures.test_myohand import write
 # --- when fingers have closed, and references that no hand can take: synthetic motions ---
 
 
-FRAMES, FIRST = 40, 5
+FRAMES = 40
+FIRST = 5
 BALL = plain_object("ball", (Piece("ellipsoid", (0.01, 0.01, 0.01), (0.5, 0.5, 0.5)),), 500.0)
 """Far from the hand."""
-THUMB, INDEX = 0.010, 0.009
+THUMB = 0.010
+INDEX = 0.009
 """Radii of the thickest skin, m."""
 
 
@@ -73,7 +67,8 @@ def moving(joints, lift, wrist=0.0, present=True):
     """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at
     (T, 5, 4, 3).
     """
-    count, up = len(joints), np.array([0.0, 0.0, 1.0])
+    count = len(joints)
+    up = np.array([0.0, 0.0, 1.0])
     return Sequence(
         name="lift",
         object_name="box",
@@ -150,7 +145,7 @@ def test_a_grasp_that_is_noticed_late_belongs_to_where_the_object_was_picked_up(
         (np.linspace(0.30, 0.10, 21), LIFT),  # another hand lifts it while this one comes
     ],
 )
-def test_an_object_that_this_hand_does_not_carry_leaves_the_frame_as_it_is(wrist, lift):
+def test_an_object_not_carried_by_the_hand_keeps_the_frame(wrist, lift):
     assert picked(wrist, lift) == 20
 
 
@@ -170,7 +165,8 @@ def pinch(tmp_path, run_import):
 
 def test_a_reference_that_is_deep_in_its_object_is_dropped_and_counted(pinch):
     sets, report = pinch(0.004)
-    assert not report.dropped and list(sets) == ["box"]
+    assert not report.dropped
+    assert list(sets) == ["box"]
     _, report = pinch(0.03, code=2)
     assert report.rules()[0][:2] == ("too deep", 1)
     assert "mm deep in the object (10 mm at most)" in report.rules()[0][2]
@@ -189,8 +185,9 @@ def straight(contact):
     )
 
 
-def test_what_is_wider_than_the_hand_opens_is_too_wide():
-    opening, cross = widest_gap(HUMAN), np.asarray(grasp_frame(HUMAN).cross)
+def test_an_object_wider_than_the_hand_opens_is_dropped():
+    opening = widest_gap(HUMAN)
+    cross = np.asarray(grasp_frame(HUMAN).cross)
     fitting, wide = (straight(np.outer([0, share * opening], cross)) for share in (0.97, 1.03))
     assert width(fitting) == pytest.approx(0.97 * opening)
     check_reference(HUMAN, fitting, BALL, 1.0)
@@ -231,83 +228,6 @@ def test_normals_of_a_surface_point_outwards():
     assert (np.einsum("ni,ni->n", normals, obj.normals) > 0.9).all()
 
 
-# --- fingers moved apart, worked out by hand for two of them ---
-
-
-ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
-
-
-def two_fingers(upper=1.0, couplings=()):
-    """Fingers of 5 cm at x = -2 and 2 cm along y, that turn about z: `a` towards -x and `b` towards
-    +x.
-
-    So +x of `a` needs a negative angle: turned by -t and t, their tips are 2 (2 cm - 5 cm sin t)
-    apart.
-    """
-    links = [Link("palm", "", (), (Capsule((0, -0.05, 0), (0, -0.04, 0), RADIUS),), 0.1, 1.0)]
-    for name, x, limits in (("a", -ASIDE, (-upper, 1.0)), ("b", ASIDE, (-1.0, 1.0))):
-        joint = Joint(name, (0, 0, 1), (x, 0, 0), *limits, kp=1.0, kv=0.1, torque_limit=1.0)
-        shape = Capsule((x, 0, 0), (x, LONG, 0), RADIUS)
-        links.append(Link(name, "palm", (joint,), (shape,), 0.05, 1.0, tip=(x, LONG, 0)))
-    return Hand("two", tuple(links), "a", {}, {}, HUMAN.wrist, couplings=couplings)
-
-
-def test_two_fingers_part_evenly():
-    """Turned by 0.38 rad each they overlap by 7 mm; at t with 2 (2 cm - 5 cm sin t) = 1 cm - 1 mm
-    by 1 mm.
-    """
-    hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
-    overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
-    np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
-    angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
-    np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
-
-
-def test_where_one_may_not_go_the_other_does():
-    """`a` cannot leave -0.38 rad, where its tip is at 2 cm - 5 cm sin(0.38) from the middle: `b`
-    makes all the room.
-    """
-    stiff = two_fingers()
-    a = dataclasses.replace(stiff.links[1].joints[0], upper=-0.38)
-    hand = dataclasses.replace(
-        stiff,
-        links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2]),
-    )
-    hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    assert found[0, 0] == np.float32(-0.38) and found[0, 1] < 0.3
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
-
-
-def test_followers_still_follow():
-    hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
-
-
-@pytest.mark.parametrize("name", ["human", "sharpa"])
-@pytest.mark.slow
-def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
-    hand, rng = get_hand(name), np.random.default_rng(3)
-    share = rng.uniform(0.0, 1.0, (12, 1))
-    q = (
-        hand.q_open
-        + share * (hand.q_closed - hand.q_open)
-        + rng.normal(0, 0.25, (12, len(hand.joints)))
-    )
-    q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
-    before, found = np.asarray(deepest(hand, q)), separated(hand, q)
-    deep = before > OVERLAP
-    assert deep.any() and not deep.all()
-    np.testing.assert_array_equal(found[~deep], q[~deep])
-    assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
-    np.testing.assert_array_less(
-        hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5
-    )
-    np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)
-
-
 # --- resting poses ---
 
 
@@ -344,7 +264,7 @@ def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
 # --- sequences of which no episode is drawn ---
 
 
-def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
+def test_from_below_means_excluded_by_the_approach_alone():
     """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming
     down, up and up.
     """
@@ -372,25 +292,25 @@ def test_the_report_names_them(capsys):
         later = {"frames_after_touch": 4 if below else 0}
         return {"sequence": name, "object": "box", "residual_rad": 0.0} | place | apart | later
 
-    kept = [
+    sequences = [
         row("lift", clear=True, below=False),
         row("scoop", clear=False, below=True, overlap=0.004, moved=0.1),
         row("push", clear=False, below=False, overlap=0.003, moved=0.2),
         row("dig", clear=False, below=True),
     ]
-    print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
-    said = capsys.readouterr().out
-    assert "room for 1 of 4" in said
-    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in said
-    assert "the reference is taken then, 4 frames later on average" in said
-    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in said
-    assert "by 0.15 rad on average, at most 0.20 rad (push)" in said
+    print_report(Report(sequences), "human", pathlib.Path("sets"), pathlib.Path("objects"))
+    printed = capsys.readouterr().out
+    assert "room for 1 of 4" in printed
+    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in printed
+    assert "the reference is taken then, 4 frames later on average" in printed
+    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in printed
+    assert "by 0.15 rad on average, at most 0.20 rad (push)" in printed
     assert (
         "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, "
-        "dig." in said
+        "dig." in printed
     )
-    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
-    assert "3 sequences are for training, 1 held out." in said
+    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in printed
+    assert "3 sequences are for training, 1 held out." in printed
 
 
 # --- robot hands ---
@@ -413,35 +333,40 @@ def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_pa
     known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
     options = ["--meshes", tmp_path / "meshes", "--headings", "demonstrated"]
     sets, report = run_import("myohand", tmp_path / "data", "--hand", name, *options)
-    assert not report.dropped and "finger angles do not fit" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert not report.dropped
+    assert "finger angles do not fit" in " ".join(capsys.readouterr().out.split())
 
-    hand, scale = get_hand(name), get_hand(name).object_scale
-    made = sets["box"]
-    arrays = made.arrays
-    assert made.meta["hand"] == name and made.meta["object_scale"] == scale
-    assert len(describe(made)["captured"].split(", ")) == 2
+    hand = get_hand(name)
+    scale = get_hand(name).object_scale
+    constraint_set = sets["box"]
+    arrays = constraint_set.arrays
+    assert constraint_set.meta["hand"] == name
+    assert constraint_set.meta["object_scale"] == scale
+    assert len(describe(constraint_set)["captured"].split(", ")) == 2
     for m, case in enumerate(cases):
         q = arrays["pose/q"][0, m]
-        assert q.shape == hand.lower.shape and (q >= hand.lower).all() and (q <= hand.upper).all()
+        assert q.shape == hand.lower.shape
+        assert (q >= hand.lower).all()
+        assert (q <= hand.upper).all()
         tips = np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
         center = (tips[0] + tips[1:].mean(0)) / 2
         human = np.clip(far[-1, 9:] if m else case.q, HUMAN.lower, HUMAN.upper)
         human_tips = joint_positions(human)[:, 3]
         position, turns = case.waypoints()
-        wanted = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
-        found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
+        centre = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
+        rotation = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
         path = arrays["trajectory/position"][0, m]
         # The hand centre of the closed hand, wrist frame
-        held = found[-1].inv().apply(wanted[-1] - path[-1])
-        np.testing.assert_allclose(path + found.apply(held), wanted, atol=1e-3)
+        held = rotation[-1].inv().apply(centre[-1] - path[-1])
+        np.testing.assert_allclose(path + rotation.apply(held), centre, atol=1e-3)
         assert np.linalg.norm(held - center) < 0.03  # fingers that close again move it a little
-        for own, theirs in zip(axes(hand), axes(HUMAN), strict=True):
-            assert (np.linalg.norm(found.apply(own) - turns.apply(theirs), axis=-1) < 0.01).all()
-        np.testing.assert_allclose(arrays["heading/position"][0, m], wanted[-1], atol=1e-3)
+        for ours, theirs in zip(axes(hand), axes(HUMAN), strict=True):
+            assert (
+                np.linalg.norm(rotation.apply(ours) - turns.apply(theirs), axis=-1) < 0.01
+            ).all()
+        np.testing.assert_allclose(arrays["heading/position"][0, m], centre[-1], atol=1e-3)
         np.testing.assert_array_equal(
             arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1]
         )
     assert arrays["heading/position"].shape[1] == HEADINGS
-    assert bank_of([made]).pose_q.shape[-1] == len(hand.joints)
+    assert bank_of([constraint_set]).pose_q.shape[-1] == len(hand.joints)

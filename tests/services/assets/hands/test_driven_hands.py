@@ -49,12 +49,10 @@ def _mirrored(path, out):
 def test_one_motor_moves_a_gripper_of_two_fingers():
     proposal = propose(HANDS / "pincher.urdf")
     hand = proposal.hand
-    assert (len(hand.joints), len(hand.motors), len(hand.tip_links), proposal.palm) == (
-        4,
-        1,
-        2,
-        "housing",
-    )
+    assert len(hand.joints) == 4
+    assert len(hand.motors) == 1
+    assert len(hand.tip_links) == 2
+    assert proposal.palm == "housing"
     follow = {x.joint: (x.leader, x.ratio, x.offset) for x in hand.couplings}
     assert follow == {  # that of the last joint through the one that it mimics
         "left_parallel": ("left", -1.0, 0.0),
@@ -71,9 +69,10 @@ def test_one_motor_moves_a_gripper_of_two_fingers():
     assert "capsules follow from inertias ('capsules' in the hand file): right_pad" in words
 
 
-def test_palm_and_thumb_are_found_on_an_arm_beside_a_door_without_names(driven):
+def test_palm_and_thumb_are_found_in_a_scene_without_names(driven):
     hand = driven.hand
-    assert driven.palm == "base" and hand.thumb == "side_end"
+    assert driven.palm == "base"
+    assert hand.thumb == "side_end"
     chains = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
     assert [len(chain) for chain in chains] == [3, 3, 3, 3]
     assert not {"arm", "wrist", "door"} & {joint.name for joint in hand.joints}
@@ -81,7 +80,8 @@ def test_palm_and_thumb_are_found_on_an_arm_beside_a_door_without_names(driven):
 
 def test_tendons_and_curves_become_couplings_and_motors(driven):
     hand = driven.hand
-    assert (len(hand.joints), len(hand.motors)) == (16, 13)
+    assert len(hand.joints) == 16
+    assert len(hand.motors) == 13
     (tendon,) = hand.tendons
     # Apart from links of those names
     assert tendon.joints == {
@@ -91,12 +91,11 @@ def test_tendons_and_curves_become_couplings_and_motors(driven):
     # 30,000 N/m and 60 N at a radius of 0.01 m.
     assert (tendon.kp, tendon.torque_limit) == pytest.approx((3.0, 0.6))
     follow = {x.joint: x for x in hand.couplings}
-    ring, middle = follow["ring_end_joint"], follow["middle_end_joint"]
-    assert (ring.leader, ring.ratio, ring.offset) == (
-        "ring_middle_joint",
-        pytest.approx(5 / 7, abs=1e-5),
-        0.0,
-    )
+    ring = follow["ring_end_joint"]
+    middle = follow["middle_end_joint"]
+    assert ring.leader == "ring_middle_joint"
+    assert ring.ratio == pytest.approx(5 / 7, abs=1e-5)
+    assert ring.offset == 0.0
     x = np.linspace(0.0, 1.57, 200)
     assert np.abs(middle.offset + middle.ratio * x - (0.5 * x + 0.1 * x**2)).max() < 0.05
     assert any("'middle_end' follows a curve" in note for note in driven.notes)
@@ -108,7 +107,8 @@ def test_the_thumb_of_the_open_hand_is_turned_against_the_fingers(driven):
     assert hand.open_pose["side_turn"] > 1.2
     frame = grasp_frame(hand)
     # Objects lie on the side +x, between fingers and thumb
-    assert frame.heading[0] > 0.9 and frame.cross[2] > 0.9
+    assert frame.heading[0] > 0.9
+    assert frame.cross[2] > 0.9
     closing = [
         name for name in hand.closed_pose if name.endswith(("root", "middle", "side_end_joint"))
     ]
@@ -116,34 +116,38 @@ def test_the_thumb_of_the_open_hand_is_turned_against_the_fingers(driven):
 
 
 def test_a_left_hand_is_the_mirror_image(driven, tmp_path):
-    left, right = propose(_mirrored(HANDS / "driven.xml", tmp_path / "left.xml")).hand, driven.hand
-    assert left.thumb == right.thumb and len(left.motors) == 13
+    left = propose(_mirrored(HANDS / "driven.xml", tmp_path / "left.xml")).hand
+    right = driven.hand
+    assert left.thumb == right.thumb
+    assert len(left.motors) == 13
     np.testing.assert_allclose(left.q_open, right.q_open, atol=0.05)
     np.testing.assert_allclose(left.q_closed, right.q_closed, atol=0.1)
-    ours, theirs = grasp_frame(left), grasp_frame(right)
+    ours = grasp_frame(left)
+    theirs = grasp_frame(right)
     np.testing.assert_allclose(ours.heading, theirs.heading * [1, -1, 1], atol=0.05)
     np.testing.assert_allclose(ours.center, theirs.center * [1, -1, 1], atol=0.005)
 
 
-def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path, monkeypatch):
+def test_visual_meshes_of_a_file_are_stored_and_drawn(driven, tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     get_hand.cache_clear()
     path = tmp_path / "driven.json"
     path.write_text(hand_text(driven.hand))
     save_meshes(path, driven.meshes)
-    found = load_meshes(path, driven.hand)
-    assert found.keys() == {link.name for link in driven.hand.links}
-    vertices, faces = found["palm"]  # the box of the file, in the palm's frame
+    loaded = load_meshes(path, driven.hand)
+    assert loaded.keys() == {link.name for link in driven.hand.links}
+    vertices, faces = loaded["palm"]  # the box of the file, in the palm's frame
     np.testing.assert_allclose(
         [vertices.min(0), vertices.max(0)], [[-0.012, -0.04, -0.005], [0.012, 0.04, 0.085]]
     )
     assert len(faces) == 12
-    skin = skin_of_meshes(driven.hand, {"palm": found["palm"]})  # of the other links their capsules
-    assert np.abs(skin.points[:8] - vertices).max() == 0 and len(skin.weights.T) == len(
-        driven.hand.links
-    )
-    drawn, own = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
-    assert np.abs(drawn.astype(int) - own).max() > 30
+    skin = skin_of_meshes(
+        driven.hand, {"palm": loaded["palm"]}
+    )  # of the other links their capsules
+    assert np.abs(skin.points[:8] - vertices).max() == 0
+    assert len(skin.weights.T) == len(driven.hand.links)
+    drawn, capsules = (hands_sheet([driven.hand], [x], size=(40, 40)) for x in (skin, None))
+    assert np.abs(drawn.astype(int) - capsules).max() > 30
     assert main.run(["hands", "sheet", "driven", "--out", str(tmp_path / "sheet.png")]) == 0
 
     def refused(word, meshes):
@@ -163,12 +167,13 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     assert load_meshes(path, driven.hand) == {}
 
 
-def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
+def test_a_hand_can_collide_by_the_shapes_of_its_file(driven):
     """Every geom of the file that collides is in the hand's model, where it is in the file, and the
     masses stay.
     """
     hand = propose(HANDS / "driven.xml", Choices(own_collision=True)).hand
-    assert hand_from_text(hand_text(hand)) is hand and all(link.solids for link in hand.links)
+    assert hand_from_text(hand_text(hand)) is hand
+    assert all(link.solids for link in hand.links)
     theirs = mujoco.MjModel.from_xml_path(str(HANDS / "driven.xml"))
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -178,7 +183,8 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     def shapes(model, palm, bodies):
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        root, turn = data.body(palm).xpos, data.body(palm).xmat.reshape(3, 3)
+        root = data.body(palm).xpos
+        turn = data.body(palm).xmat.reshape(3, 3)
         geoms = [
             g
             for g in range(model.ngeom)
@@ -190,12 +196,11 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     part = {theirs.body("base").id}
     for body in range(theirs.nbody):
         part |= {body} if theirs.body_parentid[body] in part else set()
-    expected, found = (
-        shapes(theirs, "base", lambda g: theirs.geom_bodyid[g] in part),
-        shapes(ours, "palm", lambda g: True),
-    )
-    assert found[1] == expected[1] and {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
-    np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
+    expected = shapes(theirs, "base", lambda g: theirs.geom_bodyid[g] in part)
+    actual = shapes(ours, "palm", lambda g: True)
+    assert actual[1] == expected[1]
+    assert {2, 3, 6} <= {*actual[1]}  # balls, capsules and boxes
+    np.testing.assert_allclose(actual[0], expected[0], atol=2e-6)
     assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
     with pytest.raises(CongraspError, match="jax supports capsules only"):
         make_physics("jax", hand, TaskConfig(), [], threads=1)
@@ -209,7 +214,9 @@ def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
     proposal = propose(tmp_path / "claw.urdf", Choices(own_collision=True))
     (note,) = (note for note in proposal.notes if "capsules are used" in note)
     links = {link.name: link for link in proposal.hand.links}
-    assert "left_upper" in note and not links["left_upper"].solids and links["left_upper"].capsules
+    assert "left_upper" in note
+    assert not links["left_upper"].solids
+    assert links["left_upper"].capsules
 
 
 def test_a_fine_mesh_is_simplified(tmp_path):

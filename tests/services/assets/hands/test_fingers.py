@@ -116,14 +116,16 @@ def test_check_of_a_tip_at_rest_fails(carried):
         closed[joint] = carried.open_pose.get(joint, 0.0)
     closed["arch"] = carried.open_pose.get("arch", 0.0)
     (finding,) = finger_findings(dataclasses.replace(carried, closed_pose=closed))
-    assert (finding.check, finding.verdict) == ("finger", "failed")
+    assert finding.check == "finger"
+    assert finding.verdict == "failed"
     assert "'ring'" in finding.measured
 
 
 def test_check_of_a_bending_joint_at_rest_fails(carried):
     closed = carried.closed_pose | {"ring_bend": carried.open_pose.get("ring_bend", 0.0)}
     (finding,) = finger_findings(dataclasses.replace(carried, closed_pose=closed))
-    assert (finding.check, finding.verdict) == ("joint", "failed")
+    assert finding.check == "joint"
+    assert finding.verdict == "failed"
     assert "'ring_bend'" in finding.measured
 
 
@@ -133,4 +135,5 @@ def test_two_tips_on_one_finger_are_a_fault(carried):
         for link in carried.links
     )
     (fault,) = faults(dataclasses.replace(carried, links=links))
-    assert "'ring'" in fault and "'ring_end'" in fault
+    assert "'ring'" in fault
+    assert "'ring_end'" in fault

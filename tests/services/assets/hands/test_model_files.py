@@ -47,14 +47,15 @@ def test_a_urdf_is_understood(claw):
         "palm",
         *(
             f"{finger}_{part}"
-            for finger in ("left", "right", "opposing")
-            for part in ("lower", "upper")
+            for finger, part in itertools.product(("left", "right", "opposing"), ("lower", "upper"))
         ),
     ]
     joints = {joint.name: joint for joint in hand.joints}
     assert len(joints) == 6
     root = joints["left_root"]
-    assert (root.lower, root.upper, root.torque_limit) == (-1.2, 0.5, 1.5)
+    assert root.lower == (-1.2)
+    assert root.upper == 0.5
+    assert root.torque_limit == 1.5
     np.testing.assert_allclose(root.anchor, (0.04, 0.025, 0.04), atol=1e-9)
     np.testing.assert_allclose(root.axis, (0.0, 1.0, 0.0), atol=1e-9)
     lean = 0.06 * np.array([np.sin(0.4), 0.0, np.cos(0.4)])
@@ -66,15 +67,18 @@ def test_a_urdf_is_understood(claw):
 
 def test_thumb_tips_poses_and_frame_are_proposed(claw):
     hand = claw.hand
-    assert hand.thumb == "opposing_upper" and len(hand.tip_links) == 3
+    assert hand.thumb == "opposing_upper"
+    assert len(hand.tip_links) == 3
     assert {name: hand.closed_pose[name] for name in ENDS} == pytest.approx(ENDS)
     assert all(abs(hand.open_pose[name]) < 0.5 for name in ENDS)
     frame = grasp_frame(hand)
     np.testing.assert_allclose(frame.heading, (0.0, 0.0, 1.0), atol=0.1)
     np.testing.assert_allclose(frame.cross, (1.0, 0.0, 0.0), atol=0.1)
     words = "\n".join(describe(claw))
-    assert "opposing_lower - opposing_upper" in words and "no torque limit" not in words
-    assert "'opposing_upper' is assumed to be the thumb" in words and "(--thumb)" in words
+    assert "opposing_lower - opposing_upper" in words
+    assert "no torque limit" not in words
+    assert "'opposing_upper' is assumed to be the thumb" in words
+    assert "(--thumb)" in words
 
 
 def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
@@ -89,7 +93,8 @@ def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
             [*b.anchor, *b.axis, b.lower, b.upper],
             atol=1e-9,
         )
-        assert (b.kp, b.torque_limit) == (5.0, 1.2)  # of its motors
+        assert b.kp == 5.0
+        assert b.torque_limit == 1.2  # of the file's motors
     np.testing.assert_allclose(hand.q_closed, other.q_closed)
     for a, b in zip(hand.links, other.links, strict=True):
         assert a.mass == pytest.approx(b.mass)
@@ -102,9 +107,10 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
     add_hand(spec, get_hand(name))
     spec.compile()
     (tmp_path / "hand.xml").write_text(spec.to_xml())
-    original, found = get_hand(name), propose(tmp_path / "hand.xml").hand
-    assert found.thumb == original.thumb
-    for a, b in zip(original.joints, found.joints, strict=True):
+    original = get_hand(name)
+    hand = propose(tmp_path / "hand.xml").hand
+    assert hand.thumb == original.thumb
+    for a, b in zip(original.joints, hand.joints, strict=True):
         np.testing.assert_allclose(
             [*a.anchor, *a.axis, a.lower, a.upper, a.kp, a.torque_limit],
             [*b.anchor, *b.axis, b.lower, b.upper, b.kp, b.torque_limit],
@@ -112,22 +118,25 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
         )
     # What is proposed is near to what was chosen by hand: the frame, and the thumb turned against
     # the fingers.
-    ours, theirs = grasp_frame(original), grasp_frame(found)
+    ours = grasp_frame(original)
+    theirs = grasp_frame(hand)
     assert np.degrees(np.arccos(ours.heading @ theirs.heading)) < 20
     assert np.degrees(np.arccos(ours.cross @ theirs.cross)) < 20
-    assert found.object_scale == pytest.approx(original.object_scale, abs=0.15)
+    assert hand.object_scale == pytest.approx(original.object_scale, abs=0.15)
 
 
 def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
-    said = capsys.readouterr().out
-    assert "6 joints, 6 motors, 7 links" in said and "congrasp train --hand gripper" in said
-    assert (tmp_path / "own" / "gripper.json").exists() and (
-        tmp_path / "own" / "gripper.png"
-    ).stat().st_size > 10_000
+    printed = capsys.readouterr().out
+    assert "6 joints, 6 motors, 7 links" in printed
+    assert "congrasp train --hand gripper" in printed
+    assert (tmp_path / "own" / "gripper.json").exists()
+    assert (tmp_path / "own" / "gripper.png").stat().st_size > 10_000
     assert main.run(["hands", "list"]) == 0
-    said = capsys.readouterr().out
-    assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
+    printed = capsys.readouterr().out
+    assert all(
+        name in printed for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO")
+    )
 
 
 def test_long_numbers_are_searched_in_linear_time():
@@ -158,14 +167,17 @@ def test_an_obj_of_points_is_a_hull(tmp_path):
     (tmp_path / "points.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners))
     notes = []
     _, model = robot_spec(tmp_path / "hand.urdf", notes)
-    assert not notes and model.nmesh == 1 and model.nmeshvert == 8
+    assert not notes
+    assert model.nmesh == 1
+    assert model.nmeshvert == 8
 
 
 def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
     """1,000 tetrahedra around a ball, which cannot be reduced to the triangles that a link may
     have.
     """
-    turn, height = np.arange(1000) * np.pi * (3 - np.sqrt(5)), np.linspace(-1, 1, 1000)
+    turn = np.arange(1000) * np.pi * (3 - np.sqrt(5))
+    height = np.linspace(-1, 1, 1000)
     axes = np.sqrt(1 - height**2) * [np.cos(turn), np.sin(turn)]
     corners = (
         0.0005 * np.random.default_rng(0).normal(size=(1000, 4, 3))
@@ -179,7 +191,8 @@ def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
     trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(tmp_path / "ball.obj")
     box = '<geom type="box" size=".03 .05 .015" pos="0 0 .015"/>'
     text = (pathlib.Path(__file__).parents[3] / "cases/_hand/pinch.xml").read_text()
-    assert box in text and "<asset/>" in text
+    assert box in text
+    assert "<asset/>" in text
     text = text.replace(
         "<asset/>", '<asset><mesh name="ball" file="ball.obj" inertia="shell"/></asset>'
     )
@@ -194,7 +207,8 @@ def test_any_number_of_meshes_may_be_missing(tmp_path):
     text = (PINCH / "pinch.xml").read_text()
     (tmp_path / "hand.xml").write_text(text.replace("<asset/>", f"<asset>{meshes}</asset>"))
     robot_spec(tmp_path / "hand.xml", notes := [])
-    assert len(notes) == 1 and notes[0].endswith(" and 296 more")
+    assert len(notes) == 1
+    assert notes[0].endswith(" and 296 more")
 
 
 # --- tendons through space, whose levers are known where they run around a pulley ---
@@ -216,7 +230,9 @@ def test_a_motor_of_a_tendon_through_space_has_the_tendons_mean_levers():
     """
     model = mujoco.MjModel.from_xml_string(_FINGER.format(""))
     (servo,) = servos(model, notes := [])
-    assert set(servo.joints) == {0, 1} and servo.kp == 20000 and servo.reach is None
+    assert set(servo.joints) == {0, 1}
+    assert servo.kp == 20000
+    assert servo.reach is None
     lengths = [
         np.hypot(
             0.006 * np.cos(q) + 0.02 * np.sin(q) - 0.012,
@@ -225,14 +241,18 @@ def test_a_motor_of_a_tendon_through_space_has_the_tendons_mean_levers():
         for q in (0.0, 0.8)
     ]
     assert servo.joints[1] == pytest.approx((lengths[1] - lengths[0]) / 0.8, rel=1e-6)
-    below, above, radius = np.hypot(0.012, 0.05), np.hypot(0.012, 0.03), 0.01
+    below = np.hypot(0.012, 0.05)
+    above = np.hypot(0.012, 0.03)
+    radius = 0.01
     # Rad around the axis at 0, on the tendon's side
     between = np.arctan2(0.05, 0.012) + np.arctan2(0.03, 0.012)
     straight = np.sqrt(below**2 + above**2 - 2 * below * above * np.cos(between - 0.4))
     around = between + 0.4 - np.arccos(radius / below) - np.arccos(radius / above)
     wrapped = np.sqrt(below**2 - radius**2) + np.sqrt(above**2 - radius**2) + radius * around
-    assert around > 0 and servo.joints[0] == pytest.approx((straight - wrapped) / 0.8, rel=1e-6)
-    assert len(notes) == 1 and notes[0].startswith("1 motors pull spatial tendons")
+    assert around > 0
+    assert servo.joints[0] == pytest.approx((straight - wrapped) / 0.8, rel=1e-6)
+    assert len(notes) == 1
+    assert notes[0].startswith("1 motors pull spatial tendons")
 
 
 def test_a_joint_hangs_on_the_tendon_that_pulls_it_most():

@@ -55,22 +55,22 @@ def _tips(hand, q):
 
 @pytest.mark.parametrize("name", HANDS)
 def test_a_real_hand_is_understood_without_an_option(name):
-    known = HANDS[name]
-    proposal = _imported(known["file"])
+    expected = HANDS[name]
+    proposal = _imported(expected["file"])
     hand = proposal.hand
-    found = (proposal.palm, len(hand.joints), len(hand.motors), len(hand.tip_links))
-    assert found == tuple(known[fact] for fact in ("palm", "joints", "motors", "fingers"))
-    assert any(re.search(known["thumb"], link) for link in chain_of(hand, hand.thumb))
+    actual = (proposal.palm, len(hand.joints), len(hand.motors), len(hand.tip_links))
+    assert actual == tuple(expected[fact] for fact in ("palm", "joints", "motors", "fingers"))
+    assert any(re.search(expected["thumb"], link) for link in chain_of(hand, hand.thumb))
     closed = dict(
         zip((joint.name for joint in hand.joints), hand.q_closed - hand.q_open, strict=True)
     )
-    assert {joint: np.sign(closed[joint]) for joint in known["flexes"]} == known["flexes"]
-    assert known["opening"][0] < grasp_frame(hand).opening < known["opening"][1]
+    assert {joint: np.sign(closed[joint]) for joint in expected["flexes"]} == expected["flexes"]
+    assert expected["opening"][0] < grasp_frame(hand).opening < expected["opening"][1]
     # Closing brings thumb and fingers together, to less than half of the opening.
-    gaps = [
-        float(np.linalg.norm(tips[1:].mean(0) - tips[0]))
-        for tips in (_tips(hand, q) for q in _ways(hand))
-    ]
+    gaps = []
+    for q in _ways(hand):
+        tips = _tips(hand, q)
+        gaps.append(float(np.linalg.norm(tips[1:].mean(0) - tips[0])))
     assert min(gaps) < 0.5 * gaps[0]
     # The hand centre is ahead of the palm, on the side to which the heading points.
     frame = grasp_frame(hand)

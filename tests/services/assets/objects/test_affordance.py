@@ -24,7 +24,8 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from tests.services.conftest import quick_imports
 
-EDGES, SHIFT = np.array([0.05, 0.05, 0.12]), np.array([0.01, 0.02, 0.06])
+EDGES = np.array([0.05, 0.05, 0.12])
+SHIFT = np.array([0.01, 0.02, 0.06])
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +63,12 @@ def test_each_source_finds_the_lower_half(box, folder):
         on_part_mesh(box, folder / "low.stl"),
         painted(box, folder / "painted.ply", (0, 255, 0)),
     ):
-        assert plus.shape == (512,) and np.array_equal(plus[~near], below[~near])
+        assert plus.shape == (512,)
+        assert np.array_equal(plus[~near], below[~near])
     labelled = two_parts(box, below, "half")
     np.testing.assert_array_equal(labelled.non_graspable_points, ~below)
-    assert labelled.name == "half" and labelled.part_names == ("grasp", "avoid")
+    assert labelled.name == "half"
+    assert labelled.part_names == ("grasp", "avoid")
 
 
 @pytest.mark.parametrize("kind", ["patch", "flat", "points"])
@@ -82,8 +85,9 @@ def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
         patch = trimesh.PointCloud(trimesh.sample.sample_surface(patch, 3000, seed=0)[0])
     patch.export(tmp_path / "part.ply")
     depth = box.points[:, 0].max() - box.points[:, 0]
-    found = on_part_mesh(box, tmp_path / "part.ply")
-    assert found[depth < 1e-3].all() and not found[depth > 0.005].any()
+    labelled = on_part_mesh(box, tmp_path / "part.ply")
+    assert labelled[depth < 1e-3].all()
+    assert not labelled[depth > 0.005].any()
 
 
 def test_a_part_whose_triangles_lack_vertices_is_refused(box, tmp_path):
@@ -132,8 +136,10 @@ def imported(tmp_path, quick_import):
 
 def test_halves_that_can_be_held_stay(imported):
     obj = imported(trimesh.creation.cylinder(0.02, 0.2))
-    assert obj.part_names == UNLABELLED and 0.45 < obj.graspable[obj.labels].mean() < 0.55
-    assert affordance.covered(obj).all() and affordance.UNCOVERED not in obj.notes
+    assert obj.part_names == UNLABELLED
+    assert 0.45 < obj.graspable[obj.labels].mean() < 0.55
+    assert affordance.covered(obj).all()
+    assert affordance.UNCOVERED not in obj.notes
 
 
 def test_halves_that_cannot_be_held_are_cut_elsewhere(imported):

@@ -21,7 +21,9 @@ from congrasp.services.viz.episode_scene import object_at
 from congrasp.services.viz.raster import render_scene
 from tests.episodes import episode
 
-RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+RED = (255, 0, 0)
+GREEN = (0, 255, 0)
+BLUE = (0, 0, 255)
 SIDE = 0.1
 
 
@@ -46,11 +48,14 @@ def textured(path: pathlib.Path) -> pathlib.Path:
 
 
 def test_an_image_is_looked_up_where_it_lies_on_the_surface(tmp_path):
-    found = sample_colours([textured(tmp_path / "cube.glb")], seed=0)
-    assert found is not None and found.points.shape == (COLOUR_POINTS, 3) == found.values.shape
-    x = found.points[:, 0]
-    assert (found.values[x < 0.04] == RED).all() and (found.values[x > 0.06] == BLUE).all()
-    assert (np.abs(found.points).min(0) >= 0).all() and found.points.max() <= SIDE + 1e-6
+    samples = sample_colours([textured(tmp_path / "cube.glb")], seed=0)
+    assert samples is not None
+    assert samples.points.shape == (COLOUR_POINTS, 3) == samples.values.shape
+    x = samples.points[:, 0]
+    assert (samples.values[x < 0.04] == RED).all()
+    assert (samples.values[x > 0.06] == BLUE).all()
+    assert (np.abs(samples.points).min(0) >= 0).all()
+    assert samples.points.max() <= SIDE + 1e-6
     even = x[: COLOUR_POINTS // 2]
     # As many points on each face, as it has a sixth of the area.
     assert np.isclose(even, 0).mean() == pytest.approx(1 / 6, abs=0.02)
@@ -65,9 +70,9 @@ def test_colours_of_corners_are_mixed_in_between(suffix, tmp_path):
     colours = np.where(box.vertices[:, 2:] > SIDE / 2, GREEN, RED)
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=np.c_[colours, np.full(36, 255)])
     box.export(tmp_path / f"cube.{suffix}")
-    found = sample_colours([tmp_path / f"cube.{suffix}"], seed=0, up="z")
-    assert found is not None
-    np.testing.assert_allclose(found.values[:, 1], 255 * found.points[:, 2] / SIDE, atol=1.5)
+    samples = sample_colours([tmp_path / f"cube.{suffix}"], seed=0, up="z")
+    assert samples is not None
+    np.testing.assert_allclose(samples.values[:, 1], 255 * samples.points[:, 2] / SIDE, atol=1.5)
 
 
 def test_a_material_without_an_image_is_its_colour(tmp_path):
@@ -75,8 +80,9 @@ def test_a_material_without_an_image_is_its_colour(tmp_path):
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in cube().vertices)
     faces = "".join(f"f {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(12))
     (tmp_path / "cube.obj").write_text(f"mtllib cube.mtl\n{corners}usemtl paint\n{faces}")
-    found = sample_colours([tmp_path / "cube.obj"], seed=0)
-    assert found is not None and (np.abs(found.values.astype(int) - (255, 127, 0)) <= 1).all()
+    samples = sample_colours([tmp_path / "cube.obj"], seed=0)
+    assert samples is not None
+    assert (np.abs(samples.values.astype(int) - (255, 127, 0)) <= 1).all()
 
 
 def test_files_without_colours_have_none(tmp_path):
@@ -85,17 +91,15 @@ def test_files_without_colours_have_none(tmp_path):
         assert sample_colours([tmp_path / f"cube.{suffix}"], seed=0) is None
 
 
-def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
-    tmp_path, quick_import
-):
+def test_colours_of_an_imported_object_are_stored_and_drawn(tmp_path, quick_import):
     (source,) = find_sources(textured(tmp_path / "cube.glb"))
     obj = import_source(source, ImportOptions(scale=0.5, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is not None
     x = obj.colours.points[:, 0]
-    assert x.min() == pytest.approx(-0.025, abs=1e-3) and x.max() == pytest.approx(0.025, abs=1e-3)
-    assert (obj.colours.values[x < -0.005] == RED).all() and (
-        obj.colours.values[x > 0.005] == BLUE
-    ).all()
+    assert x.min() == pytest.approx(-0.025, abs=1e-3)
+    assert x.max() == pytest.approx(0.025, abs=1e-3)
+    assert (obj.colours.values[x < -0.005] == RED).all()
+    assert (obj.colours.values[x > 0.005] == BLUE).all()
     assert np.ptp(obj.scaled(2.0).colours.points) == pytest.approx(2 * np.ptp(obj.colours.points))
     store.save(obj, tmp_path / "cube.safetensors")
     for ours, theirs in zip(
@@ -103,19 +107,21 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(
     ):
         np.testing.assert_array_equal(ours, theirs)
 
-    shown = dataclasses.replace(
+    plain = dataclasses.replace(
         episode(),
         object_vertices=obj.visual_vertices,
         object_faces=obj.visual_faces,
         colours=obj.colours,
     )
     picture = render_scene(
-        [object_at(shown, 0, painted=False)],
-        Camera(shown.object_position[0] + [0, -0.5, 0.0], shown.object_position[0]),
+        [object_at(plain, 0, painted=False)],
+        Camera(plain.object_position[0] + [0, -0.5, 0.0], plain.object_position[0]),
         (60, 60),
     )
-    left, right = picture[30, 25].astype(int), picture[30, 35].astype(int)
-    assert left[0] > left[2] + 60 and right[2] > right[0] + 60
+    left = picture[30, 25].astype(int)
+    right = picture[30, 35].astype(int)
+    assert left[0] > left[2] + 60
+    assert right[2] > right[0] + 60
 
 
 def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):
@@ -126,9 +132,7 @@ def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):
     assert sample_colours([tmp_path / "cube.glb"], seed=0) is None
 
 
-def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(
-    tmp_path, quick_import
-):
+def test_invalid_texture_coordinates_cost_only_the_colours(tmp_path, quick_import):
     box = cube()
     box.visual = trimesh.visual.TextureVisuals(
         uv=np.full((36, 2), np.nan), image=Image.new("RGB", (4, 4), RED)

@@ -32,6 +32,11 @@ from tests.solids import block, ell
 
 SLOW = pytest.mark.slow
 SIDES = np.array([0.04, 0.06, 0.08])
+_PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float "
+    b"y\nproperty float z\n"
+)
+_FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
 
 
 @pytest.fixture
@@ -43,11 +48,9 @@ def options(tmp_path):
 def test_mass_properties_of_a_block(tmp_path, options, quick_import, suffix):
     block(SIDES, (0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
     (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
-    assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == (
-        "block",
-        "imported",
-        ["mesh"],
-    )
+    assert obj.name == "block"
+    assert obj.family == "imported"
+    assert [piece.kind for piece in obj.pieces] == ["mesh"]
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-5)
     np.testing.assert_allclose(np.sort(np.ptp(obj.visual_vertices, axis=0)), SIDES, rtol=1e-5)
@@ -92,7 +95,8 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
 
 def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, monkeypatch):
     """Each of three imports waits for the others to begin."""
-    started, real = threading.Barrier(3), meshes.assemble
+    started = threading.Barrier(3)
+    real = meshes.assemble
 
     def build(*arguments, **options):
         started.wait(20)
@@ -103,10 +107,11 @@ def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, mo
     monkeypatch.setattr(meshes, "memory", lambda: 1 << 40)
     for name, factor in (("a", 1.0), ("b", 1000.0), ("c", 0.5)):
         block(factor * SIDES).export(tmp_path / f"{name}.stl")
-    found = dict(meshes.import_sources(find_sources(tmp_path), options))
-    assert [isinstance(found[i], CongraspError) for i in range(3)] == [False, True, False]
-    assert (found[0].name, found[2].name) == ("a", "c")
-    assert "b.stl is 80 m long" in str(found[1])
+    imports = dict(meshes.import_sources(find_sources(tmp_path), options))
+    assert [isinstance(imports[i], CongraspError) for i in range(3)] == [False, True, False]
+    assert imports[0].name == "a"
+    assert imports[2].name == "c"
+    assert "b.stl is 80 m long" in str(imports[1])
 
 
 def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
@@ -157,12 +162,12 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
     )
     # The middle of the hull's longest side is 3 cm from either leg; the hull fills 36 cm^3 beside
     # the 56 of the mesh, less what thinning takes: 2 * 3 mm of 20.
-    said = re.search(
+    note = re.search(
         r"cut from its mesh, for its own 1 are coarser: .*most ([0-9.]+) mm off .* ([0-9.]+)% too large",
         obj.notes[-1],
     )
-    assert abs(float(said[1]) - 30) < 0.3
-    assert abs(float(said[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
+    assert abs(float(note[1]) - 30) < 0.3
+    assert abs(float(note[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
 
 
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
@@ -205,7 +210,8 @@ def test_an_open_sphere_is_cut_by_coacd():
     sphere = trimesh.creation.icosphere(4, 0.04)
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.02)
     result = decompose.decompose(sphere.vertices, sphere.faces, volume=None)
-    assert (result.method, result.notes) == ("coacd", [])
+    assert result.method == "coacd"
+    assert result.notes == []
 
 
 def break_module(folder, monkeypatch, name):
@@ -224,7 +230,8 @@ def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatc
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     break_module(tmp_path, monkeypatch, "vhacdx")
     result = decomposed(mesh)
-    assert (result.method, len(result.pieces)) == ("hull", 1)
+    assert result.method == "hull"
+    assert len(result.pieces) == 1
     np.testing.assert_allclose(
         shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6
     )
@@ -326,13 +333,15 @@ def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
         tmp_path / "bowl.stl"
     )
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
-    assert obj.surface_error < 3e-3 and abs(obj.volume_error) < 0.05
+    assert obj.surface_error < 3e-3
+    assert abs(obj.volume_error) < 0.05
 
 
 def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
     folder = tmp_path / "ell"
     folder.mkdir()
-    first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
+    first = block((0.08, 0.02, 0.02))
+    second = block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
     trimesh.util.concatenate([first, second]).export(folder / "ell.stl")
     first.export(folder / "contact0.stl")
     second.export(folder / "contact1.stl")
@@ -359,11 +368,6 @@ def test_coacd_cuts_an_ell_in_two():
 # --- files that announce more than they hold ---
 
 
-_PLY = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float "
-    b"y\nproperty float z\n"
-)
-_FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
 _POINTS = (
     _PLY.replace(b"binary_little_endian", b"ascii") % 4
     + _FACES.replace(b"%d", b"0\nproperty int part")
@@ -464,10 +468,11 @@ def _fallback(tree):
         ),
     ],
 )
-def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
+def test_a_file_that_announces_too_much_is_refused_unread(tmp_path, name, data, why):
     (tmp_path / name).write_bytes(data)
-    said = limited(read_mesh, tmp_path / name)
-    assert said.startswith(f"CongraspError: {tmp_path / name}") and why in said, said
+    message = limited(read_mesh, tmp_path / name)
+    assert message.startswith(f"CongraspError: {tmp_path / name}"), message
+    assert why in message, message
 
 
 def _inline(tree):
@@ -476,7 +481,7 @@ def _inline(tree):
     )
 
 
-def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
+def test_a_scene_of_many_instances_is_read_in_bounded_memory(tmp_path):
     (tmp_path / "a.glb").write_bytes(_glb(_many))
     assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
 

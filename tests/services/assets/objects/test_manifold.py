@@ -17,9 +17,9 @@ def touching(*boxes: tuple[tuple[float, float, float], tuple[float, float, float
         center = np.add(low, np.divide(sides, 2))
         transform = trimesh.transformations.translation_matrix(center)
         meshes.append(trimesh.creation.box(sides, transform))
-    whole = trimesh.util.concatenate(meshes)
-    whole.merge_vertices()
-    return whole
+    mesh = trimesh.util.concatenate(meshes)
+    mesh.merge_vertices()
+    return mesh
 
 
 def test_an_edge_of_two_boxes_belongs_to_both():
@@ -45,10 +45,10 @@ def test_the_shape_of_cubes_of_a_grid_is_unchanged(cells):
     cubes = [((n % 3, n // 3 % 3, n // 9), (1, 1, 1)) for n in cells]
     mesh = touching(*cubes)
     vertices, faces = manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    whole = trimesh.Trimesh(vertices, faces, process=False)
-    assert whole.is_watertight
-    assert whole.volume == pytest.approx(len(cells))
-    np.testing.assert_array_equal(whole.triangles, mesh.triangles)
+    grid = trimesh.Trimesh(vertices, faces, process=False)
+    assert grid.is_watertight
+    assert grid.volume == pytest.approx(len(cells))
+    np.testing.assert_array_equal(grid.triangles, mesh.triangles)
 
 
 def test_a_manifold_is_unchanged():

@@ -14,10 +14,9 @@ from congrasp.services.assets.objects.named import find_object, objects_at
 
 
 def test_a_family_and_a_seed_name_an_object_wherever_paths_do():
-    (found,) = objects_at(pathlib.Path("mug:7"))
-    assert found.name == "mug_7" and digest(found.load()) == digest(find_object("mug:7")) == digest(
-        generate(7, "mug")
-    )
+    (obj,) = objects_at(pathlib.Path("mug:7"))
+    assert obj.name == "mug_7"
+    assert digest(obj.load()) == digest(find_object("mug:7")) == digest(generate(7, "mug"))
 
 
 @pytest.mark.parametrize("text", ["mug:", ":7", "mug:x", "nothing.obj"])
@@ -90,9 +89,11 @@ def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_im
     (tmp_path / "mug_7" / "grasp.npz").touch()
     assert find_object("mug_7").name == "mug_7"  # which a folder of grasps leaves alone
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
-    said = r"'mug_7' is ambiguous: .* Pass \./mug_7 or objects/mug_7\.safetensors"
+    ambiguity = r"'mug_7' is ambiguous: .* Pass \./mug_7 or objects/mug_7\.safetensors"
     for find in (find_object, lambda name: constraints.Generate((name,))()):
-        with pytest.raises(CongraspError, match=said):
+        with pytest.raises(CongraspError, match=ambiguity):
             find("mug_7")
     ((mesh, mug), (error,)) = find_objects(["./mug_7", str(stored), "mug_7"])
-    assert mesh.source and not mug.source and re.search(said, error.error)
+    assert mesh.source
+    assert not mug.source
+    assert re.search(ambiguity, error.error)

@@ -21,11 +21,9 @@ def prism(outline, depth):
     low, high = (
         np.column_stack([outline, np.full(len(outline), z)]) for z in (-depth / 2, depth / 2)
     )
-    caps = [
-        [side[0], side[i], side[i + 1]]
-        for side in (low[::-1], high)
-        for i in range(1, len(side) - 1)
-    ]
+    caps = []
+    for side in (low[::-1], high):
+        caps += [[side[0], side[i], side[i + 1]] for i in range(1, len(side) - 1)]
     walls = [[low[i - 1], low[i], high[i]] for i in range(len(low))]
     return np.array(caps + walls + [[low[i - 1], high[i], high[i - 1]] for i in range(len(low))])
 
@@ -39,8 +37,8 @@ def joined(blocks, max_pieces, triangles=None):
 
 def test_pieces_that_form_a_convex_one_are_joined_without_need():
     blocks = [block((0.01, 0.01, 0.01), (x, 0, 0)) for x in (0, 0.01, 0.1, 0.11)]
-    whole = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
-    merged = joined(blocks, 8, np.concatenate(whole))
+    halves = [np.asarray(block((0.02, 0.01, 0.01), (x, 0, 0)).triangles) for x in (0.005, 0.105)]
+    merged = joined(blocks, 8, np.concatenate(halves))
     np.testing.assert_allclose(
         [shapes.hull_of(piece).volume for piece in merged], [2e-6, 2e-6], rtol=1e-6
     )
@@ -63,10 +61,12 @@ def test_a_thin_step_is_joined_for_its_small_depth_but_not_for_a_large_volume(cl
     cm."""
 
     def pieces_of_step(height):
-        low, high = block((0.02, height, 0.02), (0.01, height / 2, 0)), height + 0.0005
+        low = block((0.02, height, 0.02), (0.01, height / 2, 0))
+        high = height + 0.0005
         blocks = [low, block((0.02, high, 0.02), (0.03, high / 2, 0))]
         outline = [[0, 0], [0.04, 0], [0.04, high], [0.02, high], [0.02, height], [0, height]]
-        surface, volume = prism(np.array(outline), 0.02), sum(block.volume for block in blocks)
+        surface = prism(np.array(outline), 0.02)
+        volume = sum(block.volume for block in blocks)
         return len(
             merge(
                 [np.asarray(block.vertices) for block in blocks],
@@ -110,10 +110,8 @@ def test_pieces_of_a_bent_wall_are_as_thin_as_the_wall(angle):
     sections = [
         prism(np.array([inner[i], outer[i], outer[i + 1], inner[i + 1]]), 0.03) for i in range(24)
     ]
-    wall, blocks = (
-        np.concatenate(sections),
-        [np.concatenate(some).reshape(-1, 3) for some in np.split(np.array(sections), 6)],
-    )
+    wall = np.concatenate(sections)
+    blocks = [np.concatenate(some).reshape(-1, 3) for some in np.split(np.array(sections), 6)]
     volume = np.radians(angle) * 0.040 * 0.002 * 0.03
     merged = merge(blocks, 2, wall, volume)
     assert len(merged) == 2

@@ -1,5 +1,6 @@
 """Broken meshes: each is repaired with a note, or rejected with the remedy."""
 
+import itertools
 import struct
 
 import numpy as np
@@ -24,11 +25,14 @@ def ball(**options):
 
 
 def test_an_opening_is_left_and_bodies_that_touch_stay_together():
-    half, said = ball(), list[str]()
+    half = ball()
+    notes = list[str]()
     half.update_faces(half.triangles_center[:, 2] < 0)
-    assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
+    assert len(closed(half, notes).faces) == len(half.faces)
+    assert not notes  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
-    assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
+    assert len(largest_body(pair, notes).faces) == 2 * len(ball().faces)
+    assert not notes
 
 
 @pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
@@ -58,21 +62,20 @@ def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
 )
 def test_a_flat_object_is_no_table(radius, depth, knob, at):
     flat = trimesh.creation.cylinder(radius, depth)
-    whole = trimesh.util.concatenate(
+    mesh = trimesh.util.concatenate(
         [flat, trimesh.creation.cylinder(*knob).apply_translation([0.0, 0.0, at])]
     )
-    assert without_table(whole, 1.0, []) is whole
+    assert without_table(mesh, 1.0, []) is mesh
 
 
 def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
-    scan, speck = (
-        trimesh.creation.icosphere(7, 0.05),
-        np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]]),
-    )
+    scan = trimesh.creation.icosphere(7, 0.05)
+    speck = np.array([[4.5, 0, 0], [4.5, 1e-3, 0], [4.5, 0, 1e-3]])
     volume = scan.volume
     trimesh.util.concatenate([scan, trimesh.Trimesh(speck, [[0, 1, 2]])]).export(tmp_path / "a.stl")
-    found = largest_body(read_mesh(tmp_path / "a.stl"), [])
-    assert found.is_watertight and found.volume == pytest.approx(volume, rel=0.01)
+    body = largest_body(read_mesh(tmp_path / "a.stl"), [])
+    assert body.is_watertight
+    assert body.volume == pytest.approx(volume, rel=0.01)
     small = trimesh.Trimesh(*reduced(np.vstack([scan.vertices, [100.0, 0, 0]]), scan.faces, []))
     assert small.volume == pytest.approx(volume, rel=0.01)
 
@@ -91,16 +94,16 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     a = np.linspace(0, np.pi, rows)
     spine = np.stack([0.04 + 0.03 * np.sin(a), 0 * a, 0.025 * np.cos(a)], -1)[:, None]
     strap = (spine + np.array([[0, 0, 0], [0, 0.004, 0]])).reshape(-1, 3)
-    faces = [
-        face
-        for i in range(0, 2 * rows - 2, 2)
-        for face in ((i, i + 1, i + 2), (i + 1, i + 3, i + 2))
-    ]
+    faces = []
+    for i in range(0, 2 * rows - 2, 2):
+        faces += [(i, i + 1, i + 2), (i + 1, i + 3, i + 2)]
     mug = trimesh.util.concatenate([cup, trimesh.Trimesh(strap, faces, process=False)])
     mug.merge_vertices()
-    assert (mug.faces.shape, mug.body_count) == ((len(cup.faces) + len(faces), 3), 1)
-    said = list[str]()
-    assert len(closed(mug, said).faces) == len(mug.faces) and not said
+    assert mug.faces.shape == (len(cup.faces) + len(faces), 3)
+    assert mug.body_count == 1
+    notes = list[str]()
+    assert len(closed(mug, notes).faces) == len(mug.faces)
+    assert not notes
 
 
 @pytest.mark.parametrize(
@@ -110,7 +113,7 @@ def test_a_handle_of_one_sheet_is_kept(rows):
         (lambda mesh: mesh.apply_translation([1e5, -2e5, 3e5]), ""),
     ],
 )
-def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil, note):
+def test_repairable_meshes_are_solid(tmp_path, quick_import, spoil, note):
     spoil(ball()).export(tmp_path / "a.obj", digits=9)
     obj = one_object(
         tmp_path / "a.obj", ImportOptions(density=1000.0, cache_dir=str(tmp_path / "cache"))
@@ -125,7 +128,7 @@ def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.06)
 
 
-def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
+def test_a_mesh_rounded_by_single_precision_is_refused(tmp_path):
     ball().apply_translation([1e5, 0, 0]).export(tmp_path / "a.stl")
     with pytest.raises(
         CongraspError,
@@ -140,7 +143,8 @@ _ARROW = [(0, 0), (2, 0), (0.5, 0.5), (0, 2)]
 
 def _prism(outline):
     """Points and polygons of a prism, as modelling programs export it: one polygon for each end."""
-    points, n = [(x, y, z) for z in (0, 3) for x, y in outline], len(outline)
+    points = [(x, y, z) for z, (x, y) in itertools.product((0, 3), outline)]
+    n = len(outline)
     sides = [(i, (i + 1) % n, (i + 1) % n + n, i + n) for i in range(n)]
     return points, [tuple(range(n))[::-1], tuple(range(n, 2 * n)), *sides]
 
@@ -156,12 +160,13 @@ property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"""
     rows = [("3f", *point) for point in points]
     rows += [(f"B{len(one)}i3B", len(one), *one, 9, i, 7) for i, one in enumerate(faces)]
     order = ">" if "big" in kind else "<"
-    packed = [struct.pack(order + row[0], *row[1:]) for row in rows]
-    return header.encode() + b"".join(
-        packed
-        if number is None
-        else [(" ".join(number % x for x in row[1:]) + "\n").encode() for row in rows]
-    )
+    written = []
+    for form, *values in rows:
+        if number is None:
+            written.append(struct.pack(order + form, *values))
+        else:
+            written.append((" ".join(number % x for x in values) + "\n").encode())
+    return header.encode() + b"".join(written)
 
 
 _QUADS = _ply(_ARROW, "binary_little_endian")
@@ -187,9 +192,11 @@ _QUADS = _ply(_ARROW, "binary_little_endian")
 )
 def test_polygons_of_a_ply_keep_their_volume_and_their_colours(tmp_path, data, volume):
     (tmp_path / "a.ply").write_bytes(data)
-    said = list[str]()
-    mesh = read_mesh(tmp_path / "a.ply", said)
-    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(volume) and not said
+    notes = list[str]()
+    mesh = read_mesh(tmp_path / "a.ply", notes)
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(volume)
+    assert not notes
     colours = load_geometry(tmp_path / "a.ply", "").visual.face_colors[:, :3]
     faces = 6 if volume == 3 else 10
     np.testing.assert_array_equal(np.unique(colours, axis=0), [(9, i, 7) for i in range(faces)])
@@ -235,11 +242,9 @@ def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
     text = "".join(" ".join(map(str, row[1:])) + "\n" for row in rows)
     (tmp_path / "a.ply").write_bytes(header.encode() + (text.encode() if kind == "ascii" else data))
     mesh = read_mesh(tmp_path / "a.ply")
-    assert (
-        mesh.is_watertight
-        and abs(mesh.volume) == pytest.approx(36)
-        and mesh.area == pytest.approx(24 + 26 * 3)
-    )
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(36)
+    assert mesh.area == pytest.approx(24 + 26 * 3)
 
 
 @pytest.mark.parametrize("turn", [1, -1])
@@ -249,11 +254,9 @@ def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
     text = "".join("v {} {} {}\n".format(*point) for point in points)
     (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
-    assert (
-        mesh.is_watertight
-        and abs(mesh.volume) == pytest.approx(36)
-        and mesh.area == pytest.approx(24 + 26 * 3)
-    )
+    assert mesh.is_watertight
+    assert abs(mesh.volume) == pytest.approx(36)
+    assert mesh.area == pytest.approx(24 + 26 * 3)
 
 
 def _row(face, end):
@@ -291,9 +294,9 @@ def test_star_of_many_corners_is_cut(tmp_path):
 
 def test_many_corners_are_left_with_a_note(tmp_path):
     (tmp_path / "a.obj").write_text(_star(1002))
-    said = list[str]()
-    assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 1000
-    assert said == [
+    notes = list[str]()
+    assert len(load_geometry(tmp_path / "a.obj", "", notes=notes).faces) == 1000
+    assert notes == [
         "1 of its dented polygons could not be cut and may be filled (export it as triangles)"
     ]
     (tmp_path / "a.obj").write_text("v 0 0\n" + _flat(np.eye(4, 2)))
@@ -310,18 +313,19 @@ def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
         trimesh.creation.revolve(np.array(line), sections=32)
         for line in (outer + inner, [*outer, (0, 0.18)])
     )
-    said = list[str]()
-    shown = without_hollows(bottle, said)
-    np.testing.assert_allclose(shown.volume, (full if filled else bottle).volume, rtol=0.01)
-    assert repair.encloses(shown) and bool(said) == filled
+    notes = list[str]()
+    repaired = without_hollows(bottle, notes)
+    np.testing.assert_allclose(repaired.volume, (full if filled else bottle).volume, rtol=0.01)
+    assert repair.encloses(repaired)
+    assert bool(notes) == filled
 
 
 def test_a_hollow_without_an_opening_is_filled():
     void = ball()
     void.apply_scale(0.9)
     void.invert()
-    shown = without_hollows(trimesh.util.concatenate([ball(), void]), [])
-    np.testing.assert_allclose(shown.volume, ball().volume, rtol=1e-6)
+    filled = without_hollows(trimesh.util.concatenate([ball(), void]), [])
+    np.testing.assert_allclose(filled.volume, ball().volume, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -333,7 +337,8 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     obj = one_object(tmp_path / "fine.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
     notes = obj.notes
     assert notes[0] == "its 81,920 triangles were reduced to 2,000: a hand does not feel the rest"
-    assert len(obj.visual_faces) <= 2_000 and not [note for note in notes if "open" in note]
+    assert len(obj.visual_faces) <= 2_000
+    assert not [note for note in notes if "open" in note]
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
     # As STL files have it: no triangle shares a corner
     soup = fine.vertices[fine.faces].reshape(-1, 3)
@@ -343,9 +348,9 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
 
 def test_a_surface_without_an_outside_is_unchanged():
     strip = trimesh.Trimesh(*_moebius())
-    said: list[str] = []
-    assert closed(strip, said).faces.shape == strip.faces.shape
-    assert not said
+    notes: list[str] = []
+    assert closed(strip, notes).faces.shape == strip.faces.shape
+    assert not notes
 
 
 def _moebius():
@@ -356,12 +361,12 @@ def _moebius():
             np.sin(t) * (1 + s * np.cos(t / 2)),
             s * np.sin(t / 2),
         )
-        for t in turns
-        for s in (-0.2, 0.2)
+        for t, s in itertools.product(turns, (-0.2, 0.2))
     ]
     faces = []
     for i in range(24):
-        a, b = 2 * i, 2 * i + 1
+        a = 2 * i
+        b = 2 * i + 1
         c, d = (2 * i + 2, 2 * i + 3) if i < 23 else (1, 0)
         faces += [(a, b, c), (b, d, c)]
     return rim, faces
@@ -378,8 +383,8 @@ def test_a_slit_along_a_bend_is_closed_along_the_bend():
     filled = fill(sphere, [loop])
     assert filled.is_watertight
     assert len(filled.vertices) == len(sphere.vertices)
-    whole = trimesh.creation.uv_sphere(0.04, count=[32, 32])
-    np.testing.assert_allclose(filled.volume, whole.volume, rtol=5e-4)
+    ball_mesh = trimesh.creation.uv_sphere(0.04, count=[32, 32])
+    np.testing.assert_allclose(filled.volume, ball_mesh.volume, rtol=5e-4)
 
 
 def test_a_hole_whose_bases_are_edges_of_the_mesh_is_closed_by_a_fan():

@@ -44,7 +44,7 @@ def test_numbers_at_their_limits_are_accepted() -> None:
         (300.0, "mm"),
     ],
 )
-def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(
+def test_the_unit_is_guessed_if_only_one_gives_a_hand_sized_object(
     longest: float, unit: str
 ) -> None:
     sides = (longest / 2, longest, longest / 3)
@@ -57,7 +57,7 @@ def test_the_unit_is_guessed_where_only_one_makes_a_thing_for_a_hand(
 
 
 @pytest.mark.parametrize("longest", [1e-4, 2e4])
-def test_what_is_for_no_hand_in_any_unit_is_refused(longest: float) -> None:
+def test_a_size_unsuited_in_every_unit_is_refused(longest: float) -> None:
     with pytest.raises(
         CongraspError,
         match=r"a\.stl is .* units long, which is not a size for a hand in any of the units",
@@ -65,7 +65,7 @@ def test_what_is_for_no_hand_in_any_unit_is_refused(longest: float) -> None:
         guessed_unit("a.stl", (longest, longest, longest))
 
 
-def test_the_size_in_every_unit_says_whether_a_hand_could_grasp_that() -> None:
+def test_sizes_in_every_unit_note_graspability() -> None:
     assert sizes_by_unit((6.0, 4.5, 9.0)) == {
         "m": ("6 x 4.5 x 9 m", False),
         "cm": ("6 x 4.5 x 9 cm", True),
@@ -89,25 +89,25 @@ def weight(mesh, name):
 
 def test_a_solid_weighs_its_volume():
     block = trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0.3, 0, 0))
-    found = weight(block, "steel")
-    assert found.mass == pytest.approx(7850 * 4e-5)
-    np.testing.assert_allclose(found.center, (0.3, 0, 0), atol=1e-12)
+    mass = weight(block, "steel")
+    assert mass.mass == pytest.approx(7850 * 4e-5)
+    np.testing.assert_allclose(mass.center, (0.3, 0, 0), atol=1e-12)
     np.testing.assert_allclose(
-        np.diag(found.inertia), found.mass / 12 * np.array([0.0104, 0.0104, 0.0008])
+        np.diag(mass.inertia), mass.mass / 12 * np.array([0.0104, 0.0104, 0.0008])
     )
 
 
-def test_what_is_too_thick_for_its_material_weighs_its_wall():
+def test_an_object_too_thick_for_its_material_weighs_its_wall():
     ball = trimesh.creation.icosphere(4, radius=0.05)
-    found = weight(ball, "ceramic")
-    assert found.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
+    mass = weight(ball, "ceramic")
+    assert mass.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
     np.testing.assert_allclose(
-        found.inertia, 2 / 3 * found.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9
+        mass.inertia, 2 / 3 * mass.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9
     )
     assert weight(ball, "wood").mass == pytest.approx(640 * 4 / 3 * np.pi * 0.05**3, rel=0.01)
 
 
-def test_a_thin_shell_weighs_what_its_two_walls_enclose():
+def test_a_thin_shell_weighs_the_volume_between_its_walls():
     tube = trimesh.creation.annulus(0.037, 0.04, 0.1)
     assert weight(tube, "ceramic").mass == pytest.approx(
         2400 * np.pi * (0.04**2 - 0.037**2) * 0.1, rel=0.01
@@ -118,9 +118,9 @@ def test_an_open_sheet_weighs_its_wall():
     box = trimesh.creation.box((0.06, 0.06, 0.1))
     box.update_faces(box.triangles_center[:, 2] < 0.049)
     assert not box.is_volume
-    found = weight(box, "glass")
-    assert found.mass == pytest.approx(2500 * 0.003 * (0.06**2 + 4 * 0.06 * 0.1))
-    assert found.center[2] == pytest.approx(-0.05 * 0.06**2 / (0.06**2 + 4 * 0.06 * 0.1))
+    mass = weight(box, "glass")
+    assert mass.mass == pytest.approx(2500 * 0.003 * (0.06**2 + 4 * 0.06 * 0.1))
+    assert mass.center[2] == pytest.approx(-0.05 * 0.06**2 / (0.06**2 + 4 * 0.06 * 0.1))
     flat = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 1, 2)], process=False)
     assert weight(flat, "paper").mass == pytest.approx(900 * 0.001 * 0.005)
 
@@ -145,15 +145,18 @@ def imported(folder: pathlib.Path, **options):
 
 def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     obj = imported(hammer, material="head=steel,handle=wood")
-    head, handle = 7850 * 0.025**2 * 0.09, 640 * 0.025**2 * 0.25
-    assert obj.mass == pytest.approx(head + handle, rel=1e-4) and 0.4 < obj.mass < 0.6
+    head = 7850 * 0.025**2 * 0.09
+    handle = 640 * 0.025**2 * 0.25
+    assert obj.mass == pytest.approx(head + handle, rel=1e-4)
+    assert 0.4 < obj.mass < 0.6
     # The file's origin is the handle's middle, so that the centre of mass is high up.
     assert -obj.origin[2] == pytest.approx(0.1375 * head / (head + handle), rel=1e-3)
     for text in ("wood,head=steel", "handle=wood,steel"):
         assert imported(hammer, material=text).mass == obj.mass
-    given = imported(hammer, material="head=steel,handle=wood", mass=0.5)
-    assert given.mass == 0.5 and given.origin == obj.origin
-    np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
+    weighed = imported(hammer, material="head=steel,handle=wood", mass=0.5)
+    assert weighed.mass == 0.5
+    assert weighed.origin == obj.origin
+    np.testing.assert_allclose(weighed.inertia / 0.5, obj.inertia / obj.mass)
 
 
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
@@ -164,7 +167,8 @@ def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_ma
 
 
 def test_options_weigh_objects_of_the_generator_too():
-    at, before = ObjectAt("mug_7", pathlib.Path("mug:7"), None), generate(7, "mug")
+    at = ObjectAt("mug_7", pathlib.Path("mug:7"), None)
+    before = generate(7, "mug")
     heavy = import_object(at, ImportOptions(mass=0.4))
     assert heavy.mass == 0.4
     np.testing.assert_allclose(heavy.inertia, before.inertia * 0.4 / before.mass)

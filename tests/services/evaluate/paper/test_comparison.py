@@ -2,6 +2,7 @@
 LaTeX.
 """
 
+import collections
 import json
 import pathlib
 import re
@@ -39,7 +40,7 @@ def find(cells, table, constraint, quantity=SUCCESS, hand="human", method="ours"
     ]
 
 
-def test_a_figure_stands_beside_the_papers_of_the_same_hand_method_and_source():
+def test_figures_are_matched_by_hand_method_and_source():
     heading = row(
         "heading",
         0.99,
@@ -50,31 +51,37 @@ def test_a_figure_stands_beside_the_papers_of_the_same_hand_method_and_source():
     )
     cells = compare([result("hands", heading)], {}, HANDS)
     (cell,) = find(cells, "hands", "heading")
-    assert (cell.ours, cell.low, cell.high, cell.paper) == (0.99, 0.97, 0.997, 0.96)
-    assert cell.difference == pytest.approx(0.03) and cell.verdict == "better"
+    assert cell.ours == 0.99
+    assert cell.low == 0.97
+    assert cell.high == 0.997
+    assert cell.paper == 0.96
+    assert cell.difference == pytest.approx(0.03)
+    assert cell.verdict == "better"
     (metres,) = find(cells, "hands", "heading", "heading_m")
-    assert (metres.low, metres.high) == pytest.approx(
-        (0.028, 0.032)
-    ) and metres.difference == pytest.approx(0.01)
+    assert (metres.low, metres.high) == pytest.approx((0.028, 0.032))
+    assert metres.difference == pytest.approx(0.01)
     assert metres.verdict == "worse"  # a larger error
     (radians,) = find(cells, "hands", "heading", "heading_rad")
-    assert radians.difference == pytest.approx(-0.043) and (radians.low, radians.verdict) == (
+    assert radians.difference == pytest.approx(-0.043)
+    assert (radians.low, radians.verdict) == (
         None,
         "",
     )
     # The paper's 96.9 % is of captured constraints: ours is only the nearest.
     (captured,) = find(cells, "single", "heading")
-    assert (
-        captured.ours is None and captured.nearest == 0.99 and "GRAB and OakInk" in captured.reason
-    )
+    assert captured.ours is None
+    assert captured.nearest == 0.99
+    assert "GRAB and OakInk" in captured.reason
     (other,) = find(cells, "hands", "heading", hand="sharpa")
-    assert other.ours is None and other.reason == "not evaluated"
+    assert other.ours is None
+    assert other.reason == "not evaluated"
 
 
 def test_every_figure_of_the_paper_has_a_cell():
     lines = paper_lines()
     assert {line.table for line in lines} == set(TABLES)
-    assert [sum(line.table == table for line in lines) for table in TABLES] == [8, 2, 4, 12, 12, 9]
+    counts = collections.Counter(line.table for line in lines)
+    assert [counts[table] for table in TABLES] == [8, 2, 4, 12, 12, 9]
     cells = compare([], {}, HANDS)
     assert len(cells) == sum(1 + len(line.figures.errors) for line in lines)
     assert all(cell.ours is None and cell.reason for cell in cells)
@@ -90,11 +97,11 @@ def test_captured_rows_of_several_data_sets_each_have_a_cell():
         result("captured", row("pose", rate, 0.0, 1.0), table="captured", data=name)
         for rate, name in ((0.8, "grab"), (0.9, "oakink"))
     )
-    found = find(compare([grab, oak], {}, HANDS), "ablation", "pose")
-    assert [(cell.data, cell.ours) for cell in found] == [("grab", 0.8), ("oakink", 0.9)]
+    table_cell = find(compare([grab, oak], {}, HANDS), "ablation", "pose")
+    assert [(cell.data, cell.ours) for cell in table_cell] == [("grab", 0.8), ("oakink", 0.9)]
 
 
-def test_reasons_say_what_is_missing():
+def test_missing_rows_have_a_reason():
     absent = {PolicyKey("human", "graspxl"): "its training failed"}
     cells = compare([result("hands", row("heading", 0.9, 0.8, 0.95))], absent, ("human",))
     (graspxl,) = find(cells, "objects", "heading", method="graspxl", group="small")
@@ -110,7 +117,9 @@ def test_reasons_say_what_is_missing():
 def test_rows_without_an_episode_that_succeeds_have_no_error_to_compare():
     none = row("heading", 0.0, 0.0, 0.04, errors={"heading_rad": None, "heading_m": None})
     (cell,) = find(compare([result("hands", none)], {}, HANDS), "hands", "heading", "heading_rad")
-    assert cell.ours is None and cell.difference is None and cell.reason == "no episode succeeded"
+    assert cell.ours is None
+    assert cell.difference is None
+    assert cell.reason == "no episode succeeded"
 
 
 def test_groups_by_size_are_compared_and_others_are_our_own():
@@ -120,8 +129,9 @@ def test_groups_by_size_are_compared_and_others_are_our_own():
     ]
     results = [result("objects", *rows, table="objects")]
     (small,) = find(compare(results, {}, HANDS), "objects", "heading", group="small")
-    assert small.paper == 0.929 and small.ours == 0.9
-    assert [own.group for _, own in unmatched(results)] == ["family mug"]
+    assert small.paper == 0.929
+    assert small.ours == 0.9
+    assert [ours.group for _, ours in unmatched(results)] == ["family mug"]
 
 
 def test_the_summary_counts_rates_and_intervals():
@@ -131,10 +141,8 @@ def test_the_summary_counts_rates_and_intervals():
         row("trajectory", 0.96, 0.93, 0.98),
     ]
     text = summary(compare([result("hands", *rows)], {}, HANDS))
-    assert (
-        text.startswith("3 of the paper's 47 success rates")
-        and "at or above the paper's in 2;" in text
-    )
+    assert text.startswith("3 of the paper's 47 success rates")
+    assert "at or above the paper's in 2;" in text
     assert "interval is above it in 1, and below it in 1." in text
 
 
@@ -178,16 +186,19 @@ def test_latex_is_balanced_and_holds_every_figure():
         row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01})
         for name in ("heading", "pose")
     ]
-    shown = paper_tables(compare([result("hands", *rows)], {}, HANDS))
-    text = "\n".join(table.latex("50 % of 3_objects & more.") for table in shown)
+    tables = paper_tables(compare([result("hands", *rows)], {}, HANDS))
+    text = "\n".join(table.latex("50 % of 3_objects & more.") for table in tables)
     opened, closed = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
     assert sorted(opened) == sorted(closed) == ["table"] * 6 + ["tabular"] * 6
     plain = re.sub(r"\\[\\%&#_{}$]|\\\w+(\{\})?", "", text)
     assert plain.count("{") == plain.count("}")
     body = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert len(body) == 6 + 47
-    wanted = [len(table.columns) - 1 for table in shown for _ in range(1 + len(table.rows))]
-    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == wanted and set(wanted) == {7, 9}
+    separators = []
+    for table in tables:
+        separators += [len(table.columns) - 1] * (1 + len(table.rows))
+    assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == separators
+    assert set(separators) == {7, 9}
     for line in body:
         assert not re.search(r"(?<!\\)[%#_]", line)
     assert r"98.4 (94.5-99.6) & 96.0 & +2.4" in text
@@ -196,7 +207,7 @@ def test_latex_is_balanced_and_holds_every_figure():
 
 @given(st.text("&%$#_{}~^\\<>±ab \n"))
 def test_escaped_text_has_no_special_character_left(text):
-    found = escape(text)
+    escaped = escape(text)
     for command in (
         r"\textbackslash{}",
         r"\textasciitilde{}",
@@ -205,5 +216,5 @@ def test_escaped_text_has_no_special_character_left(text):
         "$<$",
         "$>$",
     ):
-        found = found.replace(command, "")
-    assert not re.search(r"[&%$#_{}~^]", re.sub(r"\\[&%$#_{}]", "", found))
+        escaped = escaped.replace(command, "")
+    assert not re.search(r"[&%$#_{}~^]", re.sub(r"\\[&%$#_{}]", "", escaped))

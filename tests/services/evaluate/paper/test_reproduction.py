@@ -41,9 +41,7 @@ def policy(tmp_path_factory):
 
 @pytest.mark.timeout(600)
 @pytest.mark.slow
-def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
-    policy, tmp_path, capsys, monkeypatch
-):
+def test_a_reproduction_writes_its_files_once(policy, tmp_path, capsys, monkeypatch):
     command = [
         "--quick",
         "--hands",
@@ -63,28 +61,27 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
         assert load("reproduce")(command)() == 1
         return json.loads((tmp_path / "reproduction.json").read_text())
 
-    first, printed = reproduced(), capsys.readouterr().out
+    first = reproduced()
+    printed = capsys.readouterr().out
     assert [part["name"] for part in first["parts"]] == ["human-ours-single", "human-ours-objects"]
     (failure,) = first["failures"]
-    assert failure.startswith(failed) and failed in printed
+    assert failure.startswith(failed)
+    assert failed in printed
     rates = [cell for cell in first["cells"] if cell["quantity"] == "success"]
     compared = [cell for cell in rates if cell["ours"] is not None]
-    assert (
-        f"{len(compared)} of the paper's 47 success rates" in printed
-        and "reproduction.html" in printed
-    )
-    assert {cell["table"] for cell in compared} == {"hands", "objects"} and len(compared) >= 5
+    assert f"{len(compared)} of the paper's 47 success rates" in printed
+    assert "reproduction.html" in printed
+    assert {cell["table"] for cell in compared} == {"hands", "objects"}
+    assert len(compared) >= 5
     for cell in compared:
         assert 0.0 <= cell["low"] <= cell["ours"] <= cell["high"] <= 1.0
         assert cell["difference"] == pytest.approx(cell["ours"] - cell["paper"])
     assert len(first["not_comparable"]) == len(rates) - len(compared)
     page = Reader(text := (tmp_path / "reproduction.html").read_text())
-    assert (
-        not page.links
-        and len(page.sources) == 2
-        and "not trained with --quick" in text
-        and failed in html.unescape(text)
-    )
+    assert not page.links
+    assert len(page.sources) == 2
+    assert "not trained with --quick" in text
+    assert failed in html.unescape(text)
     assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
     assert not list((tmp_path / "tables").glob("*.parts"))
 
@@ -92,8 +89,10 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(
         raise CongraspError("This must not be evaluated.")
 
     monkeypatch.setattr(part_evaluation, "evaluate_tables", never)
-    again, printed = reproduced(), capsys.readouterr().out
-    assert printed.count("evaluated before") == 2 and again["cells"] == first["cells"]
+    again = reproduced()
+    printed = capsys.readouterr().out
+    assert printed.count("evaluated before") == 2
+    assert again["cells"] == first["cells"]
     assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
     (tmp_path / "tables" / "human-ours-single.json").write_text("{")
     assert [part["name"] for part in reproduced()["parts"]] == ["human-ours-objects"]
@@ -106,18 +105,18 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     policy, tmp_path, monkeypatch
 ):
     """A method whose training fails is named with the reason, and the others are evaluated."""
-    asked = []
+    trained = []
 
-    def train_all(request, wanted, track):
-        asked.extend(wanted)
-        return {one: "it failed" for one in wanted}
+    def train_all(request, keys, track):
+        trained.extend(keys)
+        return {one: "it failed" for one in keys}
 
     def evaluate_part(part, entrant, settings, out, track):
-        asked.append(part.name)
+        trained.append(part.name)
         constraint = "heading" if part.table == "single" else "pose+trajectory"
-        made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
+        result_row = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
         about = {"pictures": [], "seconds": 1.0, "heading_rules": "Half of the headings are kept."}
-        return PartResult(part, "hands", [made], about, True)
+        return PartResult(part, "hands", [result_row], about, True)
 
     monkeypatch.setattr(training, "train_all", train_all)
     monkeypatch.setattr(reproduction, "evaluate_part", evaluate_part)
@@ -144,17 +143,15 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(
     )
     account = reproduction.reproduce(request, policies, silent)
     what = {one.name: text for one, text in account.policies}
-    assert asked[:2] == [PolicyKey("allegro", "ours"), PolicyKey("human", "graspxl")]
-    assert asked[2:6] == [
+    assert trained[:2] == [PolicyKey("allegro", "ours"), PolicyKey("human", "graspxl")]
+    assert trained[2:6] == [
         "human-ours-single",
         "human-pd-single",
         "human-ours-composed",
         "human-ours-noise",
     ]
-    assert (
-        what["human-ours"].startswith("policy.safetensors, version 0")
-        and what["human-pd"] == "needs none"
-    )
+    assert what["human-ours"].startswith("policy.safetensors, version 0")
+    assert what["human-pd"] == "needs none"
     assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"
     assert what["human-dgrasp"] == "none: not requested"
     assert account.failures == ["it failed", "it failed"]
@@ -205,4 +202,5 @@ def test_captured_sets_are_looked_for_where_the_import_puts_them(
         == 1
     )
     assert "human-ours-grab: " in (printed := capsys.readouterr().out)
-    assert "has no folder 'constraints'" in printed and "congrasp constraints import" in printed
+    assert "has no folder 'constraints'" in printed
+    assert "congrasp constraints import" in printed
