@@ -19,7 +19,7 @@ from congrasp.services.ops.metrics import ServerMetrics
 from congrasp.services.ops.waiting import connect_when_up, when_up
 
 if TYPE_CHECKING:
-    from congrasp.services.serve.server import Source
+    from congrasp.services.serve.sources import Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,8 @@ class Serve:
         import jax
 
         from congrasp.common.policy.pretrained import policy_file
-        from congrasp.services.serve.server import PolicyServer, follow_file
+        from congrasp.services.serve.server import PolicyServer
+        from congrasp.services.serve.sources import follow_file
 
         if self.policy is not None and self.connect:
             raise CongraspError(
@@ -112,7 +113,7 @@ class Serve:
 
     def _source_of_run(self, stack: contextlib.ExitStack, stop: Stop) -> "Source | None":
         """Connects to the learner and waits for its first policy; returns None if stopped."""
-        from congrasp.services.serve.server import follow_run
+        from congrasp.services.serve.sources import follow_run
 
         upstream = connect_when_up(
             self.connect,

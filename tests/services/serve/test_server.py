@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import os
 import pathlib
 import threading
 import types
@@ -11,7 +12,13 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.errors import (
+    CongraspError,
+    OverloadedError,
+    RefusedError,
+    StartingError,
+    TransportError,
+)
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
@@ -22,15 +29,15 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
-from congrasp.services.serve.requests import Query
 from congrasp.services.serve.server import (
-    DEPTH,
-    SHARE,
+    PEER_LIMIT,
+    QUEUE_LIMIT,
     Answer,
     PolicyServer,
-    follow_file,
-    follow_run,
+    _join,
+    parse_timeout,
 )
+from congrasp.services.serve.sources import follow_file, follow_run
 from congrasp.services.train.command import untrained
 from tests import task
 from tests.services.ops.test_metrics import scrape
@@ -67,9 +74,8 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
         first, second = (client.act(episode.state) for _ in range(2))
         health = client.health()
         assert health["ready"] and health["hand"] == "human"
-        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health[
-            "states_per_second"
-        ] > 100
+        assert (health["queue_limit"], health["peer_limit"]) == (QUEUE_LIMIT, PEER_LIMIT)
+        assert health["states_per_second"] > 0
     assert (
         first.q_target.shape == (20,)
         and first.u_target.shape == (6,)
@@ -109,7 +115,7 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
     served, monkeypatch
 ):
     path, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_PERIOD_S", 0.001)
     policy = task.policy()
     swapped = threading.Event()
 
@@ -149,7 +155,9 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
 ):
     """Beside other clients the eleven are inferred in three parts."""
     _, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
+    monkeypatch.setattr(
+        "congrasp.services.serve.batching._ALONE_AFTER_S", 1e6 if beside_others else 0.0
+    )
     if beside_others:
         with PolicyClient(endpoint, timeout=5.0) as other:
             other.reset(episode.request)
@@ -173,17 +181,14 @@ def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_o
     assert np.abs(together[0].q_target - together[10].q_target).max() > 0.01
 
 
-def test_a_query_whose_policy_is_swapped_between_two_parts_is_answered_by_one():
+def test_parts_are_joined_only_if_one_policy_answered_all():
     old, new = object(), object()
 
     def part(policy: object, value: float) -> Answer:
         return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
 
-    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), new, 0.25, 0.75)
-    server = types.SimpleNamespace(_infer=lambda queries, queued: [repeated])
-    query = Query(np.zeros((4, 5), np.float32), ())
-    assert PolicyServer._join(server, query, [part(old, 1.0), part(new, 2.0)]) is repeated
-    joined = PolicyServer._join(server, query, [part(new, 1.0), part(new, 2.0)])
+    assert _join([part(old, 1.0), part(new, 2.0)]) is None
+    joined = _join([part(new, 1.0), part(new, 2.0)])
     np.testing.assert_array_equal(joined.inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
     assert joined.inference.active == [["x"]] * 4
     assert joined.policy is new
@@ -228,14 +233,15 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
 
     with contextlib.ExitStack() as stack:
         clients = [
-            stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)
+            stack.enter_context(PolicyClient(endpoint, timeout=50.0))
+            for _ in range(QUEUE_LIMIT + 2)
         ]
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
         stack.callback(go.set)
         asked = [pool.submit(ask, clients[0])]
         assert entered.acquire(timeout=60)
         asked += [pool.submit(ask, client) for client in clients[1:-1]]
-        eventually(lambda: clients[-1].health()["queue"] >= DEPTH)
+        eventually(lambda: clients[-1].health()["queue"] >= QUEUE_LIMIT)
         with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
@@ -276,7 +282,7 @@ def test_following_a_run_pulls_only_what_is_newer():
 
 def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
     """Its policy stays until the learner answers again with a newer one."""
-    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_PERIOD_S", 0.001)
     monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
     first = task.policy()
     newer = dataclasses.replace(first, version=first.version + 1)
@@ -295,6 +301,118 @@ def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
         eventually(lambda: server.health()["version"] == newer.version)
         assert served_while_lost == 20 * [first.version]
         server.close()
+
+
+@pytest.fixture
+def quick_start(monkeypatch):
+    """Servers look for newer policies often, and compile nothing."""
+    monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_PERIOD_S", 0.001)
+    monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
+
+
+def test_a_server_outlives_any_error_of_its_source(quick_start):
+    """Its health reports the error until the source works again."""
+    first = task.policy()
+    outcome: list[object] = [ZeroDivisionError("reason")]
+
+    def pull(version):
+        if version < 0:
+            return first
+        if isinstance(outcome[0], Exception):
+            raise outcome[0]
+        return outcome[0]
+
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", pull)
+        eventually(lambda: "reason" in server.health()["trouble"])
+        outcome[0] = None
+        eventually(lambda: server.health()["trouble"] == "")
+        outcome[0] = dataclasses.replace(first, version=first.version + 1)
+        eventually(lambda: server.health()["version"] == first.version + 1)
+        server.close()
+
+
+def test_a_policy_file_that_was_missing_for_a_while_is_no_trouble(quick_start, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    bundles.save(task.policy(), path)
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", follow_file(path))
+        path.rename(tmp_path / "aside")
+        eventually(lambda: "cannot be read" in server.health()["trouble"])
+        (tmp_path / "aside").rename(path)
+        eventually(lambda: server.health()["trouble"] == "")
+        server.close()
+
+
+def test_a_policy_file_is_read_again_after_a_failure(tmp_path, monkeypatch):
+    """Its time of change is the same: only the reading failed."""
+    path = tmp_path / "policy.safetensors"
+    bundles.save(task.policy(), path)
+    read = follow_file(path)
+    version = read(-1).version
+    os.utime(path, (1.0, 1.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(bundles, "load", mock.Mock(side_effect=CongraspError("disk")))
+        with pytest.raises(CongraspError, match="disk"):
+            read(version)
+    assert read(version).version == version
+    assert read(version) is None
+
+
+def test_health_is_complete_at_the_moment_of_readiness(quick_start):
+    """The server gets ready between two looks of the same check."""
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", lambda version: task.policy())
+        server._ready.clear()
+        looks = iter([False])
+        server._ready.is_set = lambda: next(looks, True)
+        with pytest.raises(StartingError, match="compiling, "):
+            server._check_ready()
+        server._check_ready()
+        server.close()
+
+
+def test_queries_to_a_compiling_server_are_counted(quick_start):
+    outcomes = []
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(
+            transport,
+            "p",
+            lambda version: task.policy(),
+            on_answer=lambda outcome, seconds: outcomes.append(outcome),
+        )
+        server._ready.clear()
+        with pytest.raises(StartingError):
+            server._admit("p/act/peer")
+        server.close()
+    assert outcomes == ["refused"]
+
+
+def test_a_failed_start_leaves_no_thread(quick_start, monkeypatch):
+    monkeypatch.setattr(PolicyFunction, "warm_up", mock.Mock(side_effect=ZeroDivisionError))
+    before = threading.enumerate()
+    with MemoryTransport(MemoryHub()) as transport:
+        with pytest.raises(ZeroDivisionError):
+            PolicyServer(transport, "p", lambda version: task.policy())
+        started = [thread.name for thread in threading.enumerate() if thread not in before]
+        assert not {"batcher", "follow"} & set(started)
+        with pytest.raises(RefusedError, match="The policy server is closed"):
+            transport.query(Keys("p").health, Message({}, {"metadata": True}), timeout=10.0)
+
+
+def test_an_error_of_a_callback_is_the_reply():
+    """Otherwise the query would never be answered."""
+    server = types.SimpleNamespace(_count=mock.Mock(side_effect=ZeroDivisionError("callback")))
+    answer, reply = concurrent.futures.Future(), concurrent.futures.Future()
+    answer.set_result(Answer(Inference(np.zeros((1, 3)), [[]]), None, 0.0, 0.0))
+    PolicyServer._resolve(server, 0.0, reply, answer)
+    assert isinstance(reply.exception(0), ZeroDivisionError)
+
+
+@pytest.mark.parametrize("timeout", [True, 0.0, -1, 61, float("nan"), "1", None])
+def test_a_timeout_that_is_no_duration_is_refused(timeout):
+    with pytest.raises(CongraspError, match="'timeout' is"):
+        parse_timeout(timeout)
 
 
 def test_a_server_without_a_policy_and_one_with_a_bad_file_say_so(tmp_path: pathlib.Path):
