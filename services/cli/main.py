@@ -30,8 +30,8 @@ from congrasp.services.cli.process import (
 )
 from congrasp.services.cli.terminal import ensure_width
 from congrasp.services.cli.variables import check_xla_flags
-from congrasp.services.ops.interrupts import ending, interrupts_reach
-from congrasp.services.ops.lifetime import follow_parent, on_signal
+from congrasp.services.ops.interrupts import interrupts_reach
+from congrasp.services.ops.lifetime import follow_parent, on_signal, stopped_line
 from congrasp.services.ops.logs import announced, log_error
 
 COMMANDS = {
@@ -151,7 +151,7 @@ def run(arguments: list[str]) -> int:
             stop.wait(_LATE_SIGNAL_S)
         code = stop.exit_code or (result if isinstance(result, int) else 0)
     if code in SIGNALLED and (interrupted or name not in _REPORT_THEIR_END):
-        write_if_possible(sys.stderr, f"{ending(code)}\n")
+        write_if_possible(sys.stderr, f"{stopped_line(code)}\n")
     return code
 
 

@@ -63,6 +63,14 @@ class Stop(threading.Event):
         return f"stopped by {signal.Signals(self.signal).name}" if self.signal else "stopped"
 
 
+def stopped_line(exit_code: int) -> str:
+    """Returns the last line of a command that ended with the exit code of a signal."""
+    number = signal.Signals(exit_code - 128)
+    if number == signal.SIGINT:
+        return "Stopped by Ctrl-C."
+    return f"Stopped by {number.name}."
+
+
 @contextlib.contextmanager
 def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterator[Stop]:
     """Yields a Stop that the first signal sets. Python handles signals only in the main thread;
