@@ -81,7 +81,7 @@ def convex_pieces(
             f"its {len(own_pieces)} convex pieces were merged into {len(hulls)} (--max-pieces)"
         )
     merged = _simplified(surfaces, hulls, [0] * len(hulls))
-    if merged.errors.excess <= 1 or not has_surface:
+    if merged.errors.tolerance_ratio <= 1 or not has_surface:
         notes.append(f"its own {merged}")
         return merged
     cut_notes: list[str] = []
@@ -89,7 +89,7 @@ def convex_pieces(
         cut = _cut(surfaces, options, cut_notes)
     except QhullError:
         cut = merged  # the surface lies in a plane
-    if cut.errors.excess < merged.errors.excess:
+    if cut.errors.tolerance_ratio < merged.errors.tolerance_ratio:
         notes.extend(cut_notes)
         notes.append(
             f"{cut}; they were cut from its mesh, for its own {len(merged.hulls)} are coarser: "
@@ -113,17 +113,17 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
     cut = _cut_to_depth(surfaces, limits, CUT_DEPTH, cut_notes)
     count = len(cut.hulls)
     is_convex = count == len(mesh_hulls)
-    if cut.errors.excess > 1 and not is_convex and count < options.max_pieces:
+    if cut.errors.tolerance_ratio > 1 and not is_convex and count < options.max_pieces:
         finer_notes: list[str] = []
         finer = _cut_to_depth(surfaces, limits, CUT_DEPTH / 2, finer_notes)
-        if finer.errors.excess < cut.errors.excess:
+        if finer.errors.tolerance_ratio < cut.errors.tolerance_ratio:
             cut = finer
             cut_notes = finer_notes
     notes += cut_notes
-    if cut.errors.excess <= 1 or is_convex:
+    if cut.errors.tolerance_ratio <= 1 or is_convex:
         return cut
     filled = _filled(surfaces, mesh_hulls)
-    if filled.errors.excess < cut.errors.excess:
+    if filled.errors.tolerance_ratio < cut.errors.tolerance_ratio:
         notes.append(
             f"its convex hull is closer to its shape than {len(cut.hulls)} pieces ({cut.errors}): "
             f"hollows are filled"

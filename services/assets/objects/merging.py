@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from congrasp.common.objects import shapes
-from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
+from congrasp.services.assets.objects.fidelity import MAX_SURFACE_ERROR_M, MAX_VOLUME_ERROR
 from congrasp.services.assets.objects.hulls import (
     SURFACE_SAMPLES,
     corners_of,
@@ -92,7 +92,7 @@ class _Merger:
         else:
             self._volume = volume
             self._inner = _sorted(interior(triangles, _INNER_POINTS))
-        self._voxels = voxels(triangles, MOST_SURFACE)
+        self._voxels = voxels(triangles, MAX_SURFACE_ERROR_M)
         self._distance = distance_transform_edt(~self._voxels.inside, self._voxels.spacing)
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
         self._count = len(self.parts)
@@ -158,7 +158,7 @@ class _Merger:
         part = self._part(shapes.hull_of(vertices))
         growth = max(0.0, part.hull.volume - first.hull.volume - second.hull.volume)
         filled = max(0.0, part.hollow - first.hollow - second.hollow)
-        cost = part.error / MOST_SURFACE + filled / (MOST_VOLUME * self._volume)
+        cost = part.error / MAX_SURFACE_ERROR_M + filled / (MAX_VOLUME_ERROR * self._volume)
         join = _Join(cost=cost, first=i, second=j, growth=growth, part=part)
         heapq.heappush(self._joins, join)
 
@@ -183,10 +183,10 @@ def merge(
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
     The cost of a join is the volume that it adds and its deviation from the surface, each as a
-    share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
-    the deepest surface point in the piece, the way that thinning moves its sides, or the distance
-    of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
-    that more than `max_pieces` remain if there are more separate bodies.
+    share of the tolerance (`fidelity.MAX_VOLUME_ERROR`, `MAX_SURFACE_ERROR_M`). The deviation is
+    the depth of the deepest surface point in the piece, the way that thinning moves its sides, or
+    the distance of its farthest point from the mesh, by samples. Pieces that do not touch are never
+    joined, so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
@@ -212,7 +212,7 @@ def _thinned(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
     middle = (along.max() + along.min()) / 2
     inwards = min(hollow_share, _MAX_THINNING) * (middle - along)
     largest = np.abs(inwards).max()
-    shift = min(MOST_SURFACE, largest)
+    shift = min(MAX_SURFACE_ERROR_M, largest)
     return shapes.hull_of(vertices + np.outer(inwards * shift / largest, axis)), shift
 
 
