@@ -46,6 +46,10 @@ _CUTS = (0.5, 0.65, 0.35, 0.8, 0.2)
 UNCOVERED = "none of its halves can be held without the other: it has no affordance"
 
 
+class SmallRegionError(CongraspError):
+    """The graspable region has less than `LEAST_SHARE` of the surface."""
+
+
 def relabelled(
     obj: GraspObject,
     labels: np.ndarray,
@@ -63,12 +67,12 @@ def relabelled(
       name: name of the new object; unchanged if empty.
 
     Raises:
-      CongraspError: the graspable region has less than a tenth of the surface.
+      SmallRegionError: the graspable region has less than a tenth of the surface.
     """
     labels = np.asarray(labels, np.int32)
     share = float(np.asarray(graspable, bool)[labels].mean())
     if share < LEAST_SHARE:
-        raise CongraspError(
+        raise SmallRegionError(
             f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
             f"It must be at least {LEAST_SHARE:.0%}: select a larger part, or swap the regions "
             f"with --invert.",
