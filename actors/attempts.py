@@ -14,6 +14,7 @@ from congrasp.actors import initial
 from congrasp.actors import stress as protocols
 from congrasp.actors.episode import EpisodeFacts, traced_episode
 from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.initial_hand import handover_speed
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.worker import RolloutWorker
@@ -115,7 +116,7 @@ class Attempts:
         """Initial speed of the wrist along the heading, m/s."""
         if not self.phases.approach:
             return 0.0
-        return initial.handover_speed(self._hand, self._task)
+        return handover_speed(self._hand, self._task)
 
     @property
     def _after(self) -> int:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import initial
+from congrasp.actors import draws
 from congrasp.actors import stress as protocols
 from congrasp.actors.env import GraspEnv
 from congrasp.actors.env_state import EnvState, Settings, Transition
@@ -181,7 +181,7 @@ class Programs:
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
         """Draws initial conditions for all environments from the bank."""
-        return initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
+        return draws.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
 
     def _begin(self, conditions: InitialConditions, running: EnvState | None) -> EnvState:
         """Starts episodes in every environment; a compiled engine is started or, if it runs
@@ -211,7 +211,7 @@ class Programs:
             """Draws a batch of the episodes that are left; returns which are left then."""
             state, left = carry
             rows = jnp.nonzero(left, size=self._together, fill_value=self._batch)[0]
-            fresh = initial.sample(
+            fresh = draws.sample(
                 self.env.hand, self.env.task, bank, key, self._batch, stationary, rows
             )
             return self.env.restart(state, rows, fresh), left.at[rows].set(False, mode="drop")

@@ -30,7 +30,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Array, Goal
-from congrasp.services.evaluate.plan import two_seconds
+from congrasp.services.evaluate.plan import required_hold_steps
 
 PROBED_EPISODES = 2000
 """Most episodes of a row from which forces are read."""
@@ -156,7 +156,7 @@ class Episodes:
             probe=plausibility.sample if self._measured else _effort,
             traced="all" if traced else "none",
         )
-        self.stressable = self._measured and hold == two_seconds(task)
+        self.stressable = self._measured and hold == required_hold_steps(task)
         """True if episodes can continue after the hold: the stress test begins after two
         seconds.
         """

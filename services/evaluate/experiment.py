@@ -44,7 +44,7 @@ from congrasp.services.evaluate.plan import (
     from_references,
     plan_row,
     protocol,
-    two_seconds,
+    required_hold_steps,
 )
 from congrasp.services.evaluate.references import References
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
@@ -163,7 +163,7 @@ class Experiment:
     @functools.cached_property
     def steps(self) -> int:
         """Control steps without the table."""
-        return two_seconds(self.policy.task) if self.hold is None else self.hold
+        return required_hold_steps(self.policy.task) if self.hold is None else self.hold
 
     @functools.cached_property
     def task(self) -> TaskConfig:
@@ -469,7 +469,7 @@ class Experiment:
             variation.constraint,
             self.hand.name,
             [obj.name for obj in self.objects],
-            held_2s=self.steps == two_seconds(self.task),
+            held_2s=self.steps == required_hold_steps(self.task),
             by_reference=self.constraints is not None and from_references(variation.constraint),
             group=variation.label,
             method=self.task.method,

@@ -58,7 +58,7 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     """Returns the initial state of an episode with a procedural object and one of its headings."""
     import jax
 
-    from congrasp.actors.initial import initial_hand
+    from congrasp.actors.initial_hand import initial_hand
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.objects.pool import scale_objects

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.initial import initial_hand
+from congrasp.actors.initial_hand import initial_hand
 from congrasp.common.episode.episode import Episode
 from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.errors import CongraspError

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from congrasp.common.hands.closure import CENTER, outline
+from congrasp.common.hands.closure import CENTER_ONLY, outline
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
@@ -94,7 +94,7 @@ def build_set(hand: Hand, group: Group, options: Options, number: int, source: s
         captured = demonstrated_headings(group.demonstrations, scale)
         headings = Headings(*(np.resize(field, (HEADINGS, 3)) for field in captured))
     # Human grasps are not tested against the hand's outline, since their table was elsewhere.
-    tested_outline = CENTER if headings else outline(hand)
+    tested_outline = CENTER_ONLY if headings else outline(hand)
     seed = (options.seed, number)
     fields = headings_of(task, scaled, seed, headings, scale, tested_outline)
     references = _references(hand, group.demonstrations, scaled, scale)

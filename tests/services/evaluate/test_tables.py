@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.actors import initial
+from congrasp.actors import draws
 from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.config import TaskConfig
@@ -96,7 +96,7 @@ def test_a_level_is_what_it_says(bank):
     """
     sensed = SENSING[0].task(TASK)
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
-    sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
+    sample = jax.jit(draws.sample, static_argnames=("hand", "task", "batch"))
     drawn = sample(task.HAND, sensed, one, jax.random.key(0), 4)
     found = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
     assert len(found) == len(SENSING)
