@@ -12,8 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
-from congrasp.services.appearance.palette import JOINT, SKIN
-from congrasp.services.appearance.palette import MATERIALS as COLOURS
+from congrasp.services.appearance.palette import MATERIAL_COLOURS, ROBOT_JOINT, ROBOT_LINK
 from congrasp.services.record import hand_parts
 from congrasp.services.record.hand_parts import surface_parts, surface_points
 
@@ -39,7 +38,10 @@ def test_a_robots_parts_are_its_surface_in_every_pose(name: str) -> None:
     parts, whole, _ = _posed(name, 0.7)
     assert cKDTree(parts.mean(1)).query(whole.mean(1))[0].max() < 1e-4
     assert cKDTree(whole.mean(1)).query(parts.mean(1))[0].max() < 1e-4
-    assert {part.colour for own in surface_parts(get_hand(name)) for part in own} == {SKIN, JOINT}
+    assert {part.colour for own in surface_parts(get_hand(name)) for part in own} == {
+        ROBOT_LINK,
+        ROBOT_JOINT,
+    }
 
 
 def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> None:
@@ -61,7 +63,7 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     distance = cKDTree(points).query(whole.mean(1))[0]
     assert np.percentile(distance, 95) < 0.004
     assert {part.colour for own in surface_parts(hand) for part in own} == {
-        COLOURS[name] for name in ("flesh", "nail", "sleeve")
+        MATERIAL_COLOURS[name] for name in ("flesh", "nail", "sleeve")
     }
 
 
