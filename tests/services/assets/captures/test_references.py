@@ -30,15 +30,19 @@ from congrasp.services.assets.captures.constraint_sets import (
     from_below,
     usable_resting_poses,
 )
-from congrasp.services.assets.captures.contact import LATER, before_carried, opposed_frame
+from congrasp.services.assets.captures.contact import (
+    MAX_FRAMES_TO_CLOSE,
+    before_carried,
+    opposed_frame,
+)
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.references import (
-    DEEPEST,
-    OVERLAP,
+    MAX_DEPTH_M,
+    MAX_OVERLAP_M,
     check_reference,
-    deepest,
     depth,
-    separated,
+    greatest_overlap,
+    separate_fingers,
     width,
 )
 from congrasp.services.assets.captures.report import Report
@@ -111,7 +115,7 @@ def test_the_reference_is_taken_when_thumb_and_finger_have_closed():
 def test_fingers_that_never_close_give_the_nearest_frame_within_reach():
     assert opposed(0.003 + CLOSING, 0.0) == FIRST + 8
     slow = 0.01 - 0.0001 * AT
-    assert opposed(slow, 0.0) == FIRST + LATER
+    assert opposed(slow, 0.0) == FIRST + MAX_FRAMES_TO_CLOSE
     # The object is lifted by 1 cm a frame from the eighth frame on: three centimetres at the
     # eleventh.
     assert opposed(slow, 0.0, 0.01 * np.maximum(AT - 8, 0)) == 10
@@ -217,7 +221,7 @@ def test_depth_is_that_of_the_deepest_skin():
 
     for deep in (-0.02, 0.003, 0.012):
         assert depth(held, block(deep)) == pytest.approx(deep, abs=1e-6)
-    check_reference(HUMAN, held, block(0.9 * DEEPEST), 1.0)
+    check_reference(HUMAN, held, block(0.9 * MAX_DEPTH_M), 1.0)
     with pytest.raises(Dropped, match="12 mm deep in the object"):
         check_reference(HUMAN, held, block(0.012), 1.0)
     # It closes around the object by itself
@@ -258,9 +262,9 @@ def test_two_fingers_part_evenly():
     """
     hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
     overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
-    np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
-    angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
-    np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
+    np.testing.assert_allclose(greatest_overlap(hand, q), overlap, atol=1e-6)
+    angle = np.arcsin((ASIDE - RADIUS + MAX_OVERLAP_M / 2) / LONG)
+    np.testing.assert_allclose(separate_fingers(hand, q), [[-angle, angle]], atol=2e-4)
 
 
 def test_where_one_may_not_go_the_other_does():
@@ -274,16 +278,16 @@ def test_where_one_may_not_go_the_other_does():
         links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2]),
     )
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    found = separate_fingers(hand, np.array([[-0.38, 0.38]], np.float32))
     assert found[0, 0] == np.float32(-0.38) and found[0, 1] < 0.3
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+    np.testing.assert_allclose(greatest_overlap(hand, found), MAX_OVERLAP_M, atol=2e-5)
 
 
 def test_followers_still_follow():
     hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
-    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    found = separate_fingers(hand, np.array([[-0.38, 0.38]], np.float32))
     np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
-    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+    np.testing.assert_allclose(greatest_overlap(hand, found), MAX_OVERLAP_M, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
@@ -297,15 +301,15 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
         + rng.normal(0, 0.25, (12, len(hand.joints)))
     )
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
-    before, found = np.asarray(deepest(hand, q)), separated(hand, q)
-    deep = before > OVERLAP
+    before, found = np.asarray(greatest_overlap(hand, q)), separate_fingers(hand, q)
+    deep = before > MAX_OVERLAP_M
     assert deep.any() and not deep.all()
     np.testing.assert_array_equal(found[~deep], q[~deep])
     assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
     np.testing.assert_array_less(
-        hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5
+        hand_hand(hand, link_transforms(hand, jnp.asarray(found))), MAX_OVERLAP_M + 5e-5
     )
-    np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)
+    np.testing.assert_allclose(separate_fingers(hand, found), found, atol=1e-3)
 
 
 # --- resting poses ---
