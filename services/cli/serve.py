@@ -14,7 +14,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import Watch, announced, log
+from congrasp.services.ops.logs import Watch, announce_progress, log
 from congrasp.services.ops.metrics import ServerMetrics
 from congrasp.services.ops.waiting import connect_when_up, when_up
 
@@ -59,7 +59,7 @@ class Serve:
     def __call__(self) -> int:
         """Serves until a signal."""
         starting = contextlib.ExitStack()
-        starting.enter_context(announced("Loading and compiling the policy"))
+        starting.enter_context(announce_progress("Loading and compiling the policy"))
         # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it
         # when it starts) ...
         os.environ.setdefault("NPROC", "1")

@@ -69,13 +69,13 @@ def test_a_package_that_is_missing_comes_with_the_command_that_installs_it(monke
 
 
 def test_a_port_in_use_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_PORT", free_port())
+    monkeypatch.setattr(doctor, "_DEFAULT_PORT", free_port())
     assert "are free" in findings()["ports"].text
     with socket.socket() as busy:
-        busy.bind(("127.0.0.1", doctor._PORT))
+        busy.bind(("127.0.0.1", doctor._DEFAULT_PORT))
         busy.listen()
         found = findings()["ports"]
-    assert f"{doctor._PORT} is in use" in found.text and "--listen" in found.text
+    assert f"{doctor._DEFAULT_PORT} is in use" in found.text and "--listen" in found.text
 
 
 def _slow(patch):
@@ -126,7 +126,7 @@ def test_what_is_wrong_is_said(monkeypatch, what, words, patch):
         monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 4))
     with monkeypatch.context() as change:
         patch(change)
-        (found,) = doctor._tried(CHECKS[what])
+        (found,) = doctor._run_check(CHECKS[what])
     assert found.what == what and not found.fine and re.search(words, found.text), found.text
 
 

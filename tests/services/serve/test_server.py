@@ -26,7 +26,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.metrics import ServerMetrics, exposed
+from congrasp.services.ops.metrics import ServerMetrics, serve_metrics
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
 from congrasp.services.serve.server import (
@@ -91,7 +91,7 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
 def test_answers_refusals_and_batches_are_counted(served, metrics):
     _, endpoint, episode = served
     port = free_port()
-    with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
+    with PolicyClient(endpoint) as client, serve_metrics(port, "127.0.0.1", metrics):
         before = scrape(port)
         client.reset(episode.request)
         for _ in range(3):

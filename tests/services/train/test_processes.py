@@ -204,7 +204,7 @@ def scripts(monkeypatch):
             return [sys.executable, "-c", chosen[self.name], folder]
 
     monkeypatch.setattr(background, "Child", Training)
-    monkeypatch.setattr(lifetime, "_POLL", 0.05)
+    monkeypatch.setattr(lifetime, "_CHILD_POLL_S", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
 
