@@ -108,7 +108,7 @@ class Attempts:
     @property
     def simulated_steps(self) -> int:
         """Control steps of a run: those of the episode, and of the tests of the hold after it."""
-        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT_M
         return self.steps + protocols.stress_steps(self._task, height)
 
     @property
@@ -185,7 +185,7 @@ class Attempts:
     @property
     def _stress_height(self) -> float:
         """Height of the lift after the hold, m: none if the hand has already lifted the object."""
-        return 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        return 0.0 if self.phases.lift else protocols.LIFT_HEIGHT_M
 
     def _protocol(self, obj: GraspObject) -> protocols.Protocol:
         """Returns the lift and the pushes of a run."""

@@ -101,14 +101,14 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
         raise CongraspError(f"{source} has the format {version!r:.20}, not {FORMAT}.", _REMEDY)
     # Without spaces, since the text is sent with every episode.
     compact = json.dumps({"format": FORMAT, **fields}, separators=(",", ":"))
-    hand, fault = _described(compact)
+    hand, fault = _parse_text(compact)
     if hand is None or fault:
         raise CongraspError(f"{source}: {fault}.", _REMEDY)
     return hand
 
 
 @functools.lru_cache(maxsize=16)
-def _described(text: str) -> tuple[Hand | None, str]:
+def _parse_text(text: str) -> tuple[Hand | None, str]:
     """Parses a hand file's text; returns the hand, or None and the fault."""
     fields = json.loads(text)
     del fields["format"]

@@ -139,7 +139,7 @@ def flesh(skeleton: Skeleton) -> Surface:
     turns = _spread(fingers_together)
     fingers = []
     for finger, turn in zip(fingers_together, turns, strict=True):
-        fingers.append([_turned(cone, turn) for cone in finger])
+        fingers.append([_turn_cone(cone, turn) for cone in finger])
     low, high = _bounds([*palm, *itertools.chain.from_iterable(fingers)])
     axes = [np.arange(a, b + _CELL, _CELL) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
@@ -175,7 +175,7 @@ def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndar
     return turns
 
 
-def _turned(cone: Cone, turn: tuple[np.ndarray, np.ndarray]) -> Cone:
+def _turn_cone(cone: Cone, turn: tuple[np.ndarray, np.ndarray]) -> Cone:
     """Returns the cone rotated about a point (3,) by a matrix (3, 3)."""
     anchor, matrix = turn
     start = anchor + matrix @ (cone.start - anchor)

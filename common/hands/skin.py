@@ -108,7 +108,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
             anchors=mirror.vector(skeleton.anchors),
             axes=mirror.axial(skeleton.axes),
         )
-        return _mirrored(skin_on(mirrored))
+        return _mirror_skin(skin_on(mirrored))
     if skeleton.hand in HUMAN_HANDS and _is_anatomical(skeleton):
         surface, material = _human_surface(skeleton)
     else:
@@ -124,7 +124,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
     )
 
 
-def _mirrored(skin: Skin) -> Skin:
+def _mirror_skin(skin: Skin) -> Skin:
     """Returns the mirror image of a surface."""
     return skin._replace(
         points=mirror.vector(skin.points),
@@ -165,7 +165,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
             vertices, faces = meshes[link.name]
             parts.append(trimesh.Trimesh(vertices, faces, process=False))
         else:
-            parts.append(_rounded(link))
+            parts.append(_capsule_mesh(link))
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
     link_of_point = np.repeat(np.arange(len(parts)), counts)
@@ -196,7 +196,7 @@ def _unit_normals(mesh: "trimesh.Trimesh") -> np.ndarray:
     return normals
 
 
-def _rounded(link: Link) -> "trimesh.Trimesh":
+def _capsule_mesh(link: Link) -> "trimesh.Trimesh":
     """Returns a mesh of a link's capsules, in the wrist frame at zero."""
     parts = []
     for capsule in link.capsules:

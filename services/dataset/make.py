@@ -36,7 +36,7 @@ from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import batches, plan_row
-from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, prepared
+from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, load_pools
 
 FORMAT = 1
 _T = TypeVar("_T")
@@ -146,7 +146,7 @@ def make(
     done = 0
     with (
         contextlib.ExitStack() as stack,
-        prepared(recipe.template, pools, numbers) as prepared_pools,
+        load_pools(recipe.template, pools, numbers) as prepared_pools,
     ):
         running: Episodes | None = None
         for pool in prepared_pools:

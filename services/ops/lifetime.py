@@ -82,7 +82,7 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
     second signal: from the user, or from the kernel because the parent has ended (`follow_parent`).
 
     Args:
-      grace: seconds from the signal to the forced end; by default `GRACE_S`, or `GRACE_WITHOUT_CHILDREN_S`.
+      grace: seconds from the signal to the forced end; by default that of `_default_grace`.
       interrupt: also raises KeyboardInterrupt in the main thread, for code that does not poll.
     """
     stop = Stop()

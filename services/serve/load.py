@@ -18,7 +18,7 @@ from congrasp.services.ops.lifetime import Child, command, end_all
 
 
 @contextlib.contextmanager
-def serving(
+def serve_policy(
     policy: pathlib.Path, log: pathlib.Path, certs: pathlib.Path | None = None
 ) -> Iterator[tuple[str, int]]:
     """Context with a server of a policy file on this machine: yields its endpoint and process id.

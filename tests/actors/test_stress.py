@@ -27,7 +27,7 @@ from congrasp.common.task.types import Surface
 from tests import task as suite
 from tests.task import BATCH, HAND, OBJECTS, TASK, warp_engine
 
-WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
+WITHOUT_MESHES = set(protocols.ASSESSED_NAMES) - {"hand_mesh_mm"}
 """What is measured of a hand whose file has no visual meshes."""
 NEVER = 10_000
 """Control steps after which no test goes on."""
@@ -71,14 +71,16 @@ def test_every_lift_is_smooth_and_ends_where_it_should(height):
     found = frames(height)
     assert found.height[-1] == pytest.approx(height, abs=1e-5) and abs(found.speed[-1]) < 1e-4
     assert (
-        found.speed.max() <= protocols.LIFT_SPEED + 1e-5 and (np.diff(found.height) > -1e-6).all()
+        found.speed.max() <= protocols.LIFT_SPEED_M_S + 1e-5
+        and (np.diff(found.height) > -1e-6).all()
     )
     assert (
-        np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+        np.abs(np.diff(found.speed)).max()
+        <= protocols.LIFT_ACCELERATION_M_S2 * TASK.control_dt + 1e-4
     )
     way = 0.5 * TASK.control_dt * (found.speed[1:] + found.speed[:-1])
     # Where the speed has a kink within a step, the trapezoid is off by a dt^2 / 8 at most.
-    kink = protocols.LIFT_ACCELERATION * TASK.control_dt**2 / 8
+    kink = protocols.LIFT_ACCELERATION_M_S2 * TASK.control_dt**2 / 8
     np.testing.assert_allclose(np.diff(found.height), way, atol=kink + 1e-6)
 
 
@@ -266,7 +268,7 @@ def test_pushes_reach_the_object_through_the_environment():
 
 
 def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypatch):
-    monkeypatch.setattr(protocols, "PUSH_SECONDS", 0.05)
+    monkeypatch.setattr(protocols, "PUSH_S", 0.05)
     steps, after = TASK.approach_steps + TASK.hold_steps, protocols.stress_steps(TASK)
     plain = suite.worker(renewed=False)
     conditions, acts = suite.episodes(BATCH), suite.command(fingers=0.5)
@@ -334,9 +336,9 @@ def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
     found = protocols.survival(*path(**moves), np.array([True]), TASK)
-    assert tuple(found[name][0] for name in protocols.SURVIVAL) == survived
+    assert tuple(found[name][0] for name in protocols.SURVIVAL_NAMES) == survived
     lost = protocols.survival(*path(**moves), np.array([False]), TASK)
-    assert not any(lost[name][0] for name in protocols.SURVIVAL)
+    assert not any(lost[name][0] for name in protocols.SURVIVAL_NAMES)
 
 
 @pytest.mark.slow

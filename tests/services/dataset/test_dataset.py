@@ -86,7 +86,7 @@ def short_protocol():
     """Holds and pushes that last an eighth and a twelfth of their time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "REQUIRED_HOLD_S", 0.25)
-        patch.setattr(stress, "PUSH_SECONDS", 0.02)
+        patch.setattr(stress, "PUSH_S", 0.02)
         yield
 
 
@@ -109,7 +109,7 @@ def columns(whole) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "REQUIRED_HOLD_S", 2.0)  # as in the process
-    monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
+    monkeypatch.setattr(stress, "PUSH_S", 0.25)
     made(whole := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
