@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.episode.episode import Episode
 from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import read_json
 from congrasp.common.rotations import continuous
@@ -69,7 +69,7 @@ def _finger_angles(joints: Any, hand: Hand, path: pathlib.Path) -> np.ndarray:
         raise CongraspError(
             f"a joint angle of {path} is {largest:.4g}.", "Write joint angles in radians."
         )
-    return coupled(hand, np.clip(q, hand.lower, hand.upper))
+    return follow_couplings(hand, np.clip(q, hand.lower, hand.upper))
 
 
 def read_path(text: str, target: Target) -> dict[str, np.ndarray]:

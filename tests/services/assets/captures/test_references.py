@@ -16,7 +16,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import widest_gap
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
@@ -286,7 +286,7 @@ def test_where_one_may_not_go_the_other_does():
 def test_followers_still_follow():
     hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
     found = separate_fingers(hand, np.array([[-0.38, 0.38]], np.float32))
-    np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
+    np.testing.assert_allclose(found, follow_couplings(hand, found), atol=1e-6)
     np.testing.assert_allclose(greatest_overlap(hand, found), MAX_OVERLAP_M, atol=2e-5)
 
 
