@@ -16,7 +16,7 @@ from congrasp.services.appearance import palette
 from congrasp.services.appearance.surface_colours import paint_surface
 from congrasp.services.export.frames import OBJECT, link_origins
 
-COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
+COLOURS = {**palette.MATERIAL_COLOURS, OBJECT: palette.OBJECT}
 """Colours of the materials of hands, and of the object."""
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
 

@@ -211,7 +211,7 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
         "row",
         lambda self, variation, sample: mock.Mock(group=variation.label, episodes=4),
     )
-    monkeypatch.setattr(experiments, "joined", lambda samples: None)
+    monkeypatch.setattr(experiments, "join_samples", lambda samples: None)
     results = dataclasses.replace(experiment, track=lambda label, total: told.append).run(
         variations
     )
