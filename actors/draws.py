@@ -37,9 +37,9 @@ class _TrainingNumbers(NamedTuple):
     object: Array
     rest: Array
     joined: Array
-    """Whether a constraint joins the requested ones (`Constraint.joined`)."""
+    """Joining of a constraint with the requested ones (`Constraint.joined`)."""
     is_disturbed: Array
-    """Whether the references are disturbed."""
+    """Presence of a disturbance of the references."""
     disturbance: Array
     """Scale of the disturbance."""
     back_off: Array
@@ -62,11 +62,11 @@ class _ConstraintNumbers(NamedTuple):
     """Random numbers in [0, 1) of a constraint, by what they determine."""
 
     requested: Array
-    """(B,) whether it is requested."""
+    """(B,) presence of the constraint."""
     reference: Array
-    """(B,) its reference."""
+    """(B,) reference of the constraint."""
     goal: Array
-    """(B, U) its goal arrays (`Constraint.sample`)."""
+    """(B, U) goal arrays of the constraint (`Constraint.sample`)."""
 
 
 class _RandomNumbers(NamedTuple):

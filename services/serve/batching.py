@@ -29,7 +29,7 @@ _ALONE_AFTER_S = 1.0
 
 
 class Splitting(NamedTuple, Generic[T, R]):
-    """How items are run in parts while several peers share the batches."""
+    """Splitting of items into parts, while several peers share the batches."""
 
     weight_limits: tuple[int, ...]
     """Ascending limits of a batch's weight. The first one applies that is at least the number of

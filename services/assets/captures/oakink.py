@@ -58,7 +58,7 @@ class _Recording(NamedTuple):
 
 
 class _ObjectFiles(NamedTuple):
-    """What the data set tells about its objects."""
+    """Names and parts of the data set's objects."""
 
     names: dict[str, str]
     """Names of objects by id."""
