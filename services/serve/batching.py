@@ -224,8 +224,8 @@ class Batcher(Generic[T, R]):
         except Exception as error:
             return [error] * len(batch)
         if len(results) != len(batch):
-            error = RuntimeError(f"A batch of {len(batch)} items has {len(results)} results.")
-            return [error] * len(batch)
+            mismatch = RuntimeError(f"A batch of {len(batch)} items has {len(results)} results.")
+            return [mismatch] * len(batch)
         return results
 
     def _finish(self, part: _Part[T, R], result: R | Exception) -> None:
