@@ -210,7 +210,7 @@ def _initial_conditions(
             plan = plan_row(experiment.task, bank, experiment.scaled, constraints, total)
         except CongraspError:
             continue  # no object allows them
-        is_real = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
+        is_real = (plan.episodes.episode_numbers < share) & (plan.episodes.objects < pool.real)
         plan = plan._replace(episodes=_selected(plan.episodes, is_real))
         for batch, count in batches(
             experiment.hand, experiment.task, bank, plan, experiment.seed, total
@@ -220,7 +220,7 @@ def _initial_conditions(
             {
                 "constraints": np.full(plan.total, constraints),
                 "object": names[plan.episodes.objects],
-                "episode": plan.episodes.numbers,
+                "episode": plan.episodes.episode_numbers,
             }
         )
     if not parts:
