@@ -14,6 +14,7 @@ from congrasp.actors import initial
 from congrasp.actors import stress as protocols
 from congrasp.actors.episode import EpisodeFacts, traced_episode
 from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.initial_hand import handover_speed
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.worker import RolloutWorker
@@ -107,7 +108,7 @@ class Attempts:
     @property
     def simulated_steps(self) -> int:
         """Control steps of a run: those of the episode, and of the tests of the hold after it."""
-        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        height = 0.0 if self.phases.lift else protocols.LIFT_HEIGHT_M
         return self.steps + protocols.stress_steps(self._task, height)
 
     @property
@@ -115,7 +116,7 @@ class Attempts:
         """Initial speed of the wrist along the heading, m/s."""
         if not self.phases.approach:
             return 0.0
-        return initial.handover_speed(self._hand, self._task)
+        return handover_speed(self._hand, self._task)
 
     @property
     def _after(self) -> int:
@@ -184,7 +185,7 @@ class Attempts:
     @property
     def _stress_height(self) -> float:
         """Height of the lift after the hold, m: none if the hand has already lifted the object."""
-        return 0.0 if self.phases.lift else protocols.LIFT_HEIGHT
+        return 0.0 if self.phases.lift else protocols.LIFT_HEIGHT_M
 
     def _protocol(self, obj: GraspObject) -> protocols.Protocol:
         """Returns the lift and the pushes of a run."""

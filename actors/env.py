@@ -59,7 +59,7 @@ class GraspEnv:
         self._engine = engine
 
     @property
-    def _traced(self) -> Physics:
+    def _traceable_engine(self) -> Physics:
         """The engine, for the methods that call it."""
         assert self._engine is not None, "the engine is stepped outside"
         return self._engine
@@ -68,7 +68,7 @@ class GraspEnv:
 
     def reset(self, initial: InitialConditions) -> EnvState:
         """Starts episodes from initial conditions, in every environment."""
-        return self.state_of(initial, self._traced.start(initial.reset_state))
+        return self.state_of(initial, self._traceable_engine.start(initial.reset_state))
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
         """Returns the state of episodes whose engine was just started from their `reset_state`."""
@@ -166,7 +166,7 @@ class GraspEnv:
         """
         settings = settings or self.settings
         target, command = self.targets(state, action, settings)
-        physics, physics_state = self._traced.step(state.physics, *command)
+        physics, physics_state = self._traceable_engine.step(state.physics, *command)
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
     def targets(
@@ -184,7 +184,7 @@ class GraspEnv:
             return target, (jnp.concatenate([followed.u_target, motors], -1), table)
         start = state.reset_state
         frame = protocols.frame(protocol, self.task, state.time + 0.5)
-        u_target = protocols.carried_targets(
+        u_target = protocols.targets_to_world_frame(
             followed.u_target, self.hand, start.base_quaternion, frame
         )
         force = protocols.push(
@@ -205,7 +205,7 @@ class GraspEnv:
           settings: see `step`.
         """
         had_table = self.table_present(state)
-        state = self._moved(state, target, physics_state, settings)
+        state = self._after_step(state, target, physics_state, settings)
         scene = self.scene_of(state)
         success, up = track_success(self.task, state.success, scene, physics_state.diverged)
         state = state._replace(success=success)
@@ -240,7 +240,7 @@ class GraspEnv:
         )
         return state, transition
 
-    def _moved(
+    def _after_step(
         self, state: EnvState, target: Action, physics_state: PhysicsState, settings: Settings
     ) -> EnvState:
         """Returns the environments with time, targets, sensors and views after a control step; see
@@ -258,7 +258,9 @@ class GraspEnv:
         )
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
-        carried = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
+        carried = protocols.to_carried_frame(
+            physics_state, state.reset_state.base_quaternion, state.frame
+        )
         newest = Action(state.q_target, state.u_target)
         followed = targets_followed(task, state.sensing, newest)
         momentum = track_load(
@@ -357,7 +359,9 @@ class GraspEnv:
         """Returns the environments with the scene of an engine that has simulated no step since the
         last `advance`.
         """
-        carried = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
+        carried = protocols.to_carried_frame(
+            physics_state, state.reset_state.base_quaternion, state.frame
+        )
         newest = Action(state.q_target, state.u_target)
         followed = targets_last_followed(self.task, state.sensing, newest)
         return self._with_views(state, self._scene_state(state, carried, followed))
@@ -404,11 +408,11 @@ class GraspEnv:
                 object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:]
             )
             sensed_state = sensor.seen(self.task, sensed_state, state.sensing.readings)
-            sensed = self._view(sensed_state, *self._observed(state))
+            sensed = self._view(sensed_state, *self._observed_surface_and_goal(state))
         true = self._view(true_state, state.surface, state.goal)
         return state._replace(views=Views(true, sensed))
 
-    def _observed(self, state: EnvState) -> tuple[Surface, Goal]:
+    def _observed_surface_and_goal(self, state: EnvState) -> tuple[Surface, Goal]:
         """Points of the object and goal as the policy observes them."""
         if state.sensing is None:
             return state.surface, state.goal
@@ -428,7 +432,7 @@ class GraspEnv:
         """Scene of the current control step as observed by the policy."""
         assert state.views is not None, "call `with_scene` first"
         view = state.views.sensed or state.views.true
-        surface, goal = self._observed(state)
+        surface, goal = self._observed_surface_and_goal(state)
         scene = Scene(self.hand, self.task, *view, goal, surface)
         if state.sensing is None:
             return scene

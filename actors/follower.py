@@ -48,7 +48,7 @@ class Follower:
           rollout, since the rollout only has metrics of its last one.
         """
         if self._followed is not None:
-            self._followed = _continued(self._followed, trace)
+            self._followed = _continue_episode(self._followed, trace)
         elif due:
             self._followed = _first_part(trace, before, after)
         if self._followed is None:
@@ -64,7 +64,7 @@ class Follower:
         return episode
 
 
-def _continued(episode: TracedEpisode, trace: Trace) -> TracedEpisode:
+def _continue_episode(episode: TracedEpisode, trace: Trace) -> TracedEpisode:
     """Returns the episode with the trace of the next rollout."""
     fields = []
     for before, new in zip(episode.trace, trace, strict=True):

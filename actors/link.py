@@ -356,7 +356,7 @@ class ActorLink(Closing):
             return None
         self._pace.record("weights", time.monotonic() - began)
         if self._info and reply.meta.get("run_id") != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("run_id"))
+            self._uploads.failure = _restart_error(self._info.run_id, reply.meta.get("run_id"))
         return _Weights(reply, session)
 
     def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
@@ -432,7 +432,7 @@ class ActorLink(Closing):
         self._learner = int(meta["version"]), str(meta["session_id"])
         self._finished = bool(meta["finished"])
         if self._info and meta["run_id"] != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, meta["run_id"])
+            self._uploads.failure = _restart_error(self._info.run_id, meta["run_id"])
 
     def _follow(self) -> None:
         """Receives announcements in the background."""
@@ -491,7 +491,7 @@ def _new_ticket_id() -> str:
     return secrets.token_hex(8)
 
 
-def _restarted(before: str, now: Any) -> RunRestarted:
+def _restart_error(before: str, now: Any) -> RunRestarted:
     """Error for a changed run id."""
     return RunRestarted(
         f"The learner started another training (run id {now} after {before}).",

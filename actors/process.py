@@ -345,7 +345,7 @@ class _Actor:
         self._on_rollout({"version": float(bundle.version), **values})
         self._follow(bundle, rollout, before if is_beginning else None)
         if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
-            self._publish("rollout", self._sampled(bundle, arrays))
+            self._publish("rollout", self._sample_of_rollout(bundle, arrays))
         self._rollouts += 1
         if config.objects.renew_every and self._rollouts % config.objects.renew_every == 0:
             self._renew_objects()
@@ -374,7 +374,7 @@ class _Actor:
         self._publish_episode(bundle, rollout, episode)
         self._next_episode = self._rollouts + self._config.episode_every
 
-    def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
+    def _sample_of_rollout(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
         """Returns a rollout's first environments, with the metadata that a reader needs to parse
         the arrays.
         """

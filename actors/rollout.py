@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import initial
+from congrasp.actors import draws
 from congrasp.actors import stress as protocols
 from congrasp.actors.env import GraspEnv
 from congrasp.actors.env_state import EnvState, Settings, Transition
@@ -36,7 +36,7 @@ Probe = Callable[[Scene, Array, Any], Any]
 arrays to record for every environment and step."""
 Traced = Literal["first", "all", "none"]
 """Environments whose steps are recorded (`Trace`)."""
-_RENEWED_FRACTION = 64
+_BATCH_PER_RENEWED = 64
 """A batch of new episodes is the environments over this number: about three times as many as end in
 a control step.
 """
@@ -167,7 +167,7 @@ class Programs:
         self._batch = batch
         self._traced = _TRACED_ROWS[traced]
         self._taught = taught
-        self._together = min(batch, max(LEAST_RENEWED, batch // _RENEWED_FRACTION))
+        self._together = min(batch, max(LEAST_RENEWED, batch // _BATCH_PER_RENEWED))
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self.sample = jax.jit(self._sample)
         self.begin = jax.jit(self._begin)
@@ -181,7 +181,7 @@ class Programs:
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
         """Draws initial conditions for all environments from the bank."""
-        return initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
+        return draws.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
 
     def _begin(self, conditions: InitialConditions, running: EnvState | None) -> EnvState:
         """Starts episodes in every environment; a compiled engine is started or, if it runs
@@ -211,7 +211,7 @@ class Programs:
             """Draws a batch of the episodes that are left; returns which are left then."""
             state, left = carry
             rows = jnp.nonzero(left, size=self._together, fill_value=self._batch)[0]
-            fresh = initial.sample(
+            fresh = draws.sample(
                 self.env.hand, self.env.task, bank, key, self._batch, stationary, rows
             )
             return self.env.restart(state, rows, fresh), left.at[rows].set(False, mode="drop")
@@ -248,7 +248,7 @@ class Programs:
         target, command = self.env.targets(state, action, settings)
         return _Decision(seen, action, log_probability, target, command)
 
-    def _recorded(
+    def _record_step(
         self, state: EnvState, action: Array, transition: Transition, settings: Settings
     ) -> tuple[Trace, Any]:
         """Returns the recorded values of trace and probe of a step."""
@@ -272,7 +272,7 @@ class Programs:
         call has a cost.
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
-        recorded = self._recorded(after, decision.action, transition, settings)
+        recorded = self._record_step(after, decision.action, transition, settings)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(key_data))
         changed = {}
         for name, value in after._asdict().items():
@@ -305,7 +305,7 @@ class Programs:
                 parameters, seen.observation.astype(jnp.float32), step_key
             )
             state, transition = self.env.step(state, action, settings)
-            recorded = self._recorded(state, action, transition, settings)
+            recorded = self._record_step(state, action, transition, settings)
             carry = state, episode_key
             if bank is not None:
                 ended = jnp.any(transition.terminal)
@@ -318,7 +318,9 @@ class Programs:
 
 
 @functools.lru_cache(maxsize=16)
-def _shared(hand: Hand, task: TaskConfig, policy: ActFunction, **settings: Any) -> Programs:
+def _shared_programs(
+    hand: Hand, task: TaskConfig, policy: ActFunction, **settings: Any
+) -> Programs:
     """Returns the programs around an engine that is stepped between them; the same ones for the
     same arguments.
     """
@@ -335,7 +337,7 @@ def programs_of(
     """
     if engine.compiled:
         return Programs(hand, task, engine, policy, **settings)
-    return _shared(hand, task, policy, **settings)
+    return _shared_programs(hand, task, policy, **settings)
 
 
 def row_of(

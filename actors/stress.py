@@ -25,25 +25,26 @@ from congrasp.common.task.plausibility import Sample
 from congrasp.common.task.settings import GRAVITY
 from congrasp.common.task.types import Array
 
-LIFT_HEIGHT = 0.15
-"""Height of the lift, m."""
-LIFT_SPEED = 0.3
-"""Largest speed of the lift, m/s."""
-LIFT_ACCELERATION = 3.0
-"""Acceleration of the lift, m/s^2."""
-PUSH_SECONDS = 0.25
-"""Duration of each push, s."""
-PUSH_FORCE = 1.0
-"""Force of the second six pushes, N; that of the first six is half of the object's weight."""
-FARTHEST = 0.05
-"""Largest displacement of the object in the wrist frame for survival, m (as in DexGraspBench)."""
-MOST_TURNED = float(np.radians(15.0))
-"""Largest rotation of the object in the wrist frame for survival, rad (likewise)."""
-SURVIVAL = ("lift_survival", "push_survival_weight", "push_survival")
+LIFT_HEIGHT_M = 0.15
+"""Height of the lift."""
+LIFT_SPEED_M_S = 0.3
+"""Largest speed of the lift."""
+LIFT_ACCELERATION_M_S2 = 3.0
+"""Acceleration of the lift."""
+PUSH_S = 0.25
+"""Duration of each push."""
+PUSH_FORCE_N = 1.0
+"""Force of the second six pushes; that of the first six is half of the object's weight."""
+MAX_SHIFT_M = 0.05
+"""Largest displacement of the object in the wrist frame for survival (as in DexGraspBench)."""
+MAX_TURN_RAD = float(np.radians(15.0))
+"""Largest rotation of the object in the wrist frame for survival (likewise)."""
+SURVIVAL_NAMES = ("lift_survival", "push_survival_weight", "push_survival")
 """Names of the survived parts."""
-ASSESSED = (*plausibility.MEASURES, "clean", *SURVIVAL)
+ASSESSED_NAMES = (*plausibility.MEASURES, "clean", *SURVIVAL_NAMES)
 """Names of all results of `assess`."""
-_STILL_SECONDS = 0.1  # after the lift
+_REST_AFTER_LIFT_S = 0.1
+"""Time until the hand is at rest after the lift."""
 _DIRECTIONS = np.concatenate([np.stack([axis, -axis]) for axis in np.eye(3, dtype=np.float32)])
 
 
@@ -80,7 +81,7 @@ class Frame(NamedTuple):
 
 
 def stress(
-    task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT
+    task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT_M
 ) -> Protocol:
     """Returns a lift by `height` metres and all pushes, starting `start` control steps after the
     table's removal.
@@ -100,20 +101,20 @@ def lift_first(
     return protocol._replace(lift_start=np.float32(0), lift_height=np.float32(height), table=True)
 
 
-def lift_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
+def lift_steps(task: TaskConfig, height: float = LIFT_HEIGHT_M) -> int:
     """Control steps of a lift, including the time until the hand is at rest; 0 without a height."""
     if not height:
         return 0
-    seconds = height / LIFT_SPEED + LIFT_SPEED / LIFT_ACCELERATION + _STILL_SECONDS
+    seconds = height / LIFT_SPEED_M_S + LIFT_SPEED_M_S / LIFT_ACCELERATION_M_S2 + _REST_AFTER_LIFT_S
     return math.ceil(round(seconds / task.control_dt, 6))
 
 
 def push_steps(task: TaskConfig) -> int:
     """Control steps of one push."""
-    return round(PUSH_SECONDS / task.control_dt)
+    return round(PUSH_S / task.control_dt)
 
 
-def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
+def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT_M) -> int:
     """Control steps of `stress`."""
     return lift_steps(task, height) + 2 * len(_DIRECTIONS) * push_steps(task)
 
@@ -121,24 +122,26 @@ def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
 def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
     """Carried frame `time` (B,) control steps into the episode.
 
-    Its acceleration is at most `LIFT_ACCELERATION` and its speed at most `LIFT_SPEED`: a ramp minus
-    the same ramp delayed by height / speed.
+    Its acceleration is at most `LIFT_ACCELERATION_M_S2` and its speed at most `LIFT_SPEED_M_S`: a
+    ramp minus the same ramp delayed by height / speed.
     """
     since = (time - task.approach_steps - protocol.lift_start) * task.control_dt
-    rise = LIFT_SPEED / LIFT_ACCELERATION
+    rise = LIFT_SPEED_M_S / LIFT_ACCELERATION_M_S2
 
     def ramp(seconds: Array) -> Frame:
-        """Frame that accelerates to `LIFT_SPEED` and continues."""
+        """Frame that accelerates to `LIFT_SPEED_M_S` and continues."""
         speeding = jnp.clip(seconds, 0.0, rise)
-        way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
+        way = 0.5 * LIFT_ACCELERATION_M_S2 * speeding**2 + LIFT_SPEED_M_S * jnp.maximum(
+            seconds - rise, 0.0
+        )
         speeds_up = (seconds > 0.0) & (seconds < rise)
         # Zeros of this type, or the frame's weak type would compile every program of an episode
         # again.
-        pull = jnp.where(speeds_up, LIFT_ACCELERATION, jnp.zeros_like(seconds))
-        return Frame(way, LIFT_ACCELERATION * speeding, pull)
+        pull = jnp.where(speeds_up, LIFT_ACCELERATION_M_S2, jnp.zeros_like(seconds))
+        return Frame(way, LIFT_ACCELERATION_M_S2 * speeding, pull)
 
     ramped = ramp(since)
-    delayed = ramp(since - protocol.lift_height / LIFT_SPEED)
+    delayed = ramp(since - protocol.lift_height / LIFT_SPEED_M_S)
     return Frame(
         height=ramped.height - delayed.height,
         speed=ramped.speed - delayed.speed,
@@ -162,12 +165,12 @@ def push(
     since = time - task.approach_steps - protocol.push_start
     number = jnp.floor(since / push_steps(task)).astype(jnp.int32)
     weight = GRAVITY * jnp.asarray(protocol.masses)[index] * mass_scale
-    newtons = jnp.where(number < len(_DIRECTIONS), 0.5 * weight, PUSH_FORCE)
+    newtons = jnp.where(number < len(_DIRECTIONS), 0.5 * weight, PUSH_FORCE_N)
     newtons = jnp.where((number >= 0) & (number < 2 * len(_DIRECTIONS)), newtons, 0.0)
     return newtons[:, None] * jnp.asarray(_DIRECTIONS)[number % len(_DIRECTIONS)]
 
 
-def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> PhysicsState:
+def to_carried_frame(state: PhysicsState, base_quaternion: Array, frame: Frame) -> PhysicsState:
     """Transforms hand and object to the carried frame.
 
     Args:
@@ -186,7 +189,9 @@ def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> Physic
     )
 
 
-def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame) -> Array:
+def targets_to_world_frame(
+    u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame
+) -> Array:
     """Transforms wrist targets (B, 6) from the carried frame to the world frame, at the middle of a
     control step.
 
@@ -213,7 +218,7 @@ def up(length: Array) -> Array:
 
 
 def assess(
-    samples: Sample, held: np.ndarray, task: TaskConfig, hold: int, height: float = LIFT_HEIGHT
+    samples: Sample, held: np.ndarray, task: TaskConfig, hold: int, height: float = LIFT_HEIGHT_M
 ) -> dict[str, np.ndarray]:
     """Measures (B,) of episodes and the survival of their grasps.
 
@@ -243,7 +248,7 @@ def survival(
     object_quaternion: np.ndarray,
     held: np.ndarray,
     task: TaskConfig,
-    height: float = LIFT_HEIGHT,
+    height: float = LIFT_HEIGHT_M,
 ) -> dict[str, np.ndarray]:
     """Survival of the parts of `stress`: (B,) 1 or 0 each, NaN if it was not simulated.
 
@@ -267,12 +272,12 @@ def survival(
     is_simulated = len(object_position) > ends[-1]
     survived = np.asarray(held, bool)
     results = {}
-    for name, (first, last) in zip(SURVIVAL, itertools.pairwise(ends), strict=True):
+    for name, (first, last) in zip(SURVIVAL_NAMES, itertools.pairwise(ends), strict=True):
         position = object_position[first : last + 1]
         quaternion = object_quaternion[first : last + 1]
         way = np.linalg.norm(position - position[:1], axis=-1)
         cosine = np.minimum(np.abs((quaternion * quaternion[:1]).sum(-1)), 1.0)
         turn = 2 * np.arccos(cosine)
-        survived = survived & ((way < FARTHEST) & (turn < MOST_TURNED)).all(0)
+        survived = survived & ((way < MAX_SHIFT_M) & (turn < MAX_TURN_RAD)).all(0)
         results[name] = (1.0 if is_simulated else np.nan) * survived
     return results

@@ -92,7 +92,7 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     captured = with_columns(hand, task, bank_of(sets, objects.split)) if sets else None
     bank = captured or build_bank(hand, task, pool, seed)
     if not objects.procedural:
-        return _built(pool, bank)
+        return _training_set_of(pool, bank)
     more = dataclasses.replace(objects, folder="", constraints="", count=objects.procedural)
     procedural = scale_objects(hand, task, load_pool(more, number))
     procedural_bank = build_bank(hand, task, procedural, seed)
@@ -102,9 +102,9 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
         weights = [share / len(pool)] * len(pool)
         weights += [(1 - share) / len(procedural)] * len(procedural)
         both = both._replace(weight=both.weight * np.array(weights, np.float32))
-    return _built(pool + procedural, with_columns(hand, task, both))
+    return _training_set_of(pool + procedural, with_columns(hand, task, both))
 
 
-def _built(objects: list[GraspObject], bank: ConstraintBank) -> TrainingSet:
+def _training_set_of(objects: list[GraspObject], bank: ConstraintBank) -> TrainingSet:
     """The training set of a bank."""
     return TrainingSet(objects, lambda: jax.eval_shape(lambda: bank), lambda: bank)

@@ -17,9 +17,9 @@ from congrasp.common.wire.codec import CompressedMessage, Message, encode
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout: `duplicate` if it had been accepted before, `stale` if it was too old."""
-_COMPRESSED_BELOW = 20e6
+_COMPRESSED_BELOW_BYTES_S = 20e6
 """Speed of a link below which rollouts are compressed, bytes/s: a tenth of the compression's."""
-_SLOWEST_LINK = 100e3
+_MIN_LINK_BYTES_S = 100e3
 """Speed of the slowest link that is waited for, bytes/s."""
 
 
@@ -132,7 +132,7 @@ class Uploads:
         timeout = self._timeout_of(message)
         delays = backoff()
         size = sum(array.nbytes for array in message.arrays.values())
-        if self._bytes_per_s < _COMPRESSED_BELOW:
+        if self._bytes_per_s < _COMPRESSED_BELOW_BYTES_S:
             message = CompressedMessage(message.arrays, message.meta)
             size = len(encode(message))
         while not self.closed.is_set():
@@ -144,7 +144,7 @@ class Uploads:
                 damaged += 1
                 answered = self._patience.now()
                 if damaged >= self._max_refusals:
-                    return self._refused(str(error))
+                    return self._count_refusal(str(error))
             except TransportError as error:
                 self._patience.check(answered, error)
             else:
@@ -167,7 +167,7 @@ class Uploads:
         itself.
         """
         size = sum(array.nbytes for array in message.arrays.values())
-        return min(self._timeout + size / _SLOWEST_LINK, self._patience.limit)
+        return min(self._timeout + size / _MIN_LINK_BYTES_S, self._patience.limit)
 
     def _outcome(self, message: Message, reply: Mapping[str, Any]) -> Outcome | None:
         """Returns the outcome of a rollout by the learner's reply, and records it; None if the
@@ -188,11 +188,11 @@ class Uploads:
                 session_id=reply["session_id"],
             )
         if outcome == "refused":
-            return self._refused(str(reply["why"]))
+            return self._count_refusal(str(reply["why"]))
         self._refusals = 0
         return outcome
 
-    def _refused(self, why: str) -> Outcome:
+    def _count_refusal(self, why: str) -> Outcome:
         """Counts a refusal; too many in a row make the uploads fail."""
         self._refusals += 1
         if self._refusals >= self._max_refusals:

@@ -51,7 +51,7 @@ from congrasp.common.task.sampling.headings import INWARD
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli.grasp import Constraints
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.ops.logs import announced
+from congrasp.services.ops.logs import announce_progress
 
 WAITING = 2.0
 """Seconds after which the node prints what it is waiting for."""
@@ -482,7 +482,9 @@ def main() -> int:
         inputs = {**INPUTS, **({arguments.cloud_topic: CLOUD} if arguments.cloud_topic else {})}
         made = ZenohBus(arguments.zenoh, inputs) if arguments.zenoh else RosBus(inputs)
         bus: Bus = stack.enter_context(contextlib.closing(made))
-        with announced(f"Waiting for the policy server at {arguments.connect}", first=WAITING):
+        with announce_progress(
+            f"Waiting for the policy server at {arguments.connect}", first=WAITING
+        ):
             client = stack.enter_context(
                 congrasp.PolicyClient(
                     arguments.connect,

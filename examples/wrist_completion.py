@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 import congrasp
 from congrasp.common.hands import get_hand
 from congrasp.services.assets.captures.approach import approach
-from congrasp.services.assets.captures.references import followed
+from congrasp.services.assets.captures.references import follow_human_wrist
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.grasp.wrist_paths import read_wrist_path
@@ -61,7 +61,7 @@ def main(arguments: Arguments) -> None:
     path = read_wrist_path(
         arguments.motion, joint=arguments.joint, fingers=arguments.fingers, back=arguments.back
     )
-    position, rotation = followed(get_hand(arguments.hand), path.position, path.rotation)
+    position, rotation = follow_human_wrist(get_hand(arguments.hand), path.position, path.rotation)
     turn = Rotation.from_quat(arguments.object_turn, scalar_first=True).inv()
     in_file, rotation = turn.apply(position - arguments.object_at), turn * rotation
     far = Surface(obj).distance(in_file + obj.origin)

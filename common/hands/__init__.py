@@ -48,7 +48,7 @@ def check_reference(reference: object) -> str:
     name = reference if isinstance(reference, str) and len(reference) <= MAX_BYTES else ""
     if (name.isidentifier() and len(name) <= LONGEST_NAME) or name.lstrip().startswith("{"):
         return name
-    raise _unknown(reference)
+    raise _unknown_hand_error(reference)
 
 
 def known_hand(reference: object) -> Hand:
@@ -65,11 +65,11 @@ def known_hand(reference: object) -> Hand:
     if right_name(name)[0] in HANDS:
         return get_hand(name)
     if name.isidentifier():
-        raise _unknown(reference)
+        raise _unknown_hand_error(reference)
     return hand_from_text(name)
 
 
-def _unknown(reference: object) -> CongraspError:
+def _unknown_hand_error(reference: object) -> CongraspError:
     """Error for a hand that a message cannot name."""
     return CongraspError(
         f"{ascii(reference)[:60]} is not a built-in hand, and messages may name only those.",

@@ -1,10 +1,10 @@
 """Closures: a one-parameter family of finger poses from the widest pose through the open one to the
 fist.
 
-A closure c in [-1, 1] is q_open + c (q_closed - q_open) if c is positive, else q_open - c (q_wide -
-q_open). The gap of a pose is the free space between the skins of the thumb's and the nearest other
-fingertip along the cross-finger axis. The outline of a hand is its extent around its centre in a
-few of these poses.
+The pose of a closure c in [-1, 1] has the finger angles q_open + c (q_closed - q_open) if c is
+positive, else q_open - c (q_wide - q_open). The gap of a pose is the free space between the skins
+of the thumb's and the nearest other fingertip along the cross-finger axis, in metres. The outline
+of a hand is its extent around its centre in a few of these poses.
 """
 
 import functools
@@ -20,12 +20,23 @@ from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.types import Array
 
 CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
-"""Closures at which gaps and outlines are tabulated, down to thin objects."""
-MARGIN = 0.03
-"""Metres by which the gap of a preshaped hand exceeds the object's width."""
-WIDEST = 0.14
-"""Gap in metres, for objects of the human hand's size, beyond which no hand needs to open: 12 cm,
-the widest object that gets headings, plus a centimetre on either side."""
+"""Closures (S,) at which gaps and outlines are tabulated, from the widest pose to the gaps of thin
+objects."""
+PRESHAPE_MARGIN_M = 0.03
+"""Distance by which the gap of a preshaped hand exceeds the object's width in evaluation and
+requests. It is not scaled with the hand, as the range in training is not
+(`TaskConfig.preshape_margin`)."""
+MAX_OBJECT_WIDTH_M = 0.12
+"""Greatest width of objects that the human hand grasps; other hands multiply it by their
+`object_scale`."""
+_SIDE_CLEARANCE_M = 0.01
+"""Distance on either side of the widest object to which a hand opens. It is less than half of
+`PRESHAPE_MARGIN_M`: around the widest objects, fingers are preshaped to the hand's widest pose, and
+the margin is what that leaves."""
+WIDEST_GAP_M = MAX_OBJECT_WIDTH_M + 2 * _SIDE_CLEARANCE_M
+"""Gap beyond which no hand needs to open; other hands multiply it by their `object_scale`."""
+_MIN_GAP_STEP_M = 1e-6
+"""Least difference of neighbouring entries in the table of gaps."""
 _OFFSET_WEIGHT = 0.5
 """Weight of a changed offset (m^2) relative to a missing gap (m^2)."""
 _TURN_WEIGHT = 2e-6
@@ -42,14 +53,13 @@ class Outline(NamedTuple):
     """(S, E, 3) centres of the balls, m."""
     radii: np.ndarray
     """(E,) m."""
-    openings: np.ndarray
-    """(S,) m between the skins of the thumb's and the nearest other fingertip, along w
-    (`common.hands.closure`).
-    """
+    gaps: np.ndarray
+    """(S,) gaps, m."""
 
 
-CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
-"""A ball of 1 cm around the hand's centre, for requests that name no hand."""
+CENTER_ONLY = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
+"""Outline of a ball with a radius of 1 cm around the hand's centre, which fits any gap: in place of
+a hand's outline where only its centre has to be above the table."""
 
 
 def closure_pose(hand: Hand, closure: Array) -> Array:
@@ -63,9 +73,14 @@ def closure_pose(hand: Hand, closure: Array) -> Array:
     return q_open + to_closed + to_wide
 
 
-def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
-    """Finger angles (B, F) whose gap is `margin` wider than objects (B,), or as wide as the hand
-    opens; m.
+def preshape(hand: Hand, width: Array, margin: Array | float = PRESHAPE_MARGIN_M) -> Array:
+    """Returns the finger angles (B, F) of hands that open around objects.
+
+    Args:
+      hand: the hand.
+      width: (B,) widths of the objects, m.
+      margin: () or (B,) distance by which the gap exceeds the width, m; less if the hand does not
+        open that wide.
     """
     gaps = table_of_gaps(hand)
     closure = jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])
@@ -74,11 +89,14 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
-    """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    compiled_gaps = jax.jit(_least_gaps, static_argnums=0)
-    least_gaps = kinematics.untraced(compiled_gaps, hand, CLOSURES.astype(np.float32))
-    gaps = np.asarray(least_gaps, np.float64)
-    return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
+    """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not.
+
+    `preshape` interpolates the closure of a gap, for which the gaps must differ.
+    """
+    compiled_gaps = jax.jit(_gaps_at, static_argnums=0)
+    measured_gaps = kinematics.untraced(compiled_gaps, hand, CLOSURES.astype(np.float32))
+    gaps = np.asarray(measured_gaps, np.float64)
+    return np.minimum.accumulate(gaps) - _MIN_GAP_STEP_M * np.arange(len(gaps))
 
 
 @functools.cache
@@ -95,8 +113,8 @@ def widest_gap(hand: Hand) -> float:
 
 
 def widest_pose(hand: Hand) -> dict[str, float]:
-    """Finger angles of the pose nearest to the open one that has all gaps of `WIDEST`, or the most
-    that limits allow.
+    """Finger angles of the pose nearest to the open one in which all fingers have a gap of
+    `WIDEST_GAP_M` to the thumb, or the widest that their limits allow.
 
     It faces the object as the open pose does: the fingertips keep their offsets from the thumb's
     along the heading axis and along the axis orthogonal to it and the cross-finger axis. L-BFGS-B,
@@ -132,7 +150,7 @@ def _cost(hand: Hand, motors: Array) -> Array:
     open_motors = motor_positions(hand, open_q)
     tips = _tips(hand, joint_positions(hand, motors))
     open_tips = _tips(hand, open_q)
-    missing_gap = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
+    missing_gap = jnp.maximum(WIDEST_GAP_M * hand.object_scale - _finger_gaps(hand, tips), 0.0)
     moved = (tips[1:] - tips[0]) - (open_tips[1:] - open_tips[0])
     offset = moved[:, ::2]  # along v and v x w
     return (
@@ -142,22 +160,28 @@ def _cost(hand: Hand, motors: Array) -> Array:
     )
 
 
-def _least_gaps(hand: Hand, closures: Array) -> Array:
+def _gaps_at(hand: Hand, closures: Array) -> Array:
     """Gaps (S,) in m of a hand at closures (S,)."""
     q = closure_pose(hand, closures[:, None])
-    return jnp.min(_gaps(hand, _tips(hand, q)), -1)
+    return jnp.min(_finger_gaps(hand, _tips(hand, q)), -1)
 
 
 def _tips(hand: Hand, q: Array) -> Array:
-    """Fingertips (..., G, 3), thumb first, along the grasp frame's axes v, w and v x w."""
+    """Fingertips (..., G, 3) in m, thumb first, in the grasp frame's axes v, w and v x w."""
     frame = grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
     points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
     return points[..., len(hand.links) :, :] @ jnp.asarray(axes.T, jnp.float32)
 
 
-def _gaps(hand: Hand, tips: Array) -> Array:
-    """Gaps (..., G - 1) in m along w between the skin of each other fingertip and the thumb's."""
+def _finger_gaps(hand: Hand, tips: Array) -> Array:
+    """Free space (..., G - 1) in m along w between the skins of the thumb's and each other
+    fingertip.
+
+    Args:
+      hand: the hand.
+      tips: (..., G, 3) fingertips, thumb first, in the axes of the grasp frame (`_tips`), m.
+    """
     radii = hand.keypoint_radii[len(hand.links) :]
     return tips[..., 1:, 1] - tips[..., :1, 1] - radii[1:] - radii[0]
 
@@ -167,13 +191,13 @@ def outline(hand: Hand) -> Outline:
     """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    compiled_poses = jax.jit(_posed, static_argnums=0)
-    ends, center = kinematics.untraced(compiled_poses, hand, CLOSURES.astype(np.float32))
+    compiled_balls = jax.jit(_ends_and_centers, static_argnums=0)
+    ends, center = kinematics.untraced(compiled_balls, hand, CLOSURES.astype(np.float32))
     from_center = np.asarray(ends, np.float64) - np.asarray(center, np.float64)[:, None]
     return Outline(
         points=from_center @ axes.T,
         radii=np.repeat(hand.capsule_radii, 2).astype(np.float64),
-        openings=table_of_gaps(hand),
+        gaps=table_of_gaps(hand),
     )
 
 
@@ -188,7 +212,7 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
     return -heights.min(-1)
 
 
-def _posed(hand: Hand, closures: Array) -> tuple[Array, Array]:
+def _ends_and_centers(hand: Hand, closures: Array) -> tuple[Array, Array]:
     """Ends (S, E, 3) of the hand's capsules at closures (S,), and its centres (S, 3), in the wrist
     frame.
     """

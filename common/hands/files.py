@@ -50,7 +50,7 @@ _MAX_SHAPES = 16
 _MAX_NUMBER = 1e5
 """Bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000."""
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
-_ROUNDING = 1e-5
+_ANGLE_TOLERANCE_RAD = 1e-5
 """Tolerance of angles in single precision, rad."""
 _NORM_TOLERANCE = 1e-3
 _TAKEN_LINKS = {"hand_base", "table", "anchor", "object", "hold", "world"}
@@ -101,14 +101,14 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
         raise CongraspError(f"{source} has the format {version!r:.20}, not {FORMAT}.", _REMEDY)
     # Without spaces, since the text is sent with every episode.
     compact = json.dumps({"format": FORMAT, **fields}, separators=(",", ":"))
-    hand, fault = _described(compact)
+    hand, fault = _parse_text(compact)
     if hand is None or fault:
         raise CongraspError(f"{source}: {fault}.", _REMEDY)
     return hand
 
 
 @functools.lru_cache(maxsize=16)
-def _described(text: str) -> tuple[Hand | None, str]:
+def _parse_text(text: str) -> tuple[Hand | None, str]:
     """Parses a hand file's text; returns the hand, or None and the fault."""
     fields = json.loads(text)
     del fields["format"]
@@ -251,7 +251,7 @@ def _pose_faults(hand: Hand, pose: str, angles: dict[str, float], q: np.ndarray)
     for name in sorted({*angles} - joints):
         faults.append(f"the {pose} pose names '{name}', which is not a joint")
     for joint, angle in zip(hand.joints, q, strict=True):
-        if not joint.lower - _ROUNDING <= angle <= joint.upper + _ROUNDING:
+        if not joint.lower - _ANGLE_TOLERANCE_RAD <= angle <= joint.upper + _ANGLE_TOLERANCE_RAD:
             faults.append(f"'{joint.name}' is outside its limits in the {pose} pose")
     return faults
 

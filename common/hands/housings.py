@@ -29,7 +29,7 @@ def housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
     for (start, end), radius, link in zip(
         skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True
     ):
-        shells.append(_bevelled(start, end, radius, radius))
+        shells.append(_bevelled_cylinder(start, end, radius, radius))
         links.append(link)
     housing_count = len(shells)
     for anchor, axis, link in zip(
@@ -41,7 +41,9 @@ def housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
         radius = link_radii[0]
         bevelled_length = _DRUM_BEVEL * radius
         half = _DRUM_LENGTH * radius * axis - bevelled_length * axis
-        drum = _bevelled(anchor - half, anchor + half, _DRUM_RADIUS * radius, bevelled_length)
+        drum = _bevelled_cylinder(
+            anchor - half, anchor + half, _DRUM_RADIUS * radius, bevelled_length
+        )
         shells.append(drum)
         links.append(skeleton.parents[link])
     counts = [len(shell.points) for shell in shells]
@@ -68,7 +70,7 @@ class _Shell(NamedTuple):
     """(F, 3)."""
 
 
-def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> _Shell:
+def _bevelled_cylinder(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> _Shell:
     """A cylinder with bevelled ends that extends by `reach` (m) beyond both points (3,)."""
     length = float(np.linalg.norm(end - start))
     bevel = _BEVEL * min(radius, reach)

@@ -31,26 +31,31 @@ _SHAPES = {
 }
 _REMEDY = "Use MANO_RIGHT.pkl of mano_v1_2 (mano.is.tue.mpg.de)."
 
-_RADII = {
+_SKIN_RADII_M = {
     "thumb": (0.0100, 0.0095, 0.0085),
     "index": (0.0090, 0.0080, 0.0070),
     "middle": (0.0090, 0.0080, 0.0070),
     "ring": (0.0085, 0.0075, 0.0068),
     "little": (0.0080, 0.0070, 0.0060),
 }
-_MASSES = {
+_LINK_MASSES_KG = {
     "thumb": (0.0139, 0.0082, 0.0075),
     "index": (0.0089, 0.0043, 0.0031),
     "middle": (0.0104, 0.0041, 0.0030),
     "ring": (0.0076, 0.0050, 0.0029),
     "little": (0.0043, 0.0028, 0.0016),
 }
-_PALM_MASS = 0.250
+_PALM_MASS_KG = 0.250
 """kg."""
-_METACARPAL_RADIUS = 0.0100
+_METACARPAL_RADIUS_M = 0.0100
 """m."""
-_LIMITS = {"mcp_abduction": (-20, 20), "mcp_flexion": (-20, 90), "pip": (0, 105), "dip": (-5, 85)}
-_THUMB_LIMITS = {
+_FINGER_LIMITS_DEG = {
+    "mcp_abduction": (-20, 20),
+    "mcp_flexion": (-20, 90),
+    "pip": (0, 105),
+    "dip": (-5, 85),
+}
+_THUMB_LIMITS_DEG = {
     "cmc_abduction": (-15, 50),
     "cmc_flexion": (-20, 50),
     "mp_flexion": (-10, 75),
@@ -153,13 +158,13 @@ def mano_hand(model: ManoModel) -> Hand:
         links += _finger(finger, axes[i], anchors[i], tips[i])
         if finger != "thumb":
             start = vector(0.2 * anchors[i, 0])
-            metacarpals.append(Capsule(start, vector(anchors[i, 0]), _METACARPAL_RADIUS))
+            metacarpals.append(Capsule(start, vector(anchors[i, 0]), _METACARPAL_RADIUS_M))
     palm = Link(
         "palm",
         parent="",
         joints=(),
         capsules=tuple(metacarpals),
-        mass=_PALM_MASS,
+        mass=_PALM_MASS_KG,
         contact_weight=1.0,
     )
     return Hand(
@@ -196,11 +201,11 @@ def _finger(
       tip: (3,) its fingertip, wrist frame, m.
     """
     is_thumb = finger == "thumb"
-    radii = _RADII[finger]
+    radii = _SKIN_RADII_M[finger]
     # The skin ends at the fingertip, a capsule's axis one radius before it.
     end = tip - radii[2] * _unit(tip - anchors[2])
     points = [vector(point) for point in (*anchors, end)]
-    limits = _THUMB_LIMITS if is_thumb else _LIMITS
+    limits = _THUMB_LIMITS_DEG if is_thumb else _FINGER_LIMITS_DEG
     bones = (0, 0, 1, 2)
     joint_axes = (axes[0, 1], axes[0, 2], axes[1, 2], axes[2, 2])
     joints = []
@@ -221,7 +226,7 @@ def _finger(
         joints=[(joints[0], joints[1]), (joints[2],), (joints[3],)],
         points=points,
         radii=radii,
-        masses=_MASSES[finger],
+        masses=_LINK_MASSES_KG[finger],
         weights=(2.0, 2.0, 6.0) if is_thumb else (1.0, 1.0, 3.0),
     )
 

@@ -21,7 +21,7 @@ MAX_FACES = 3000
 """Most triangles of a link; finer meshes are simplified."""
 MAX_BYTES = 16 << 20
 """Largest total size of all meshes in bytes."""
-MAX_DISTANCE = 2.0
+MAX_DISTANCE_M = 2.0
 """Greatest distance of a mesh's coordinates from the wrist's origin, m; a larger one means a file
 in another unit.
 """
@@ -53,10 +53,10 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
         if not _is_mesh(vertices, faces):
             raise CongraspError(f"{file} contains no mesh of '{name[:60]}'.", _REMEDY)
         farthest = np.abs(vertices).max()
-        if farthest > MAX_DISTANCE:
+        if farthest > MAX_DISTANCE_M:
             raise CongraspError(
                 f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist, more than "
-                f"{MAX_DISTANCE:g} m.",
+                f"{MAX_DISTANCE_M:g} m.",
                 f"Check the file's unit. {_REMEDY}",
             )
         meshes[name] = (vertices, faces)

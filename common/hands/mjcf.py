@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from congrasp.common.hands.spec import CONTACT_TIME, Capsule, Hand, Link, Solid, link_origin
+from congrasp.common.hands.spec import CONTACT_TIME_S, Capsule, Hand, Link, Solid, link_origin
 from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import GEOM_TYPES
 from congrasp.common.objects.spec import Piece
@@ -13,7 +13,7 @@ from congrasp.common.runtime.physics_library import mujoco
 
 HAND_CONTYPE = 1
 """Collision bit of the hand: geoms that collide with it have this bit in their conaffinity."""
-_COUPLING_TIME = 0.005
+_COUPLING_TIME_S = 0.005
 """Time constant of joint couplings, s."""
 _SLIDING_FRICTION = 0.1
 """Of the hand; MuJoCo uses the greater of two, so that the object's decides."""
@@ -40,7 +40,7 @@ def add_hand(
     hand: Hand,
     *,
     self_collision: bool = False,
-    contact_time: float = CONTACT_TIME,
+    contact_time: float = CONTACT_TIME_S,
     torsional_friction: float = 0.0,
 ) -> mujoco.MjsBody:
     """Adds the hand under a fixed body `hand_base` and returns that body.
@@ -127,7 +127,7 @@ def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
     """
     spec = mujoco.MjSpec()
     bodies: dict[str, mujoco.MjsBody] = {}
-    contacts = _Contacts(with_hand=True, time=CONTACT_TIME, torsional_friction=0.0)
+    contacts = _Contacts(with_hand=True, time=CONTACT_TIME_S, torsional_friction=0.0)
     for link in hand.links:
         parent = bodies[link.parent] if link.parent else spec.worldbody
         body = parent.add_body(name=link.name)
@@ -187,7 +187,7 @@ def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
             name1=coupling.joint,
             name2=coupling.leader,
             data=[coupling.offset, coupling.ratio, *[0.0] * 10],
-            solref=(_COUPLING_TIME, 1.0),
+            solref=(_COUPLING_TIME_S, 1.0),
             solimp=(0.99, 0.99, 0.001, 0.5, 2.0),
         )
 

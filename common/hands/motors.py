@@ -16,12 +16,12 @@ import numpy as np
 from congrasp.common.hands.spec import Hand, Link, chain_of
 
 Array = Any
-HUMAN_OPENING = 0.106
+HUMAN_OPEN_GAP_M = 0.106
 """Opening in m between thumb and fingers of the human hand, whose object scale is one."""
 _SCALE_EXPONENT = 0.6
 _MIN_SCALE = 0.3
 _MAX_SCALE = 3.0
-_MIN_LEVER = 1e-6
+_MIN_LEVER_M = 1e-6
 """Least displacement of a tip per radian of a motor, m."""
 
 
@@ -138,7 +138,7 @@ def motor_limits(hand: Hand) -> np.ndarray:
     return transmission(hand).limits
 
 
-def coupled(hand: Hand, q: Array) -> Array:
+def follow_couplings(hand: Hand, q: Array) -> Array:
     """Joint angles (..., F) with coupled joints set by their leaders."""
     if not hand.couplings:
         return q
@@ -161,7 +161,7 @@ def fitting_scale(opening: float) -> float:
     1.75 times the human hand's gives Allegro's 1.4, one of 1.16 times Sharpa's 1.1. It is below one
     because the mass of an object grows with the cube of its lengths.
     """
-    scale = (opening / HUMAN_OPENING) ** _SCALE_EXPONENT
+    scale = (opening / HUMAN_OPEN_GAP_M) ** _SCALE_EXPONENT
     return round(float(np.clip(scale, _MIN_SCALE, _MAX_SCALE)), 1)
 
 
@@ -193,6 +193,6 @@ def _force(hand: Hand, link: Link) -> float:
         displacements[motor] = displacements.get(motor, np.zeros(3)) + mapping.ratio[j] * lever
     forces = []
     for motor, displacement in displacements.items():
-        length = max(float(np.linalg.norm(displacement)), _MIN_LEVER)
+        length = max(float(np.linalg.norm(displacement)), _MIN_LEVER_M)
         forces.append(hand.motors[motor].torque_limit / length)
     return min(forces)

@@ -1,4 +1,12 @@
-"""Nails of a human hand."""
+"""Nails of a human hand.
+
+A nail is curved around its fingertip: around the finger's axis, and over the ball at the finger's
+end. A point of it is given by its angle around the axis, 0 on the back of the finger, and by its
+distance along the axis, 0 at the centre of the ball and positive towards the end. Beyond the
+centre, that distance continues along an arc over the ball.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -6,23 +14,34 @@ from scipy.spatial import cKDTree
 from congrasp.common.hands.flesh import Skeleton, Surface
 from congrasp.common.hands.rings import closed_surface, ring_angles
 
-_NAIL = (
-    (0.2, 0.0005),
-    (0.55, 0.0005),
-    (0.9, 0.0004),
-    (1.0, 0.0001),
-    (0.9, -0.0012),
-    (0.2, -0.0012),
+
+class _Ring(NamedTuple):
+    """A closed curve of the nail's surface, parallel to the nail's outline."""
+
+    scale: float
+    """Size as a share of the nail's outline."""
+    height: float
+    """Height above the skin, m; negative below it."""
+
+
+_RINGS = (
+    _Ring(0.2, 0.0005),
+    _Ring(0.55, 0.0005),
+    _Ring(0.9, 0.0004),
+    _Ring(1.0, 0.0001),
+    _Ring(0.9, -0.0012),
+    _Ring(0.2, -0.0012),
 )
-"""Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
-_NAIL_WIDTH = 0.90
-"""Half width of a nail, rad about the finger."""
-_NAIL_LENGTH = 0.85
-"""Half length of a nail, in radii of the fingertip."""
-_NAIL_BACK = 0.30
-"""Distance of a nail behind the centre of the fingertip, in radii of the fingertip."""
-_SQUARE = 0.65
-"""Exponent of the nail's outline; 1 is an ellipse."""
+"""From the middle of the nail's upper side over its border to the middle of its lower side."""
+_HALF_WIDTH_RAD = 0.90
+"""Half width of a nail, as an angle around the finger."""
+_HALF_LENGTH = 0.85
+"""Half length of a nail along the finger, in radii of the fingertip."""
+_CENTER_BEHIND_TIP = 0.30
+"""Distance of the nail's centre behind the centre of the fingertip's ball, in its radii."""
+_OUTLINE_EXPONENT = 0.65
+"""Exponent of sine and cosine in the nail's outline, a superellipse: 1 gives an ellipse, smaller
+values squarer corners."""
 
 
 def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
@@ -31,15 +50,16 @@ def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
     skin_points = cKDTree(skin.points)
     for chain in skeleton.chains():
         tip = chain[-1]
-        bends = np.flatnonzero(skeleton.joint_link == tip)
-        if not len(bends):
+        joints = np.flatnonzero(skeleton.joint_link == tip)
+        if not len(joints):
             continue
         capsule = np.flatnonzero(skeleton.capsule_link == tip)[0]
         start, end = skeleton.capsules[capsule]
         along = (end - start) / np.linalg.norm(end - start)
-        back = -np.cross(skeleton.axes[bends[-1]], along)
-        back = back / np.linalg.norm(back)
-        rings = _nail_rings(end, along, back, skeleton.radii[capsule])
+        # A positive angle of the joint moves the tip along axis x along, towards the palm.
+        to_back = -np.cross(skeleton.axes[joints[-1]], along)
+        to_back = to_back / np.linalg.norm(to_back)
+        rings = _ring_points(end, along, to_back, skeleton.radii[capsule])
         nail = closed_surface(rings, tip, len(skeleton.names))
         _, nearest = skin_points.query(nail.points)
         weights = skin.weights[nearest].mean(0)
@@ -47,32 +67,33 @@ def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
     return surfaces
 
 
-def _nail_rings(
-    centre: np.ndarray, along: np.ndarray, back: np.ndarray, radius: float
+def _ring_points(
+    center: np.ndarray, along: np.ndarray, to_back: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Rings (R, S, 3) of a nail.
+    """Points (R, S, 3) of the rings of a nail, m.
 
     Args:
-      centre: (3,) centre of the fingertip's ball, m.
-      along: (3,) unit, direction of the finger.
-      back: (3,) unit, direction of its back.
+      center: (3,) centre of the fingertip's ball, m.
+      along: (3,) unit, direction of the finger's axis, towards its end.
+      to_back: (3,) unit, direction from the axis to the back of the finger.
       radius: radius of the fingertip, m.
     """
-    angle = ring_angles()
-    across = _rounded(np.cos(angle))
-    forward = _rounded(np.sin(angle))
+    angles = ring_angles()
+    outline_across = _superellipse(np.cos(angles))
+    outline_along = _superellipse(np.sin(angles))
+    to_side = np.cross(along, to_back)
     rings = []
-    for share, height in _NAIL:
-        turn = _NAIL_WIDTH * share * across
-        place = radius * (_NAIL_LENGTH * share * forward - _NAIL_BACK)
-        radial = np.cos(turn)[:, None] * back + np.sin(turn)[:, None] * np.cross(along, back)
-        # Over the ball at the finger's end
-        down = np.clip(place / radius, 0, np.pi / 2)[:, None]
-        out = np.cos(down) * radial + np.sin(down) * along
-        rings.append(centre + np.minimum(place, 0)[:, None] * along + (radius + height) * out)
+    for scale, height in _RINGS:
+        around_axis = _HALF_WIDTH_RAD * scale * outline_across
+        distance = radius * (_HALF_LENGTH * scale * outline_along - _CENTER_BEHIND_TIP)
+        from_axis = np.cos(around_axis)[:, None] * to_back + np.sin(around_axis)[:, None] * to_side
+        over_ball = np.clip(distance / radius, 0, np.pi / 2)[:, None]
+        outward = np.cos(over_ball) * from_axis + np.sin(over_ball) * along
+        on_axis = center + np.minimum(distance, 0)[:, None] * along
+        rings.append(on_axis + (radius + height) * outward)
     return np.array(rings)
 
 
-def _rounded(wave: np.ndarray) -> np.ndarray:
-    """Returns a coordinate of the nail's outline from that of a circle."""
-    return np.sign(wave) * np.abs(wave) ** _SQUARE
+def _superellipse(coordinate: np.ndarray) -> np.ndarray:
+    """Returns a coordinate of the nail's outline from that of the unit circle."""
+    return np.sign(coordinate) * np.abs(coordinate) ** _OUTLINE_EXPONENT

@@ -23,11 +23,11 @@ HUMAN_HANDS = ("human", "mano")
 """Names of hands with flesh."""
 MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
 """Materials of a surface."""
-_MAX_SIZE = 0.5
+_MAX_SIZE_M = 0.5
 """Size of a hand with flesh, m."""
-_SHORT_NORMAL = 0.5
+_MIN_MEAN_NORMAL = 0.5
 """Length below which a mean of unit normals is one of rounding errors."""
-_SMALLEST_LENGTH = 1e-12
+_MIN_NORMAL = 1e-12
 """Length of a normal that has a direction."""
 
 
@@ -82,7 +82,7 @@ class Skin(NamedTuple):
         points = np.einsum("vij,vj->vi", mixed_rotation, self.points) + mixed[..., 3]
         normals = np.einsum("vij,vj->vi", mixed_rotation, self.normals)
         # The normals of a vertex between two links may cancel out
-        lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _SMALLEST_LENGTH)
+        lengths = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _MIN_NORMAL)
         return points, normals / lengths
 
 
@@ -108,7 +108,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
             anchors=mirror.vector(skeleton.anchors),
             axes=mirror.axial(skeleton.axes),
         )
-        return _mirrored(skin_on(mirrored))
+        return _mirror_skin(skin_on(mirrored))
     if skeleton.hand in HUMAN_HANDS and _is_anatomical(skeleton):
         surface, material = _human_surface(skeleton)
     else:
@@ -124,7 +124,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
     )
 
 
-def _mirrored(skin: Skin) -> Skin:
+def _mirror_skin(skin: Skin) -> Skin:
     """Returns the mirror image of a surface."""
     return skin._replace(
         points=mirror.vector(skin.points),
@@ -165,7 +165,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
             vertices, faces = meshes[link.name]
             parts.append(trimesh.Trimesh(vertices, faces, process=False))
         else:
-            parts.append(_rounded(link))
+            parts.append(_capsule_mesh(link))
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
     link_of_point = np.repeat(np.arange(len(parts)), counts)
@@ -187,16 +187,16 @@ def _unit_normals(mesh: "trimesh.Trimesh") -> np.ndarray:
     a point without a face that has an area, +z.
     """
     normals = np.array(mesh.vertex_normals)
-    is_degenerate = np.linalg.norm(normals, axis=-1) < _SHORT_NORMAL
+    is_degenerate = np.linalg.norm(normals, axis=-1) < _MIN_MEAN_NORMAL
     substitutes = np.tile([0.0, 0.0, 1.0], (len(normals), 1))
-    has_area = np.linalg.norm(mesh.face_normals, axis=-1) > _SHORT_NORMAL
+    has_area = np.linalg.norm(mesh.face_normals, axis=-1) > _MIN_MEAN_NORMAL
     for corner in range(3):
         substitutes[mesh.faces[has_area, corner]] = mesh.face_normals[has_area]
     normals[is_degenerate] = substitutes[is_degenerate]
     return normals
 
 
-def _rounded(link: Link) -> "trimesh.Trimesh":
+def _capsule_mesh(link: Link) -> "trimesh.Trimesh":
     """Returns a mesh of a link's capsules, in the wrist frame at zero."""
     parts = []
     for capsule in link.capsules:
@@ -222,4 +222,4 @@ def _is_anatomical(skeleton: Skeleton) -> bool:
     if {*skeleton.capsule_link.tolist()} != {*range(len(skeleton.names))}:
         return False
     extent = np.ptp(skeleton.capsules.reshape(-1, 3), axis=0).max()
-    return float(extent + skeleton.radii.max()) < _MAX_SIZE
+    return float(extent + skeleton.radii.max()) < _MAX_SIZE_M

@@ -15,11 +15,11 @@ from typing import Literal
 import numpy as np
 
 Vector = tuple[float, float, float]
-CONTACT_TIME = 0.006
+CONTACT_TIME_S = 0.006
 """Time constant of contacts that are as stiff as flesh or rubber, s."""
-_ARM_MASS = 0.65
+_ARM_MASS_KG = 0.65
 """Inertia that an arm adds to that of the hand, kg."""
-_GYRATION_RADIUS = 0.06
+_GYRATION_RADIUS_M = 0.06
 """Radius of gyration of a hand about its wrist, m."""
 _TIP_WEIGHT = 4.0
 """Weight of a fingertip relative to a link origin in the distance reward."""
@@ -338,7 +338,7 @@ class Hand:
         hinge.
         """
         mass = sum(link.mass for link in self.links)
-        about_wrist = mass * _GYRATION_RADIUS**2
+        about_wrist = mass * _GYRATION_RADIUS_M**2
         return np.array([mass + self.wrist.slide_armature, about_wrist + self.wrist.hinge_armature])
 
     @functools.cached_property
@@ -428,13 +428,13 @@ def wrist_gains(mass: float) -> WristGains:
     The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) for any
     mass.
     """
-    moved_mass = mass + _ARM_MASS
+    moved_mass = mass + _ARM_MASS_KG
     inertia_scale = (mass + 0.2) / 0.55
     return WristGains(
         slide_kp=1800.0 * moved_mass,
         slide_kv=90.0 * moved_mass,
         slide_limit=150.0 * moved_mass,
-        slide_armature=_ARM_MASS,
+        slide_armature=_ARM_MASS_KG,
         hinge_kp=50.0 * inertia_scale,
         hinge_kv=3.0 * inertia_scale,
         hinge_limit=20.0 * inertia_scale,

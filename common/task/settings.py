@@ -6,7 +6,7 @@ The string under a field is its help on the command line.
 import dataclasses
 from typing import Literal, Self
 
-from congrasp.common.hands.spec import CONTACT_TIME
+from congrasp.common.hands.spec import CONTACT_TIME_S
 from congrasp.common.task.sensor_registry import SensorName
 
 GRAVITY = 9.81
@@ -153,7 +153,7 @@ class TaskSettings:
     """Enables collisions between the hand and the table."""
     hand_self_collision: bool = True
     """Enables collisions between the hand's links."""
-    contact_time: float = CONTACT_TIME
+    contact_time: float = CONTACT_TIME_S
     """Time constant of the hand's contacts, s; at least two physics steps. With 0.006 the contacts
     of a grasp are about 1 mm deep."""
     impratio: float = 100.0

@@ -2,19 +2,19 @@
 
 Colour = tuple[float, float, float]
 
-SKIN: Colour = (0.70, 0.73, 0.79)
-"""Colour of robots' links, and of capsules."""
 FLESH: Colour = (0.86, 0.65, 0.54)
-JOINT: Colour = (0.30, 0.32, 0.37)
-"""Colour of robots' joints."""
-MATERIALS = {
+"""Colour of a human hand."""
+ROBOT_LINK: Colour = (0.70, 0.73, 0.79)
+"""Colour of robots' links, and of capsules."""
+ROBOT_JOINT: Colour = (0.30, 0.32, 0.37)
+MATERIAL_COLOURS = {
     "flesh": FLESH,
     "nail": (0.94, 0.77, 0.70),
     "sleeve": (0.22, 0.28, 0.38),
-    "link": SKIN,
-    "joint": JOINT,
+    "link": ROBOT_LINK,
+    "joint": ROBOT_JOINT,
 }
-"""Colours of the materials in `common.hands.skin.MATERIALS`."""
+"""Colours of the materials in `common.hands.skin.MATERIALS`, by name."""
 OBJECT: Colour = (0.95, 0.62, 0.24)
 TABLE: Colour = (0.80, 0.79, 0.77)
 HEADING: Colour = (0.22, 0.40, 0.86)

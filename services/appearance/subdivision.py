@@ -2,61 +2,68 @@
 
 import numpy as np
 
-EDGE_M = 0.006
-"""Default edge length at which subdivision stops."""
-MOST_FACES = 12_000
-"""Default limit of the number of faces."""
-_EDGE_PER_MEAN_SIDE = 2.2
-"""Longest edge of a surface with the most faces, per root of its area per face."""
+_MAX_EDGE_M = 0.006
+_MAX_FACES = 12_000
+_EDGE_PER_FACE_SIZE = 2.2
+"""Longest edge of a surface at the limit of its faces, in roots of the mean area of a face: a
+shorter one would exceed the limit."""
 
 
-def finer(
-    vertices: np.ndarray, faces: np.ndarray, edge: float = EDGE_M, most: int = MOST_FACES
+def subdivide(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    max_edge: float = _MAX_EDGE_M,
+    max_faces: int = _MAX_FACES,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Subdivides a surface by repeatedly halving its longest edges.
 
     Args:
-      vertices: (V, 3).
+      vertices: (V, 3) m.
       faces: (F, 3).
-      edge: edge length at which subdivision stops, m; edges of large surfaces stay longer.
-      most: most faces; a mesh with as many is returned unchanged.
+      max_edge: edge length at which subdivision stops, m; edges of large surfaces stay longer.
+      max_faces: limit of the number of faces; a mesh with as many is returned unchanged.
 
     Returns:
       Vertices (V', 3) float32 and faces (F', 3) int32.
     """
     corners = np.asarray(vertices, float)[faces]
-    if len(faces) >= most:
+    if len(faces) >= max_faces:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=-1).sum() / 2
-    longest = max(edge, _EDGE_PER_MEAN_SIDE * float(np.sqrt(area / most)))
-    points, indices = np.unique(
-        bisected(corners, longest, most).reshape(-1, 3), axis=0, return_inverse=True
-    )
+    face_size = float(np.sqrt(area / max_faces))
+    longest = max(max_edge, _EDGE_PER_FACE_SIZE * face_size)
+    small_corners = bisect_longest(corners, longest, max_faces)
+    points, indices = np.unique(small_corners.reshape(-1, 3), axis=0, return_inverse=True)
     return points.astype(np.float32), indices.reshape(-1, 3).astype(np.int32)
 
 
-def bisected(corners: np.ndarray, longest: float, most: float = np.inf) -> np.ndarray:
-    """Bisects triangles at their longest sides until no side is longer than `longest`, or there are
-    `most` triangles.
+def bisect_longest(
+    corners: np.ndarray, max_side: float, max_triangles: float = np.inf
+) -> np.ndarray:
+    """Returns triangles (F', 3, C) bisected at their longest sides until no side is longer than a
+    limit.
 
     Args:
       corners: (F, 3, C) positions of the corners, m, and further values, which are interpolated.
-      longest: longest side, m.
-      most: limit of the number of triangles; the longest sides are bisected first.
+      max_side: longest side, m.
+      max_triangles: limit of the number of triangles; the longest sides are bisected first.
     """
-    small = []
+    finished = []
     count = len(corners)
     while len(corners):
         sides = np.linalg.norm(corners[:, [1, 2, 0], :3] - corners[..., :3], axis=-1)
-        order = np.argsort(-sides.max(1))
-        cut = order[: int(min((sides.max(1) > longest).sum(), most - count))]
-        small.append(corners[order[len(cut) :]])
-        first = (sides[cut].argmax(1)[:, None] + np.arange(3)) % 3
-        start, end, across = np.take_along_axis(corners[cut], first[..., None], 1).swapaxes(0, 1)
+        longest_first = np.argsort(-sides.max(1))
+        too_long = (sides.max(1) > max_side).sum()
+        to_cut = longest_first[: int(min(too_long, max_triangles - count))]
+        finished.append(corners[longest_first[len(to_cut) :]])
+        # Corners from the start of the longest side on
+        order = (sides[to_cut].argmax(1)[:, None] + np.arange(3)) % 3
+        ordered = np.take_along_axis(corners[to_cut], order[..., None], 1)
+        start, end, opposite = ordered.swapaxes(0, 1)
         middle = (start + end) / 2
-        corners = np.concatenate(
-            [np.stack([start, middle, across], 1), np.stack([middle, end, across], 1)]
-        )
-        count += len(cut)
-    return np.concatenate([*small, corners])
+        first_halves = np.stack([start, middle, opposite], 1)
+        second_halves = np.stack([middle, end, opposite], 1)
+        corners = np.concatenate([first_halves, second_halves])
+        count += len(to_cut)
+    return np.concatenate([*finished, corners])

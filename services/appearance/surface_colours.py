@@ -7,27 +7,36 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.objects.spec import Colours
 from congrasp.services.appearance.palette import AVOID, GRASPABLE
-from congrasp.services.appearance.subdivision import finer
+from congrasp.services.appearance.subdivision import subdivide
 
-_EDGE_M = 0.003
+_MAX_EDGE_M = 0.003
 """Edge length at which the subdivision of coloured surfaces stops."""
-_MOST_FACES = 40_000
+_MAX_FACES = 40_000
 """Limit of the number of faces of coloured surfaces."""
 _NEIGHBOURS = 8
 """Known points that determine a colour."""
-_SIMILAR = 24.0
-"""Distance of similar colours in sRGB from 0 to 255, a standard deviation."""
-_LEAST_WIDTH_M = 1e-9
+_COLOUR_SIGMA = 24.0
+"""Standard deviation of the Gaussian by which the similarity of two colours decreases with their
+distance in sRGB, from 0 to 255."""
+_MIN_MEAN_DISTANCE_M = 1e-9
 
 
-def painted(
+def paint_surface(
     vertices: np.ndarray, faces: np.ndarray, colours: Colours
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB (`colours_at`).
+    """Subdivides a mesh and colours its vertices.
 
     Results of the last few objects are cached; the arrays are read-only.
+
+    Args:
+      vertices: (V, 3) m.
+      faces: (F, 3).
+      colours: known points of the surface.
+
+    Returns:
+      Vertices (V', 3), faces (F', 3), and the colours (V', 3) uint8 sRGB of the vertices.
     """
-    return _painted(
+    return _paint_surface_bytes(
         np.asarray(vertices, float).tobytes(),
         np.asarray(faces, np.int64).tobytes(),
         np.asarray(colours.points, float).tobytes(),
@@ -36,15 +45,15 @@ def painted(
 
 
 @functools.lru_cache(maxsize=8)
-def _painted(
+def _paint_surface_bytes(
     vertices: bytes, faces: bytes, points: bytes, values: bytes
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`painted` by the content of its arrays, as a cache key."""
-    fine_vertices, fine_faces = finer(
+    """`paint_surface` by the content of its arrays, as a cache key."""
+    fine_vertices, fine_faces = subdivide(
         np.frombuffer(vertices, float).reshape(-1, 3),
         np.frombuffer(faces, np.int64).reshape(-1, 3),
-        _EDGE_M,
-        _MOST_FACES,
+        _MAX_EDGE_M,
+        _MAX_FACES,
     )
     colours = Colours(
         np.frombuffer(points, float).reshape(-1, 3), np.frombuffer(values, np.uint8).reshape(-1, 3)
@@ -59,30 +68,37 @@ def region_colours(points: np.ndarray, avoid: np.ndarray) -> Colours:
     """Colours of surface points (P, 3), m, in the avoid region (P,) bool or the graspable
     region.
     """
-    shares = np.where(avoid[:, None], AVOID, GRASPABLE)
-    return Colours(points, np.round(255 * shares).astype(np.uint8))
+    rgb = np.where(avoid[:, None], AVOID, GRASPABLE)
+    return Colours(points, np.round(255 * rgb).astype(np.uint8))
 
 
 def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
-    """(n, 3) uint8 sRGB at points (n, 3) of a surface, from the nearest known points.
+    """Returns the colours (n, 3) uint8 sRGB at points (n, 3) of a surface, by a vote of the nearest
+    known points.
 
-    The known point whose colour most of its neighbours share, by their distances, wins; the result
-    is the mean of the similar ones. So an edge between two colours is sharp, and has no teeth as
-    with the single nearest point.
+    Each neighbour proposes its colour. A neighbour supports a proposal the more, the nearer it is
+    and the more similar its colour is (a Gaussian of both distances). The result is the mean of the
+    neighbours' colours, weighted by their support for the proposal with the most. So an edge
+    between two colours is sharp, and is not jagged as with the single nearest point.
+
+    Args:
+      points: (n, 3) m.
+      colours: known points of the surface.
     """
-    neighbours = np.arange(min(_NEIGHBOURS, len(colours.points))) + 1
-    distance, index = cKDTree(colours.points).query(points, k=neighbours)
-    width = np.maximum(distance.mean(1, keepdims=True), _LEAST_WIDTH_M)
-    weight = np.exp(-((distance / width) ** 2)).astype(np.float32)
-    values = colours.values[index].astype(np.float32)
-    best = np.full(len(points), -1.0, np.float32)
-    mean = np.zeros((len(points), 3), np.float32)
-    for candidate in range(len(neighbours)):
-        apart = np.square(values - values[:, candidate, None]).sum(-1)
-        similar = weight * np.exp(-apart / (2 * _SIMILAR**2))
-        support = similar.sum(1)
-        is_better = support > best
-        best[is_better] = support[is_better]
-        total = np.einsum("nk,nkd->nd", similar[is_better], values[is_better])
-        mean[is_better] = total / support[is_better, None]
-    return np.round(mean).astype(np.uint8)
+    ranks = np.arange(min(_NEIGHBOURS, len(colours.points))) + 1
+    distance, index = cKDTree(colours.points).query(points, k=ranks)
+    mean_distance = np.maximum(distance.mean(1, keepdims=True), _MIN_MEAN_DISTANCE_M)
+    nearness = np.exp(-((distance / mean_distance) ** 2)).astype(np.float32)
+    neighbours = colours.values[index].astype(np.float32)
+    most_votes = np.full(len(points), -1.0, np.float32)
+    result = np.zeros((len(points), 3), np.float32)
+    for rank in range(len(ranks)):
+        proposal = neighbours[:, rank, None]
+        squared_difference = np.square(neighbours - proposal).sum(-1)
+        support = nearness * np.exp(-squared_difference / (2 * _COLOUR_SIGMA**2))
+        votes = support.sum(1)
+        is_better = votes > most_votes
+        most_votes[is_better] = votes[is_better]
+        total = np.einsum("nk,nkd->nd", support[is_better], neighbours[is_better])
+        result[is_better] = total / votes[is_better, None]
+    return np.round(result).astype(np.uint8)

@@ -7,7 +7,7 @@ import psutil
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.serve.load import Load, Target, example_episode, measure, serving
+from congrasp.services.serve.load import Load, Target, example_episode, measure, serve_policy
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 
@@ -22,7 +22,7 @@ def bench_query(load: Load) -> None:
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
         bundles.save(untrained(get_preset("quickstart")), policy)
-        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
+        with serve_policy(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
             episode = example_episode(_EPISODE_SEED)
             with PolicyClient(endpoint, wait=_START_TIMEOUT_S) as client:
                 client.metadata()

@@ -25,7 +25,7 @@ from rich.text import Text
 
 from congrasp.common.errors import CongraspError, printable
 from congrasp.services.ops.interrupts import check_stopped
-from congrasp.services.ops.logs import announced
+from congrasp.services.ops.logs import announce_progress
 
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(label, total if known) -> function to call with the number done."""
@@ -104,7 +104,7 @@ def bars() -> Iterator[Progress]:
         told = (
             contextlib.nullcontext()
             if console.is_terminal
-            else announced(functools.partial(current_activity, progress))
+            else announce_progress(functools.partial(current_activity, progress))
         )
         with told:
             yield progress

@@ -16,7 +16,7 @@ from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.shell import shell_command
 from congrasp.services.cli.console import in_range, say, show_table
-from congrasp.services.ops.logs import announced
+from congrasp.services.ops.logs import announce_progress
 
 if TYPE_CHECKING:
     from congrasp.common.hands.skin import Skin
@@ -161,7 +161,7 @@ class Import:
         choices = Choices(
             self.name, self.palm, self.thumb, self.object_scale, self.collision == "own"
         )
-        with announced(f"Reading {self.file}"):
+        with announce_progress(f"Reading {self.file}"):
             proposal = import_hand(self.file, choices)
         _store(proposal, self.out, self.png)
         reference = proposal.hand.name if self.out is None else self.out

@@ -30,9 +30,9 @@ from congrasp.services.cli.process import (
 )
 from congrasp.services.cli.terminal import ensure_width
 from congrasp.services.cli.variables import check_xla_flags
-from congrasp.services.ops.interrupts import ending, interrupts_reach
-from congrasp.services.ops.lifetime import follow_parent, on_signal
-from congrasp.services.ops.logs import announced, log_error
+from congrasp.services.ops.interrupts import interrupts_reach
+from congrasp.services.ops.lifetime import follow_parent, on_signal, stopped_line
+from congrasp.services.ops.logs import announce_progress, log_error
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",
@@ -151,13 +151,13 @@ def run(arguments: list[str]) -> int:
             stop.wait(_LATE_SIGNAL_S)
         code = stop.exit_code or (result if isinstance(result, int) else 0)
     if code in SIGNALLED and (interrupted or name not in _REPORT_THEIR_END):
-        write_if_possible(sys.stderr, f"{ending(code)}\n")
+        write_if_possible(sys.stderr, f"{stopped_line(code)}\n")
     return code
 
 
 def _call(name: str, arguments: list[str]) -> Any:
     """Loads a command, parses and checks its arguments, and calls it."""
-    with announced(f"Loading 'congrasp {name}'"):
+    with announce_progress(f"Loading 'congrasp {name}'"):
         call = parse(name, load(name), arguments)
     check_numbers(getattr(call, "keywords", {}))
     check_outputs(call)

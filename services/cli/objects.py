@@ -271,7 +271,7 @@ class Affordance:
         if self.part_mesh is not None:
             return affordance.on_part_mesh(obj, self.part_mesh)
         if self.painted is not None:
-            return affordance.painted(obj, self.painted, _colour(self.colour))
+            return affordance.find_painted(obj, self.painted, _colour(self.colour))
         return affordance.in_half_space(obj, self.half_space[:3], self.half_space[3])
 
 

@@ -14,12 +14,12 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import Watch, announced, log
+from congrasp.services.ops.logs import Watch, announce_progress, log
 from congrasp.services.ops.metrics import ServerMetrics
 from congrasp.services.ops.waiting import connect_when_up, when_up
 
 if TYPE_CHECKING:
-    from congrasp.services.serve.server import Source
+    from congrasp.services.serve.sources import Source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Serve:
     def __call__(self) -> int:
         """Serves until a signal."""
         starting = contextlib.ExitStack()
-        starting.enter_context(announced("Loading and compiling the policy"))
+        starting.enter_context(announce_progress("Loading and compiling the policy"))
         # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it
         # when it starts) ...
         os.environ.setdefault("NPROC", "1")
@@ -67,7 +67,8 @@ class Serve:
         import jax
 
         from congrasp.common.policy.pretrained import policy_file
-        from congrasp.services.serve.server import PolicyServer, follow_file
+        from congrasp.services.serve.server import PolicyServer
+        from congrasp.services.serve.sources import follow_file
 
         if self.policy is not None and self.connect:
             raise CongraspError(
@@ -112,7 +113,7 @@ class Serve:
 
     def _source_of_run(self, stack: contextlib.ExitStack, stop: Stop) -> "Source | None":
         """Connects to the learner and waits for its first policy; returns None if stopped."""
-        from congrasp.services.serve.server import follow_run
+        from congrasp.services.serve.sources import follow_run
 
         upstream = connect_when_up(
             self.connect,

@@ -13,7 +13,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.security import check_exposure
 from congrasp.services.ops.lifetime import on_signal
-from congrasp.services.ops.logs import announced, log
+from congrasp.services.ops.logs import announce_progress, log
 
 if TYPE_CHECKING:
     from congrasp.services.studio.grasping import Loaders
@@ -68,7 +68,7 @@ class View:
         view = self if self.run_dir is None else self.of_folder(self.run_dir)
         with contextlib.ExitStack() as starting:
             starting.enter_context(
-                announced("Loading the policies and compiling the studio's rules")
+                announce_progress("Loading the policies and compiling the studio's rules")
             )
             # Signals are handled only then: Ctrl-C interrupts the start, which may compile for a
             # minute.

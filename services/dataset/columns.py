@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from congrasp.actors.stress import ASSESSED, SURVIVAL
+from congrasp.actors.stress import ASSESSED_NAMES, SURVIVAL_NAMES
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
@@ -34,8 +34,8 @@ VERDICTS = {
     "pushed": "bool, and six times with 1 N",
 }
 """Outcomes of an episode, with their meanings."""
-_SURVIVED = dict(zip(SURVIVAL, ("lifted", "pushed_weight", "pushed"), strict=True))
-_MEASURES = (*(name for name in ASSESSED if name not in (*SURVIVAL, "clean")), *FORCES)
+_SURVIVED = dict(zip(SURVIVAL_NAMES, ("lifted", "pushed_weight", "pushed"), strict=True))
+_MEASURES = (*(name for name in ASSESSED_NAMES if name not in (*SURVIVAL_NAMES, "clean")), *FORCES)
 _MEASURES += ("links_at_removal", "moved_at_removal")
 _WIDE = {
     np.dtype(np.float32): pa.float32(),

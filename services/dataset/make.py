@@ -36,7 +36,7 @@ from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import batches, plan_row
-from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, prepared
+from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, load_pools
 
 FORMAT = 1
 _T = TypeVar("_T")
@@ -146,7 +146,7 @@ def make(
     done = 0
     with (
         contextlib.ExitStack() as stack,
-        prepared(recipe.template, pools, numbers) as prepared_pools,
+        load_pools(recipe.template, pools, numbers) as prepared_pools,
     ):
         running: Episodes | None = None
         for pool in prepared_pools:
@@ -210,7 +210,7 @@ def _initial_conditions(
             plan = plan_row(experiment.task, bank, experiment.scaled, constraints, total)
         except CongraspError:
             continue  # no object allows them
-        is_real = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
+        is_real = (plan.episodes.episode_numbers < share) & (plan.episodes.objects < pool.real)
         plan = plan._replace(episodes=_selected(plan.episodes, is_real))
         for batch, count in batches(
             experiment.hand, experiment.task, bank, plan, experiment.seed, total
@@ -220,7 +220,7 @@ def _initial_conditions(
             {
                 "constraints": np.full(plan.total, constraints),
                 "object": names[plan.episodes.objects],
-                "episode": plan.episodes.numbers,
+                "episode": plan.episodes.episode_numbers,
             }
         )
     if not parts:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from congrasp.actors.stress import SURVIVAL
+from congrasp.actors.stress import SURVIVAL_NAMES
 from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
 from congrasp.services.evaluate.text_table import NONE, Columns, Styled, Table, percent
 
@@ -24,7 +24,7 @@ def paper_rate(row: Row) -> str:
     return percent(row.paper.success) if row.paper else ""
 
 
-def measured(row: Row, name: str, factor: float = 1.0) -> str:
+def format_measure(row: Row, name: str, factor: float = 1.0) -> str:
     """Formats the mean and the 95th percentile of a force or depth, such as "7.1, 19.3"."""
     measures = {**row.forces, **row.plausibility}
     mean = measures.get(f"{name}_mean", measures.get(name))
@@ -68,14 +68,14 @@ def _error_cell(name: str, factor: float) -> Callable[[Row], Styled]:
     def cell(row: Row) -> Styled:
         """Returns the cell of one row."""
         paper_errors = row.paper.errors if row.paper else {}
-        ours = _scaled(row.errors.get(name), factor)
-        paper = _scaled(paper_errors.get(name), factor)
+        ours = _format_error(row.errors.get(name), factor)
+        paper = _format_error(paper_errors.get(name), factor)
         return Styled(ours, "number", paper)
 
     return cell
 
 
-def _scaled(error: float | None, factor: float) -> str:
+def _format_error(error: float | None, factor: float) -> str:
     """Formats an error; empty if there is none."""
     return "" if error is None else f"{factor * error:.1f}"
 
@@ -109,10 +109,10 @@ def _paper(row: Row) -> str:
 
 def _depth_in_object(row: Row) -> str:
     """Depth of the hand in the object, and of its meshes if it has some."""
-    depth = measured(row, "hand_object_mm")
+    depth = format_measure(row, "hand_object_mm")
     if row.plausibility.get("hand_mesh_mm") is None:
         return depth
-    return f"{depth}, its meshes {measured(row, 'hand_mesh_mm')}"
+    return f"{depth}, its meshes {format_measure(row, 'hand_mesh_mm')}"
 
 
 def _peak(name: str) -> Callable[[Row], str]:
@@ -152,13 +152,13 @@ objects as failures."""
 RATE = dict(RATES)
 """Cells of `RATES` by their columns."""
 _PUSHES = dict(
-    zip(("lifted", "pushed by half the weight", "and by 1 N"), SURVIVAL, strict=True),
+    zip(("lifted", "pushed by half the weight", "and by 1 N"), SURVIVAL_NAMES, strict=True),
 )
 """Names of the rates of survival, by their columns."""
 PLAUSIBILITY: Columns[Row] = (
     ("constraint", row_title),
-    ("hand in hand, mm", lambda row: measured(row, "hand_hand_mm")),
-    ("in table, mm", lambda row: measured(row, "hand_table_mm")),
+    ("hand in hand, mm", lambda row: format_measure(row, "hand_hand_mm")),
+    ("in table, mm", lambda row: format_measure(row, "hand_table_mm")),
     ("in object, mm", _depth_in_object),
     ("wrist m/s", _peak("wrist_speed")),
     ("m/s²", _peak("wrist_acceleration")),
@@ -173,9 +173,9 @@ POSTURE: Columns[Row] = (("posture off, °", _posture),)
 have none."""
 FORCES: Columns[Row] = (
     ("constraint", row_title),
-    ("link, N", lambda row: measured(row, "link_force")),
-    ("sum, N", lambda row: measured(row, "force_sum")),
-    ("torque, % of limit", lambda row: measured(row, "torque_share", 100.0)),
+    ("link, N", lambda row: format_measure(row, "link_force")),
+    ("sum, N", lambda row: format_measure(row, "force_sum")),
+    ("torque, % of limit", lambda row: format_measure(row, "torque_share", 100.0)),
     ("links in contact at table removal", lambda row: f"{row.links_at_removal:.1f}"),
     ("diverged", lambda row: percent(row.diverged)),
 )

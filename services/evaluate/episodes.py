@@ -30,13 +30,13 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.metrics import metric_names
 from congrasp.common.task.types import Array, Goal
-from congrasp.services.evaluate.plan import two_seconds
+from congrasp.services.evaluate.plan import required_hold_steps
 
-PROBED_EPISODES = 2000
+MAX_PROBED_EPISODES = 2000
 """Most episodes of a row from which forces are read."""
 _LINK_FORCE = "sample/link_force"
 _TORQUE = "sample/torque"
-_SHORTEST_CHUNK = 10
+_MIN_CHUNK_STEPS = 10
 """Control steps below which an episode is collected as a whole."""
 
 
@@ -82,8 +82,10 @@ class Sample:
         return self.where(np.arange(len(self.values["success"])) < count)
 
 
-def joined(samples: Sequence[Sample]) -> Sample:
-    """Joins the episodes of several samples, with forces of at most the first `PROBED_EPISODES`."""
+def join_samples(samples: Sequence[Sample]) -> Sample:
+    """Joins the episodes of several samples, with forces of at most the first
+    `MAX_PROBED_EPISODES`.
+    """
     values = {}
     for name in samples[0].values:
         values[name] = np.concatenate([sample.values[name] for sample in samples])
@@ -94,7 +96,7 @@ def joined(samples: Sequence[Sample]) -> Sample:
             break
     link_force = np.concatenate([sample.link_force for sample in probed])
     torque = np.concatenate([sample.torque for sample in probed])
-    return Sample(values, link_force[:PROBED_EPISODES], torque[:PROBED_EPISODES])
+    return Sample(values, link_force[:MAX_PROBED_EPISODES], torque[:MAX_PROBED_EPISODES])
 
 
 class Batch(NamedTuple):
@@ -156,7 +158,7 @@ class Episodes:
             probe=plausibility.sample if self._measured else _effort,
             traced="all" if traced else "none",
         )
-        self.stressable = self._measured and hold == two_seconds(task)
+        self.stressable = self._measured and hold == required_hold_steps(task)
         """True if episodes can continue after the hold: the stress test begins after two
         seconds.
         """
@@ -237,7 +239,7 @@ class Episodes:
         table.
         """
         chunk = math.gcd(self._task.approach_steps, self._hold)
-        if chunk < _SHORTEST_CHUNK:
+        if chunk < _MIN_CHUNK_STEPS:
             return self._task.approach_steps + self._hold
         return chunk
 

@@ -36,7 +36,7 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate import references
-from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, joined
+from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, join_samples
 from congrasp.services.evaluate.plan import (
     NOMINAL_FRICTION,
     RowPlan,
@@ -44,16 +44,16 @@ from congrasp.services.evaluate.plan import (
     from_references,
     plan_row,
     protocol,
-    two_seconds,
+    required_hold_steps,
 )
 from congrasp.services.evaluate.references import References
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
-STRESSED = 200
+MIN_STRESSED_EPISODES = 200
 """Episodes of a row that continue after the hold with lift and pushes."""
-MEASURED = 512
+MAX_MEASURED_OBJECTS = 512
 """Number of objects above which distance fields, and thus plausibility, are skipped."""
-_MAX_KEPT = 8
+_MAX_KEPT_EPISODES = 8
 """Episodes of a row kept for inspection: at most this many that hold the object to the end, and as
 many others.
 """
@@ -151,7 +151,7 @@ class Experiment:
     pool: int = 0
     """Number of the pool of these objects, added to the seed of sampled constraints."""
     measured: bool = True
-    """False skips the measures of plausibility, as do more than `MEASURED` objects."""
+    """False skips the measures of plausibility, as do more than `MAX_MEASURED_OBJECTS` objects."""
     track: Track = silent
     """Shows progress."""
 
@@ -163,7 +163,7 @@ class Experiment:
     @functools.cached_property
     def steps(self) -> int:
         """Control steps without the table."""
-        return two_seconds(self.policy.task) if self.hold is None else self.hold
+        return required_hold_steps(self.policy.task) if self.hold is None else self.hold
 
     @functools.cached_property
     def task(self) -> TaskConfig:
@@ -227,7 +227,7 @@ class Experiment:
     @functools.cached_property
     def field(self) -> DistanceField | None:
         """Grids of the objects' surfaces; None if plausibility is not measured."""
-        if not self.measured or len(self.objects) > MEASURED:
+        if not self.measured or len(self.objects) > MAX_MEASURED_OBJECTS:
             return None
         return distance_field(self.scaled)
 
@@ -389,7 +389,7 @@ class Experiment:
             """Keeps the first episodes of each outcome."""
             for i in range(count):
                 episodes = held if batch.sample.values["held"][i] > 0 else lost
-                if len(episodes) < _MAX_KEPT:
+                if len(episodes) < _MAX_KEPT_EPISODES:
                     episodes.append(batch.episode(i))
 
         visit = keep_some if keep else _ignore
@@ -403,7 +403,7 @@ class Experiment:
         plan: RowPlan,
         progress: Callable[[int], None],
         visit: Callable[[Batch, int], None] = _ignore,
-        stressed: int = STRESSED,
+        stressed: int = MIN_STRESSED_EPISODES,
     ) -> Sample:
         """Returns the episodes of a row; see `batches`.
 
@@ -423,7 +423,7 @@ class Experiment:
             samples.append(batch.sample.first(count))
             finished += count
             progress(finished)
-        return joined(samples)
+        return join_samples(samples)
 
     def batches(
         self,
@@ -469,7 +469,7 @@ class Experiment:
             variation.constraint,
             self.hand.name,
             [obj.name for obj in self.objects],
-            held_2s=self.steps == two_seconds(self.task),
+            held_2s=self.steps == required_hold_steps(self.task),
             by_reference=self.constraints is not None and from_references(variation.constraint),
             group=variation.label,
             method=self.task.method,

@@ -51,7 +51,7 @@ def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
     return count / max(design_effect, 1.0)
 
 
-def clustered(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
+def clustered_interval(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
     """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with
     `independent_episodes`.
     """

@@ -18,16 +18,16 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import keep, read_kept
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.episodes import Episodes, Sample, joined
+from congrasp.services.evaluate.episodes import Episodes, Sample, join_samples
 from congrasp.services.evaluate.experiment import (
-    MEASURED,
-    STRESSED,
+    MAX_MEASURED_OBJECTS,
+    MIN_STRESSED_EPISODES,
     Experiment,
     Variation,
     advance_from,
 )
 from congrasp.services.evaluate.object_groups import object_groups
-from congrasp.services.evaluate.pools import Pool, Pools, prepared
+from congrasp.services.evaluate.pools import Pool, Pools, load_pools
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
 
@@ -85,7 +85,7 @@ def evaluate_pools(
         experiment,
         constraints=None,
         episodes=episodes_of_object * pools.size,
-        measured=pools.size * number <= MEASURED,
+        measured=pools.size * number <= MAX_MEASURED_OBJECTS,
     )
     files: list[pathlib.Path | None] = [None] * number
     if stored is not None:
@@ -95,16 +95,16 @@ def evaluate_pools(
     for n, file in enumerate(files):
         message = None if file is None else read_kept(file)
         if message is not None:
-            results[n] = _stored(message)
+            results[n] = _result_of(message)
     missing = [n for n in range(number) if n not in results]
-    with contextlib.ExitStack() as stack, prepared(experiment, pools, missing) as ready:
+    with contextlib.ExitStack() as stack, load_pools(experiment, pools, missing) as ready:
         running: Episodes | None = None
         for pool in ready:
             if pool.real and not running:
                 running = stack.enter_context(pool.experiment.simulator())
             finished = sum(result.episodes for result in results.values())
             progress = functools.partial(advance_from, advance, finished)
-            result = _simulated(running, pool, progress, max(0, STRESSED - finished))
+            result = _simulate(running, pool, progress, max(0, MIN_STRESSED_EPISODES - finished))
             if finished:  # forces are read from the first pool
                 result = result._replace(sample=result.sample.without_forces())
             n = pool.experiment.pool
@@ -115,7 +115,7 @@ def evaluate_pools(
     return _rows([results[n] for n in sorted(results)], experiment)
 
 
-def _simulated(
+def _simulate(
     running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int
 ) -> _Result:
     """Simulates the episodes of a pool, if it has objects."""
@@ -148,7 +148,7 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
         first += len(result.objects)
         facts += result.objects
-    sample = joined([result.sample for result in results])
+    sample = join_samples([result.sample for result in results])
     index = sample.values["object_index"].astype(int)
     sizes = np.array([obj.largest_side for obj in facts])
     masses = np.array([obj.mass for obj in facts])
@@ -170,7 +170,7 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
     return rows
 
 
-def _stored(message: Message) -> _Result:
+def _result_of(message: Message) -> _Result:
     """Returns the result of its `message`."""
     facts = [_ObjectFacts(*fields) for fields in message.meta["objects"]]
     return _Result(Sample.of(message.arrays), facts, message.meta["left_out"])

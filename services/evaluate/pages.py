@@ -52,7 +52,7 @@ def count_causes(causes: Sequence[str]) -> str:
     return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
 
 
-def embedded(picture: Picture) -> Mapping[str, Any]:
+def embed(picture: Picture) -> Mapping[str, Any]:
     """Picture for the template."""
     return {
         "title": picture.title,

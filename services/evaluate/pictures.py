@@ -21,7 +21,7 @@ from congrasp.services.viz.shapes import Shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.triangles import triangles_of
 
-FRAME_SECONDS = 0.04
+FRAME_S = 0.04
 """Time between two frames of an interactive grasp."""
 _FRAMES = 5
 _SIZE = (300, 225)
@@ -200,7 +200,7 @@ def turntable(episode: Episode) -> Mapping[str, Any]:
     """
     hand = episode.known_hand()
     control_dt = episode.control_dt
-    steps_per_frame = max(1, round(FRAME_SECONDS / control_dt))
+    steps_per_frame = max(1, round(FRAME_S / control_dt))
     steps = np.arange(0, episode.steps, steps_per_frame)
     frames = _frames(episode, steps)
     object_bone = len(hand.links)
@@ -217,13 +217,13 @@ def turntable(episode: Episode) -> Mapping[str, Any]:
     removal = int(np.sum(episode.table[steps]))
     centre, radius = _bounds(episode, steps, frames, removal)
     data = {
-        "position": _encoded(mesh.points, "<f4"),
-        "normal": _encoded(mesh.normals, "<f4"),
-        "colour": _encoded(np.round(255 * mesh.colours), "u1"),
-        "bones": _encoded(mesh.bones, "u1"),
-        "weights": _encoded(np.round(255 * mesh.weights), "u1"),
-        "faces": _encoded(mesh.faces, "<u4"),
-        "frames": _encoded(frames, "<f4"),
+        "position": _encode(mesh.points, "<f4"),
+        "normal": _encode(mesh.normals, "<f4"),
+        "colour": _encode(np.round(255 * mesh.colours), "u1"),
+        "bones": _encode(mesh.bones, "u1"),
+        "weights": _encode(np.round(255 * mesh.weights), "u1"),
+        "faces": _encode(mesh.faces, "<u4"),
+        "frames": _encode(frames, "<f4"),
         "count": object_bone + 2,
         "seconds": steps_per_frame * control_dt,
         "removal": removal,
@@ -296,6 +296,6 @@ def _frames(episode: Episode, steps: np.ndarray) -> np.ndarray:
     return np.concatenate([moving, world], 1)
 
 
-def _encoded(array: np.ndarray, kind: str) -> str:
+def _encode(array: np.ndarray, kind: str) -> str:
     """Encodes an array's numbers as base64."""
     return base64.b64encode(np.ascontiguousarray(array, np.dtype(kind)).tobytes()).decode()

@@ -73,7 +73,7 @@ def plot_evaluation(
     """
     try:
         rows = [Row.from_json(row) for row in read_json(path, _MAX_FILE_BYTES)["rows"]]
-        figures = {"table": _draw_table(compared(rows)), "success": _draw_success(rows)}
+        figures = {"table": _draw_table(comparison_table(rows)), "success": _draw_success(rows)}
         if any(row.quantiles for row in rows):
             figures["errors"] = _draw_errors(rows)
     except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -87,7 +87,7 @@ def plot_evaluation(
     return files
 
 
-def compared(rows: Sequence[Row]) -> Table:
+def comparison_table(rows: Sequence[Row]) -> Table:
     """Rates and all errors of rows, each with the paper's."""
     labels = _labels(rows)
     columns: list[tuple[str, Callable[[Row], str]]] = [

@@ -66,7 +66,7 @@ class Pools(NamedTuple):
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
     """Returns at least `count` procedural objects of an exam, in pools of one size."""
-    number, size = _divided(count, _max_objects(physics))
+    number, size = _divide(count, _max_objects(physics))
     seed = first_seed(exam, number * size)
     families = procedural.family_turns(number * size, seed, FAMILIES)
 
@@ -102,7 +102,7 @@ def listed_pools(
 ) -> Pools:
     """Objects of different names in pools of at most `most`; meshes are imported when their turn
     comes, and those that cannot be are left out."""
-    number, size = _divided(len(objects), most)
+    number, size = _divide(len(objects), most)
 
     def make(part: list[ObjectAt]) -> Loaded:
         left_out: list[str] = []
@@ -125,7 +125,7 @@ def listed_pools(
     return Pools(source, size, makers)
 
 
-def _divided(count: int, most: int) -> tuple[int, int]:
+def _divide(count: int, most: int) -> tuple[int, int]:
     """Number and size of pools for `count` objects, at most `most` in each."""
     number = math.ceil(count / most)
     return number, math.ceil(count / number)
@@ -143,22 +143,22 @@ class Pool(NamedTuple):
 
 
 @contextlib.contextmanager
-def prepared(
+def load_pools(
     experiment: Experiment, pools: Pools, numbers: Sequence[int]
 ) -> Iterator[Iterator[Pool]]:
     """Yields an experiment on each of some pools, made in a thread while the previous one is in
     use.
     """
-    with _one_ahead(_prepared(experiment, pools, numbers)) as ready:
+    with _one_ahead(_load_pools(experiment, pools, numbers)) as ready:
         yield ready
 
 
-def _prepared(experiment: Experiment, pools: Pools, numbers: Sequence[int]) -> Iterator[Pool]:
+def _load_pools(experiment: Experiment, pools: Pools, numbers: Sequence[int]) -> Iterator[Pool]:
     """Yields experiments on pools, with their constraints."""
     for number in numbers:
         loaded, left_out = pools.make[number]()
         of_pool = dataclasses.replace(experiment, pool=number, track=silent)
-        of_pool, approachable = _approachable(of_pool, loaded, pools.size)
+        of_pool, approachable = _with_approachable(of_pool, loaded, pools.size)
         if approachable:
             _ = of_pool.field  # computed in this thread
         remaining = {id(obj) for obj in approachable}
@@ -181,7 +181,7 @@ def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
         yield taken()
 
 
-def _approachable(
+def _with_approachable(
     experiment: Experiment, objects: list[GraspObject], size: int
 ) -> tuple[Experiment, list[GraspObject]]:
     """Returns an experiment on `size` of the objects that the hand can approach in some resting

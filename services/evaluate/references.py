@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import initial
+from congrasp.actors import draws
+from congrasp.actors.draws import PlannedEpisodes
 from congrasp.actors.harvest import Grasps
-from congrasp.actors.initial import PlannedEpisodes
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import cache_folder, keep, read_kept
@@ -151,12 +151,12 @@ class _GraspsOfRegion(NamedTuple):
         episodes = np.ceil(_ATTEMPTS_PER_REFERENCE * missing * graspable).astype(int)
         return np.minimum(episodes, MAX_ATTEMPTS - self.attempts)
 
-    def plan(self, episodes: np.ndarray, names: np.ndarray) -> RowPlan:
+    def plan(self, episodes: np.ndarray, object_seeds: np.ndarray) -> RowPlan:
         """Plans episodes.
 
         Args:
           episodes: (N,) number of episodes of each object.
-          names: (N,) uint32, hashes of the objects.
+          object_seeds: (N,) uint32, hashes of the objects.
         """
         objects = np.repeat(np.arange(len(episodes)), episodes)
         number_in_object = np.concatenate([np.arange(count) for count in episodes])
@@ -166,12 +166,12 @@ class _GraspsOfRegion(NamedTuple):
             choices = self.rests[obj]
             rests.append(choices[number % len(choices)])
         planned = PlannedEpisodes(
-            objects.astype(np.int32),
-            np.array(rests, np.int32),
-            names[objects],
-            numbers.astype(np.int32),
+            objects=objects.astype(np.int32),
+            rests=np.array(rests, np.int32),
+            object_seeds=object_seeds[objects],
+            episode_numbers=numbers.astype(np.int32),
         )
-        return RowPlan(self.constraint, False, planned, episodes > 0)
+        return RowPlan(self.constraint, aligned=False, episodes=planned, covered=episodes > 0)
 
     def add(self, batch: Grasps, count: int) -> None:
         """Adds the grasps of the first `count` episodes of a batch."""
@@ -191,10 +191,11 @@ def _grasp_all(
     """Returns at most `POSES` grasps of each object (N) and region (V)."""
     task = protocol(policy.task, policy.task.hold_steps)
     hand = get_hand(policy.spec.hand)
-    names = np.array([int(store.digest(obj)[:8], 16) for obj in objects], np.uint32)
+    seeds = [int(store.digest(obj)[:8], 16) for obj in objects]
+    object_seeds = np.array(seeds, np.uint32)
     regions = []
     for constraint in _REGIONS:
-        allowed = np.asarray(initial.allowing(task, bank, (constraint,)))
+        allowed = np.asarray(draws.samplable(task, bank, (constraint,)))
         regions.append(
             _GraspsOfRegion(
                 constraint,
@@ -214,7 +215,7 @@ def _grasp_all(
                 attempts = region.next_attempts()
                 if not attempts.any():
                     break
-                plan = region.plan(attempts, names)
+                plan = region.plan(attempts, object_seeds)
                 for conditions, count in batches(hand, task, bank, plan, _SEED, size):
                     episodes.run(conditions)
                     region.add(jax.tree.map(np.asarray, episodes.take_grasps()), count)

@@ -23,7 +23,7 @@ from congrasp.services.evaluate.columns import (
 )
 from congrasp.services.evaluate.experiment import Experiment, Result, Variation
 from congrasp.services.evaluate.model_card import model_card
-from congrasp.services.evaluate.pages import Picture, count_causes, curves_of, embedded, template
+from congrasp.services.evaluate.pages import Picture, count_causes, curves_of, embed, template
 from congrasp.services.evaluate.pictures import failure_sheets, turntable
 from congrasp.services.evaluate.plan import objects_label
 from congrasp.services.evaluate.scores import Row
@@ -185,7 +185,7 @@ def write_report(out: pathlib.Path, content: ReportContent) -> None:
     check = None
     if content.check is not None:
         findings = _findings(content.check).html()
-        check = embedded(Picture("self-check", content.check.sheet))
+        check = embed(Picture("self-check", content.check.sheet))
     text = _report_template().render(
         title=f"Grasping policy of the {policy.spec.hand} hand, version {policy.version}",
         summary=_summary(content.rows),
@@ -193,9 +193,9 @@ def write_report(out: pathlib.Path, content: ReportContent) -> None:
         rates=_rates(content.rows, content.conditions).html(),
         forces=Table.of(FORCES_TITLE, content.rows, FORCES).html(),
         command=content.commands.table,
-        sheets=[embedded(sheet) for sheet in content.sheets],
+        sheets=[embed(sheet) for sheet in content.sheets],
         pictures_command=content.commands.pictures,
-        curves=[embedded(curve) for curve in content.curves],
+        curves=[embed(curve) for curve in content.curves],
         curves_command=content.commands.curves,
         findings=findings,
         check=check,

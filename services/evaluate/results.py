@@ -96,7 +96,7 @@ def read_results(file: pathlib.Path) -> Results:
     return Results(rows, about)
 
 
-def recorded(root: pathlib.Path = ROOT) -> dict[str, Results]:
+def read_all_results(root: pathlib.Path = ROOT) -> dict[str, Results]:
     """Reads all files of results, by name."""
     return {file.stem: read_results(file) for file in sorted((root / FOLDER).glob("*.json"))}
 
@@ -179,7 +179,7 @@ KINDS: dict[str, Callable[[Results], list[str]]] = {
 """Tables of a file of results available to pages, as lines of Markdown."""
 
 
-def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str:
+def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -> str:
     """Returns a page with its tables regenerated from results.
 
     Raises:
@@ -202,10 +202,10 @@ def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str
 
 def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
     """Yields every page whose tables differ from the results, and its corrected text."""
-    results = recorded(root)
+    results = read_all_results(root)
     for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
         text = path.read_text(encoding="utf-8")
-        corrected = filled(text, results, path.name)
+        corrected = fill_tables(text, results, path.name)
         if corrected != text:
             yield path, corrected
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.actors.stress import ASSESSED, SURVIVAL
+from congrasp.actors.stress import ASSESSED_NAMES, SURVIVAL_NAMES
 from congrasp.common.io.files import write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
@@ -20,7 +20,7 @@ from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.intervals import (
     NORMAL_95,
-    clustered,
+    clustered_interval,
     independent_episodes,
     standard_error,
 )
@@ -70,7 +70,7 @@ _HUNDREDTHS = np.linspace(0, 1, 101)
 class Row:
     """One row of a table.
 
-    Rates have 95 % intervals (`clustered`; clusters are objects or captured sequences).
+    Rates have 95 % intervals (`clustered_interval`; clusters are objects or captured sequences).
     Errors and forces are averaged over successful episodes.
     """
 
@@ -285,7 +285,7 @@ def _rates(
       pool: number of objects; those without episodes have a rate of 0.
     """
     over_episodes, over_pool = names
-    low, high = clustered(outcomes, clusters)
+    low, high = clustered_interval(outcomes, clusters)
     _, members = np.unique(objects, return_inverse=True)
     rate_of_object = np.bincount(members, outcomes) / np.bincount(members)
     return {
@@ -320,10 +320,10 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
     two-second hold.
     """
     row: dict[str, float | None] = {}
-    for name in ASSESSED:
+    for name in ASSESSED_NAMES:
         column = values.get(name, np.zeros(0))
         column = column[~np.isnan(column)]
-        needs_hold = name == "clean" or name in SURVIVAL
+        needs_hold = name == "clean" or name in SURVIVAL_NAMES
         row[name] = None
         if len(column) and (held_2s or not needs_hold):
             row[name] = float(column.mean())

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import InitialConditions
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -62,7 +62,7 @@ class Noise(Variation):
             hand = experiment.hand
             q = np.asarray(bank.pose_q)
             noisy = np.clip(q + rng.normal(0.0, self.level, q.shape), hand.lower, hand.upper)
-            return bank._replace(pose_q=coupled(hand, noisy).astype(np.float32))
+            return bank._replace(pose_q=follow_couplings(hand, noisy).astype(np.float32))
         if self.kind == "depth":
             position = np.asarray(bank.pose_position)
             quaternion = np.asarray(bank.pose_quaternion).reshape(-1, 4)

@@ -13,10 +13,10 @@ from congrasp.common.hands.flesh import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.services.appearance import palette
-from congrasp.services.appearance.surface_colours import painted
+from congrasp.services.appearance.surface_colours import paint_surface
 from congrasp.services.export.frames import OBJECT, link_origins
 
-COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
+COLOURS = {**palette.MATERIAL_COLOURS, OBJECT: palette.OBJECT}
 """Colours of the materials of hands, and of the object."""
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
 
@@ -27,7 +27,9 @@ def object_mesh(motion: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
     """
     if motion.colours is None:
         return motion.object_vertices, motion.object_faces, None
-    vertices, faces, colours = painted(motion.object_vertices, motion.object_faces, motion.colours)
+    vertices, faces, colours = paint_surface(
+        motion.object_vertices, motion.object_faces, motion.colours
+    )
     return vertices, faces, colours.astype(np.float32) / 255
 
 

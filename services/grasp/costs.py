@@ -3,7 +3,7 @@
 import numpy as np
 
 from congrasp.actors.attempts import Outcome
-from congrasp.actors.stress import SURVIVAL
+from congrasp.actors.stress import SURVIVAL_NAMES
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
@@ -19,7 +19,7 @@ _STRESS_SCALES = {
 displacement after removal (m), and deviation from natural postures (rad)."""
 _MAX_COST = 10.0
 """Largest cost of one metric."""
-_FIRM = ("clean", *SURVIVAL)
+_FIRM = ("clean", *SURVIVAL_NAMES)
 """Metrics that add a cost of 1 where they are zero."""
 _NO_SUCCESS = 1e3
 _NOT_HELD = 1e4

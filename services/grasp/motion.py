@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from congrasp.actors.stress import ASSESSED
+from congrasp.actors.stress import ASSESSED_NAMES
 from congrasp.common.episode.episode import Episode
 from congrasp.services.grasp.costs import errors_of
 
@@ -87,7 +87,7 @@ class Grasp:
             "shove_mm": 1e3 * self.shove,
             "links_at_removal": metrics["links_at_removal"],
         }
-        facts |= {name: value for name, value in metrics.items() if name in ASSESSED}
+        facts |= {name: value for name, value in metrics.items() if name in ASSESSED_NAMES}
         facts |= {name: metrics[name] for name in errors_of(episode.constraints)}
         if self.arm:
             facts |= self.arm.facts()

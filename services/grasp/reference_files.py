@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.episode.episode import Episode
 from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import read_json
 from congrasp.common.rotations import continuous
 from congrasp.common.task.sampling import set_file
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.approach import approach
-from congrasp.services.assets.captures.references import followed
+from congrasp.services.assets.captures.references import follow_human_wrist
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.sizes import size_in_words
@@ -69,7 +69,7 @@ def _finger_angles(joints: Any, hand: Hand, path: pathlib.Path) -> np.ndarray:
         raise CongraspError(
             f"a joint angle of {path} is {largest:.4g}.", "Write joint angles in radians."
         )
-    return coupled(hand, np.clip(q, hand.lower, hand.upper))
+    return follow_couplings(hand, np.clip(q, hand.lower, hand.upper))
 
 
 def read_path(text: str, target: Target) -> dict[str, np.ndarray]:
@@ -104,7 +104,7 @@ def read_path(text: str, target: Target) -> dict[str, np.ndarray]:
 def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
     """The path of a BVH joint to the frame nearest to the object, cut like captured paths."""
     recorded = read_wrist_path(path, joint=joint)
-    position, rotation = followed(target.hand, recorded.position, recorded.rotation)
+    position, rotation = follow_human_wrist(target.hand, recorded.position, recorded.rotation)
     position = position + target.obj.origin  # both are upright
     distances = Surface(target.obj).distance(position)
     frame = int(distances.argmin())

@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from congrasp.actors import initial
+from congrasp.actors import draws
+from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.config import TaskConfig
@@ -46,7 +47,7 @@ class EpisodeStreams:
             self._keys[index] = np.random.SeedSequence(_checked(one)).generate_state(2)
             self._drawn[index] = 0
 
-    def draw(self, mask: np.ndarray) -> initial.InitialConditions:
+    def draw(self, mask: np.ndarray) -> InitialConditions:
         """Draws the next episodes of the masked environments (B,); other rows hold any."""
         conditions = _draw(self._hand, self._task, self._bank, self._keys, self._drawn)
         self._drawn = self._drawn + mask.astype(np.uint32)
@@ -82,13 +83,13 @@ def _checked(seed: Any) -> int:
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _draw(
     hand: Hand, task: TaskConfig, bank: ConstraintBank, keys: jax.Array, numbers: jax.Array
-) -> initial.InitialConditions:
+) -> InitialConditions:
     """Draws an episode for each of B environments, by its key (B, 2) and number (B,)."""
 
-    def one(key_data: jax.Array, number: jax.Array) -> initial.InitialConditions:
+    def one(key_data: jax.Array, number: jax.Array) -> InitialConditions:
         """Draws a batch of a single episode."""
         key = jax.random.fold_in(jax.random.wrap_key_data(key_data), number)
-        return initial.sample(hand, task, bank, key, 1)
+        return draws.sample(hand, task, bank, key, 1)
 
     batches = jax.vmap(one)(keys, numbers)
     return jax.tree.map(lambda array: array[:, 0], batches)

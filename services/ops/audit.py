@@ -124,7 +124,7 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
         files |= stored(run_dir) or set()
     gaps = _Gaps(actors=_has_gaps(notes), learners=_has_gaps(books))
     outcomes = _outcomes(book.intact for book in books)._replace(files=files)
-    report = _compare(_made(notes), outcomes, gaps, [*notes, *books])
+    report = _compare(_sent_rollouts(notes), outcomes, gaps, [*notes, *books])
     covered = _covered_version(books)
     if covered < reached and not gaps.learners:
         return report._replace(missing=report.missing + 1, unrecorded=(covered, reached))
@@ -206,7 +206,7 @@ def _is_entry(entry: dict[str, Any]) -> bool:
     return has_fields(entry, actor=str, incarnation=str)
 
 
-def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
+def _sent_rollouts(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
     """Rollouts sent by actors, and the replies they received."""
     made: dict[Identity, Made] = {}
     for journal in journals:
@@ -394,7 +394,7 @@ def _check_acceptances(
             findings.counts[_not_accepted(answers, used=used)] += 1
             continue
         findings.counts["accepted"] += 1
-        outcome = _judged(identity, rollout, outcomes, gaps)
+        outcome = _judge(identity, rollout, outcomes, gaps)
         if outcome == "lost":
             findings.add_fault("lost", identity, "accepted, but missing afterwards")
         else:
@@ -434,7 +434,7 @@ def _max_staleness(books: Iterable[list[_Session]]) -> int:
     return max(limits)
 
 
-def _judged(identity: Identity, rollout: Made, outcomes: _Outcomes, gaps: _Gaps) -> str:
+def _judge(identity: Identity, rollout: Made, outcomes: _Outcomes, gaps: _Gaps) -> str:
     """Outcome of an accepted rollout; a loss cannot be judged while lines are missing."""
     outcome = _outcome(identity, rollout, outcomes)
     return UNJUDGED if outcome == "lost" and any(gaps) else outcome

@@ -13,10 +13,10 @@ from typing import NamedTuple
 from congrasp.common.errors import printable
 from congrasp.common.runtime import platforms
 
-_READ = 1 << 20
-"""Bytes at the end of a log in which a cause is looked for."""
-_LONGEST = 300
-"""Characters of a quoted line."""
+_MAX_READ_BYTES = 1 << 20
+"""Bytes at the end of a log that are searched for a cause."""
+_MAX_QUOTED_CHARACTERS = 300
+"""Limit of a quoted line."""
 _OUR_ERROR = "congrasp: error: "
 _PREFIX = re.compile(r"^(?:[EWFI]\d{4} [\d:.]+ +\d+ \S+\] |(?:error|fatal|warning|info): )+")
 _HARMLESS = re.compile(r"not a failure|performance gains|retrying", re.IGNORECASE)
@@ -80,7 +80,7 @@ def read_end(path: pathlib.Path, begin: int) -> str:
     try:
         with path.open("rb") as log:
             size = log.seek(0, 2)
-            log.seek(max(begin, size - _READ))
+            log.seek(max(begin, size - _MAX_READ_BYTES))
             return log.read().decode(errors="replace")
     except OSError:
         return ""
@@ -95,18 +95,18 @@ def cause_in(text: str) -> str:
     """
     lines = text.splitlines()
     for line in lines:
-        shortage = _shortage(line)
+        shortage = _find_shortage(line)
         if shortage:
-            return f"{_phrase(shortage, text)} ({_quoted(line)})"
+            return f"{_phrase_of(shortage, text)} ({_quote(line)})"
     errors = [line for line in lines if line.startswith(_OUR_ERROR)]
     if errors:
-        return _quoted(errors[-1].removeprefix(_OUR_ERROR))
-    exceptions = _exceptions(lines)
+        return _quote(errors[-1].removeprefix(_OUR_ERROR))
+    exceptions = _exception_lines(lines)
     causes = [line for line in exceptions if not _CONSEQUENCES.match(line)]
     if causes or exceptions:
-        return _quoted((causes or exceptions)[-1])
+        return _quote((causes or exceptions)[-1])
     crashes = [line for line in lines if _CRASH.search(line)]
-    return _quoted(crashes[-1]) if crashes else ""
+    return _quote(crashes[-1]) if crashes else ""
 
 
 def last_line(text: str) -> str:
@@ -127,7 +127,7 @@ def end_of(name: str, code: int, log: str, *, kernel_killed: bool = False) -> st
     cause = cause_in(log)
     if code >= 0:
         reason = cause or last_line(log) or "its log is empty"
-        return f"The {name} died (exit code {code}): {reason.rstrip('. ')}.{_limit(cause)}"
+        return f"The {name} died (exit code {code}): {reason.rstrip('. ')}.{_limit_sentence(cause)}"
     number = signal.Signals(-code)
     if not cause and number.name == "SIGKILL" and kernel_killed:
         cause = "out of memory (killed by the kernel)"
@@ -135,17 +135,17 @@ def end_of(name: str, code: int, log: str, *, kernel_killed: bool = False) -> st
         cause = "probably out of memory"
     if not cause:
         return f"The {name} was killed by {number.name}."
-    return f"The {name} was killed by {number.name}: {cause.rstrip('. ')}.{_limit(cause)}"
+    return f"The {name} was killed by {number.name}: {cause.rstrip('. ')}.{_limit_sentence(cause)}"
 
 
-def _shortage(line: str) -> Shortage | None:
+def _find_shortage(line: str) -> Shortage | None:
     """The resource whose lack a line reports."""
     if _HARMLESS.search(line):
         return None
     return next((each for each in _SHORTAGES if each.words.search(line)), None)
 
 
-def _phrase(shortage: Shortage, text: str) -> str:
+def _phrase_of(shortage: Shortage, text: str) -> str:
     """Phrase of a shortage: memory of a device is that of a GPU if the log names one."""
     if shortage.phrase == "out of device memory":
         is_gpu = re.search(r"\bGPU|CUDA|\bgpu\b", text) or _uses_gpu()
@@ -158,26 +158,26 @@ def _uses_gpu() -> bool:
     return _DRIVER.exists() and os.environ.get("JAX_PLATFORMS") != "cpu"
 
 
-def _exceptions(lines: list[str]) -> list[str]:
+def _exception_lines(lines: list[str]) -> list[str]:
     """The line of the exception after each trace."""
-    found: list[str] = []
+    exception_lines: list[str] = []
     in_trace = False
     for line in lines:
         if line.startswith(_TRACE):
             in_trace = True
         elif in_trace and _EXCEPTION.match(line):
-            found.append(line)
+            exception_lines.append(line)
             in_trace = False
-    return found
+    return exception_lines
 
 
-def _quoted(line: str) -> str:
+def _quote(line: str) -> str:
     """A line of a log without its level, time and place."""
     text = printable(_PREFIX.sub("", line.strip()).removeprefix(_OUR_ERROR)).strip().rstrip(". ")
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
+    return text if len(text) <= _MAX_QUOTED_CHARACTERS else f"{text[:_MAX_QUOTED_CHARACTERS]} …"
 
 
-def _limit(cause: str) -> str:
+def _limit_sentence(cause: str) -> str:
     """A sentence about the limit of the address space, if there is one and memory is the cause."""
     limit = platforms.address_space_limit()
     if "memory" not in cause or not limit:

@@ -24,21 +24,26 @@ from congrasp.services.ops.certificates import certificates
 from congrasp.services.ops.status import ask
 
 _PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
-_PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
+_MATCHING_PACKAGES = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
 """Packages whose versions must match."""
 PORT = int(LEARNER_URL.rpartition(":")[2])
 """First of the default ports of a learner."""
-_LEAST_GIB = 2.0
-_LEAST_MB_S = 5.0
-_SAMPLE = 16 << 20
-"""Bytes that are written to measure a disk."""
-_LEAST_DATE = 1.7e9
-"""Seconds since 1970, in the year 2023."""
+_MIN_FREE_GIB = 2.0
+_MIN_DISK_MB_S = 5.0
+_SAMPLE_BYTES = 16 << 20
+"""Size of the file that is written to measure a disk."""
+_MIN_DATE_S = 1.7e9
+"""Seconds since 1970, in the year 2023: an earlier clock is wrong."""
 _MAX_DRIFT_S = 0.1
-_DRIVER = 580
-_LEAST_DAYS = 14.0  # warning before a certificate expires, days
-_OFFSET = 1.0  # tolerated offset from the learner's clock, s
-_BETWEEN = 0.05  # seconds between two requests; a secured learner accepts a hundred per second
+"""Tolerated difference of two clocks over 0.2 s."""
+_MIN_DRIVER = 580
+"""Oldest NVIDIA driver that JAX and Warp run on."""
+_MIN_CERTIFICATE_DAYS = 14.0
+"""Time until a certificate expires below which it is reported."""
+_MAX_CLOCK_OFFSET_S = 1.0
+"""Tolerated offset from the learner's clock."""
+_REQUEST_PAUSE_S = 0.05
+"""Time between two requests; a secured learner accepts a hundred per second."""
 NVIDIA_DEVICE = "/dev/nvidia0"
 """File that exists on a machine with an NVIDIA GPU."""
 
@@ -128,7 +133,7 @@ def check_packages() -> Iterator[Finding]:
         fine = version is None or version.contains(installed[name])
         remedy = f"{version} is needed; run: pip install '{name}{version}'"
         yield Finding(name, fine, installed[name], remedy)
-    for first, second in _PAIRS:
+    for first, second in _MATCHING_PACKAGES:
         if first not in installed:
             continue
         expected = importlib.metadata.version(first)
@@ -168,11 +173,11 @@ def check_gpu() -> Iterator[Finding]:
         return
     for number, line in enumerate(lines):
         name, memory, used, driver = (part.strip() for part in line.split(","))
-        fine = int(driver.split(".")[0]) >= _DRIVER
+        fine = int(driver.split(".")[0]) >= _MIN_DRIVER
         text = (
             f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
         )
-        yield Finding(f"gpu {number}", fine, text, f"{_DRIVER} or newer is needed; update it")
+        yield Finding(f"gpu {number}", fine, text, f"{_MIN_DRIVER} or newer is needed; update it")
 
 
 def check_jax() -> Iterator[Finding]:
@@ -235,18 +240,18 @@ def check_ports() -> Iterator[Finding]:
 def check_disk(folder: pathlib.Path) -> Iterator[Finding]:
     """Checks free space of a folder's disk, and the speed of a synchronous write there."""
     free = shutil.disk_usage(folder).free / 2**30
-    if free < _LEAST_GIB:
-        remedy = f"a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
+    if free < _MIN_FREE_GIB:
+        remedy = f"a run needs about {_MIN_FREE_GIB:g} GiB; free some, or pass another --run-dir"
         yield Finding("disk", False, f"{free:.1f} GiB free", remedy)
         return
     try:
         with tempfile.NamedTemporaryFile(dir=folder) as file:
-            sample = os.urandom(_SAMPLE)
+            sample = os.urandom(_SAMPLE_BYTES)
             began = time.monotonic()
             file.write(sample)
             file.flush()
             os.fsync(file.fileno())
-            speed = _SAMPLE / 1e6 / (time.monotonic() - began)
+            speed = _SAMPLE_BYTES / 1e6 / (time.monotonic() - began)
     except OSError as error:
         yield Finding(
             "disk",
@@ -254,9 +259,11 @@ def check_disk(folder: pathlib.Path) -> Iterator[Finding]:
             f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir",
         )
         return
-    remedy = f"checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
+    remedy = (
+        f"checkpoints and recordings need about {_MIN_DISK_MB_S:g} MB/s; pass another --run-dir"
+    )
     yield Finding(
-        "disk", speed >= _LEAST_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy
+        "disk", speed >= _MIN_DISK_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy
     )
 
 
@@ -266,7 +273,7 @@ def check_clock() -> Iterator[Finding]:
     monotonic = time.monotonic()
     time.sleep(0.2)
     drift = abs((time.time() - date) - (time.monotonic() - monotonic))
-    is_behind = date < _LEAST_DATE
+    is_behind = date < _MIN_DATE_S
     remedy = f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
     if is_behind:
         remedy = "it is years behind; set it (timedatectl set-ntp true)"
@@ -281,16 +288,14 @@ def check_certificates(folder: pathlib.Path) -> Iterator[Finding]:
     except CongraspError as error:
         yield Finding("certificates", False, str(error))
         return
-    for one in listed:
-        text = (
-            f"{one.name}: valid until {one.expires:%Y-%m-%d}"
-            if one.days > 0
-            else f"{one.name}: expired"
-        )
+    for certificate in listed:
+        text = f"{certificate.name}: expired"
+        if certificate.days > 0:
+            text = f"{certificate.name}: valid until {certificate.expires:%Y-%m-%d}"
         remedy = (
             "run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
         )
-        yield Finding("certificate", one.days > _LEAST_DAYS, text, remedy)
+        yield Finding("certificate", certificate.days > _MIN_CERTIFICATE_DAYS, text, remedy)
 
 
 def check_learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
@@ -304,7 +309,7 @@ def check_learner(connect: str, run: str, certs: pathlib.Path | None = None) -> 
     try:
         with urls.connect(connect, "observer", certs=certs, wait=5.0, run=run) as transport:
             ask(transport, run)
-            time.sleep(_BETWEEN)
+            time.sleep(_REQUEST_PAUSE_S)
             began = time.time()
             status = ask(transport, run)
             ended = time.time()
@@ -317,7 +322,7 @@ def check_learner(connect: str, run: str, certs: pathlib.Path | None = None) -> 
         f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}",
     )
     offset = status["time"] - (began + ended) / 2
-    fine = abs(offset) < _OFFSET + (ended - began) / 2
+    fine = abs(offset) < _MAX_CLOCK_OFFSET_S + (ended - began) / 2
     remedy = "times in recordings will not match; synchronise both clocks"
     yield Finding(
         "its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f})", remedy

@@ -1,4 +1,4 @@
-"""Ctrl-C where a library swallows its exception, and the last line of a stopped command.
+"""Ctrl-C where a library swallows its exception.
 
 Python raises KeyboardInterrupt between any two bytecodes of the main thread, also inside callbacks
 whose exceptions it only prints, such as those of the garbage collector, of weak references and of
@@ -7,7 +7,6 @@ whose exceptions it only prints, such as those of the garbage collector, of weak
 
 import contextlib
 import ctypes
-import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -15,8 +14,9 @@ from typing import Any
 
 from congrasp.services.ops.lifetime import Stop
 
-_AGAIN = 0.05  # seconds until a swallowed interrupt is raised again
-_current: list[Stop] = []
+_RAISE_AGAIN_AFTER_S = 0.05
+"""Time from a swallowed interrupt until it is raised again."""
+_stops: list[Stop] = []
 """Stops of the commands that run in this process, the innermost last."""
 
 
@@ -25,51 +25,50 @@ def interrupts_reach(stop: Stop) -> Iterator[None]:
     """Context of a command in the main thread: an interrupt that a callback swallowed is raised
     again, and `check_stopped` raises it wherever the command calls that.
     """
-    before = sys.unraisablehook
+    previous_hook = sys.unraisablehook
     ended = threading.Event()
+    ending = threading.Lock()
+    """Held while the interrupt is raised again, so that the context ends before or after it."""
 
     def raise_unless_ended() -> None:
-        if not ended.is_set():
-            _raise_in_main_thread()
+        with ending:
+            if not ended.is_set():
+                raise_in_main_thread()
 
     def hook(unraisable: Any) -> None:
         if unraisable.exc_type is not KeyboardInterrupt:
-            before(unraisable)
+            previous_hook(unraisable)
             return
         # Not here: it would be raised inside this hook, and be swallowed as well.
-        again = threading.Timer(_AGAIN, raise_unless_ended)
-        again.daemon = True
-        again.start()
+        timer = threading.Timer(_RAISE_AGAIN_AFTER_S, raise_unless_ended)
+        timer.daemon = True
+        timer.start()
 
     sys.unraisablehook = hook
-    _current.append(stop)
+    _stops.append(stop)
     try:
         yield
     finally:
-        ended.set()
-        _current.remove(stop)
-        sys.unraisablehook = before
+        try:
+            with ending:
+                ended.set()
+        finally:  # also if the interrupt that was raised again arrives in the lines above
+            _stops.pop()
+            sys.unraisablehook = previous_hook
 
 
 def check_stopped() -> None:
     """Raises KeyboardInterrupt in the main thread of a command that a signal has stopped."""
     in_main_thread = threading.current_thread() is threading.main_thread()
-    if in_main_thread and _current and _current[-1].is_set():
+    if in_main_thread and _stops and _stops[-1].is_set():
         raise KeyboardInterrupt
 
 
-def _raise_in_main_thread() -> None:
+def raise_in_main_thread() -> None:
     """Raises KeyboardInterrupt in the main thread, between two bytecodes.
 
     It is no signal, since a second one ends the process at once (`lifetime.on_signal`).
     """
-    identifier = ctypes.c_ulong(threading.main_thread().ident or 0)
-    interrupt = ctypes.py_object(KeyboardInterrupt)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(identifier, interrupt)
-
-
-def ending(code: int) -> str:
-    """Returns the last line of a command with the exit code of a signal."""
-    if code == 128 + signal.SIGINT:
-        return "Stopped by Ctrl-C."
-    return f"Stopped by {signal.Signals(code - 128).name}."
+    thread_id = ctypes.c_ulong(threading.main_thread().ident or 0)
+    exception = ctypes.py_object(KeyboardInterrupt)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, exception)

@@ -21,18 +21,18 @@ from congrasp.common.runtime import platforms
 from congrasp.common.runtime.environment import child_environment
 from congrasp.services.ops import causes
 
-GRACE = 3.5
-"""Longest time between a signal and the end of the process, s."""
-GRACE_ALONE = 1.7
+GRACE_S = 3.5
+"""Longest time between a signal and the end of the process."""
+GRACE_WITHOUT_CHILDREN_S = 1.7
 """The same for a command that a signal interrupts and that has no children: it has nothing to
 drain, and its files are complete or absent."""
-CHILD_GRACE = 2.0
-"""Longest time for a child to drain, s. It is shorter than `GRACE`, which leaves this process time
+CHILD_GRACE_S = 2.0
+"""Longest time for a child to drain. It is shorter than `GRACE_S`, which leaves this process time
 to kill the child.
 """
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-_PARENT = "CONGRASP_PARENT"
+_PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 POLL_S = 0.5
 """Time between two looks at a child, s."""
@@ -63,6 +63,14 @@ class Stop(threading.Event):
         return f"stopped by {signal.Signals(self.signal).name}" if self.signal else "stopped"
 
 
+def stopped_line(exit_code: int) -> str:
+    """Returns the last line of a command that ended with the exit code of a signal."""
+    number = signal.Signals(exit_code - 128)
+    if number == signal.SIGINT:
+        return "Stopped by Ctrl-C."
+    return f"Stopped by {number.name}."
+
+
 @contextlib.contextmanager
 def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterator[Stop]:
     """Yields a Stop that the first signal sets. Python handles signals only in the main thread;
@@ -74,7 +82,7 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
     second signal: from the user, or from the kernel because the parent has ended (`follow_parent`).
 
     Args:
-      grace: seconds from the signal to the forced end; by default `GRACE`, or `GRACE_ALONE`.
+      grace: seconds from the signal to the forced end; by default that of `_default_grace`.
       interrupt: also raises KeyboardInterrupt in the main thread, for code that does not poll.
     """
     stop = Stop()
@@ -106,7 +114,7 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
 def _default_grace(interrupt: bool) -> float:
     """Seconds from a signal to the forced end of this process."""
     has_children = any(child.poll() is None for child in list(_children))
-    return GRACE_ALONE if interrupt and not has_children else GRACE
+    return GRACE_WITHOUT_CHILDREN_S if interrupt and not has_children else GRACE_S
 
 
 def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, interrupt: bool) -> None:
@@ -116,7 +124,7 @@ def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, inter
     Args:
       reader: has a byte for each signal; its other end is closed when the context has ended.
       stop: the event.
-      grace: seconds to the forced end; by default `GRACE`, or `GRACE_ALONE`.
+      grace: seconds to the forced end; by default `GRACE_S`, or `GRACE_WITHOUT_CHILDREN_S`.
       interrupt: True if signals also raise KeyboardInterrupt in the main thread.
     """
     signals = reader.recv(1)
@@ -157,7 +165,7 @@ def _end(code: int) -> None:
 
 def follow_parent() -> None:
     """Makes this process receive SIGTERM when its parent has ended, if that requested it."""
-    parent = os.environ.pop(_PARENT, None)
+    parent = os.environ.pop(_PARENT_VARIABLE, None)
     if parent is not None:
         platforms.terminate_with(int(parent))
 
@@ -209,7 +217,7 @@ class Child:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
         with its parent.
         """
-        additions = {**self.environment, _PARENT: str(os.getpid())}
+        additions = {**self.environment, _PARENT_VARIABLE: str(os.getpid())}
         environment = child_environment(**additions)
         # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
         # frames.
@@ -271,13 +279,13 @@ def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> No
 
 
 def end_all(children: Sequence[Child]) -> None:
-    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE`
+    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE_S`
     seconds.
     """
     running = [child.process for child in children if child.process and child.code is None]
     for process in running:
         platforms.request_end(process)
-    wait_for(running, CHILD_GRACE)
+    wait_for(running, CHILD_GRACE_S)
     for process in running:
         if process.poll() is None:
             process.kill()

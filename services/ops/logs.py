@@ -94,16 +94,16 @@ class Watch:
     @contextlib.contextmanager
     def watched(self, role: str, id: str, run: str, collector: Any) -> Iterator[None]:
         """Logs and, if a port is set, serves the collector's metrics while the block runs."""
-        with logging_as(self.log_format, role=role, id=id, run=run), self.exposed(collector):
+        with logging_as(self.log_format, role=role, id=id, run=run), self.serve_metrics(collector):
             yield
 
-    def exposed(self, collector: Any) -> contextlib.AbstractContextManager[None]:
+    def serve_metrics(self, collector: Any) -> contextlib.AbstractContextManager[None]:
         """Context that serves a collector's metrics, if a port is set."""
         if not self.metrics_port:
             return contextlib.nullcontext()
-        from congrasp.services.ops.metrics import exposed
+        from congrasp.services.ops.metrics import serve_metrics
 
-        return exposed(self.metrics_port, self.metrics_host, collector)
+        return serve_metrics(self.metrics_port, self.metrics_host, collector)
 
 
 def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:
@@ -115,7 +115,7 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
 
 
 @contextlib.contextmanager
-def announced(
+def announce_progress(
     what: str | Callable[[], str], first: float = 3.0, every: float = 10.0
 ) -> Iterator[None]:
     """Context that prints a task and its elapsed time to stderr, after `first` and then every
@@ -137,7 +137,7 @@ def announced(
             print(f"{task}: {time.monotonic() - began:.0f} s so far.", file=sys.stderr, flush=True)
             pause = every
 
-    threading.Thread(target=tell, daemon=True, name="announced").start()
+    threading.Thread(target=tell, daemon=True, name="progress").start()
     try:
         yield
     finally:

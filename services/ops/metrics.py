@@ -25,11 +25,11 @@ _GAUGES = {
         "Requests rejected because their actors had made too many useless ones.",
     ),
 }
-_MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
+_LATENCY_BUCKETS_MS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @contextlib.contextmanager
-def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
+def serve_metrics(port: int, host: str, *collectors: Any) -> Iterator[None]:
     """Context that serves collectors at http://HOST:PORT/metrics, with this process's memory and
     CPU time.
 
@@ -184,7 +184,7 @@ class ServerMetrics:
             "congrasp_policy_seconds",
             "Time from the arrival of a query to its reply.",
             registry=None,
-            buckets=[1e-3 * bound for bound in _MILLISECONDS],
+            buckets=[1e-3 * bound for bound in _LATENCY_BUCKETS_MS],
         )
         self._batch = Histogram(
             "congrasp_policy_batch",

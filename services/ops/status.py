@@ -23,7 +23,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.wire.codec import Message
 
-_TIMEOUT = 5.0
+_TIMEOUT_S = 5.0
 _SUMS = {
     "granted": ("running", "redeemed", "returned", "expired"),
     "accepted": ("consumed", "dropped", "queued"),
@@ -34,7 +34,7 @@ _NUMBER_COLUMNS = ("version", "lag", "rollouts", "rollouts\nper s", "steps\nper 
 """Titles of at most eight characters a line: all columns fit into 80."""
 _MAX_ROWS = 100
 """Most processes in a table."""
-_RUN = "quickstart"
+_DEFAULT_RUN = "quickstart"
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def ask(transport: Transport, run: str) -> dict[str, Any]:
     Raises:
       TransportError: no learner of this run responds.
     """
-    reply = transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT)
+    reply = transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT_S)
     status = dict(reply.meta)
     return {**status, "warnings": warnings(status)}
 
@@ -164,7 +164,7 @@ class Status:
     """Folder of a run whose learner runs on this machine. It replaces --connect and --run."""
     connect: str = LEARNER_URL
     """Endpoint of the learner."""
-    run: str = _RUN
+    run: str = _DEFAULT_RUN
     """Name of the run."""
     watch: bool = False
     """Update the status until Ctrl-C, also while the learner is disconnected."""
@@ -211,7 +211,7 @@ class Status:
         """Endpoint and name of the run of a folder."""
         from congrasp.learner.run_directory import learner_url, open_run
 
-        if (self.connect, self.run) != (LEARNER_URL, _RUN):
+        if (self.connect, self.run) != (LEARNER_URL, _DEFAULT_RUN):
             raise CongraspError(
                 f"The folder {run_dir} cannot be combined with --connect or --run.",
                 "Pass either the folder or these options.",

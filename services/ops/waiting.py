@@ -12,12 +12,12 @@ from congrasp.services.ops.lifetime import Stop
 from congrasp.services.ops.logs import log
 
 T = TypeVar("T")
-_NOTICED = 2.0
-"""Seconds until the first line."""
-_EVERY = 60.0
-"""Seconds between two lines."""
-_ATTEMPT = 1.0
-"""Seconds of one attempt, after which a signal is noticed."""
+_FIRST_LINE_AFTER_S = 2.0
+"""Time until the first line about a wait."""
+_LINE_PERIOD_S = 60.0
+"""Time between two lines."""
+_ATTEMPT_S = 1.0
+"""Longest time of one attempt, after which a signal is noticed."""
 
 
 def connect_when_up(
@@ -49,7 +49,7 @@ def connect_when_up(
     """
 
     def connect() -> Transport:
-        return urls.connect(url, role, certs=certs, wait=_ATTEMPT, run=run)
+        return urls.connect(url, role, certs=certs, wait=_ATTEMPT_S, run=run)
 
     return when_up(connect, f"the learner at {url}", patience=patience, stop=stop)
 
@@ -74,7 +74,7 @@ def when_up(
     """
     began = time.monotonic()
     limit = math.inf if patience is None else patience
-    next_line = began + _NOTICED
+    next_line = began + _FIRST_LINE_AFTER_S
     while not stop.is_set():
         attempted = time.monotonic()
         try:
@@ -96,6 +96,6 @@ def when_up(
         if now >= next_line:
             ends = "" if patience is None else f", up to {limit:g} s"
             log("info", f"Waiting for {what}, {now - began:.0f} s so far{ends}. {reason}")
-            next_line = now + _EVERY
-        stop.wait(min(max(0.0, attempted + _ATTEMPT - now), began + limit - now))
+            next_line = now + _LINE_PERIOD_S
+        stop.wait(min(max(0.0, attempted + _ATTEMPT_S - now), began + limit - now))
     return None

@@ -11,8 +11,7 @@ from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.lazy_trimesh import trimesh
-from congrasp.services.appearance.palette import MATERIALS as COLOURS
-from congrasp.services.appearance.palette import Colour
+from congrasp.services.appearance.palette import MATERIAL_COLOURS, Colour
 
 _OVERLAP = 0.4
 """Weight of a link on a vertex from which the triangle belongs to the link."""
@@ -58,7 +57,7 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
             faces = skin.faces[is_member & (material_of_face == number)]
             if len(faces):
                 points, light_faces = _light(skin.points[faces] - origin, share)
-                parts.append(Part(COLOURS[name], points, light_faces))
+                parts.append(Part(MATERIAL_COLOURS[name], points, light_faces))
         parts_of_links.append(tuple(parts))
     return tuple(parts_of_links)
 

@@ -28,16 +28,19 @@ ALONE_S = 1.0
 """Time without a query of another peer after which a peer counts as alone."""
 
 
-class Parts(NamedTuple, Generic[T, R]):
-    """Splitting of an item into parts."""
+class Splitting(NamedTuple, Generic[T, R]):
+    """Splitting of items into parts, while several peers share the batches."""
 
-    sizes: tuple[int, ...]
-    """Limits of a batch's weight while several peers send queries: the first that has room for one
-    state of each peer."""
+    weight_limits: tuple[int, ...]
+    """Ascending limits of a batch's weight. The first one applies that is at least the number of
+    peers ahead in the queue, so that each of them gets a weight of one or more."""
     cut: Callable[[T, int, int], T]
     """(item, first, end) -> the part of weight `end` - `first`."""
-    join: Callable[[T, list[R]], R | Exception]
-    """(item, results of its parts in order) -> its result."""
+    join: Callable[[list[R]], R | None]
+    """Results of all parts in order -> the item's result; None if they do not match, in which case
+    the item runs again as a whole."""
+    run_again: Callable[[T, float], R | Exception]
+    """(item, its time in the queue in seconds) -> its result or error."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -50,16 +53,18 @@ class _Waiting(Generic[T, R]):
     arrival: float
     deadline: float
     taken: int = 0
-    """Weight of the parts that were in a batch."""
+    """Weight of the parts that a batch has taken; the others are still queued."""
     results: list[R] = dataclasses.field(default_factory=list)
-    """Results of those parts."""
+    """Results of the parts that have run."""
 
 
 class _Part(NamedTuple, Generic[T, R]):
-    """Part of an item in a batch."""
+    """An item in a batch, or a part of one."""
 
     whole: _Waiting[T, R]
+    """The queued item."""
     item: T
+    """The item itself, or the part of it that `Splitting.cut` returned."""
 
 
 class Batcher(Generic[T, R]):
@@ -70,15 +75,18 @@ class Batcher(Generic[T, R]):
     items. It waits at most `window` seconds until there are as many as in the last batch, so that
     synchronous callers stay synchronous.
 
+    An error of `run`, or of joining an item's parts, fails the items of the batch; the worker
+    continues.
+
     Args:
       run: function of a batch and its queueing times in seconds; returns one result or exception
         for each item.
       size: limit of the weight of a batch.
       window: longest wait for further items, s.
       depth: limit of the queue (`FairQueue`); items in excess fail with `OverloadedError`.
-      share: limit of one peer's queued items; by default that of the queue alone.
+      peer_limit: limit of one peer's queued items; by default only `depth` limits them.
       weigh: returns an item's weight, at most `size`.
-      parts: splitting of items; None runs each as a whole.
+      splitting: splits items into parts; None runs each as a whole.
     """
 
     def __init__(
@@ -88,23 +96,23 @@ class Batcher(Generic[T, R]):
         size: int,
         window: float,
         depth: int,
-        share: int | None = None,
+        peer_limit: int | None = None,
         weigh: Callable[[T], int] = lambda item: 1,
-        parts: Parts[T, R] | None = None,
+        splitting: Splitting[T, R] | None = None,
     ):
         self._run = run
         self._weigh = weigh
-        self._parts = parts
+        self._splitting = splitting
         self._size = size
         self._window = window
         self._depth = depth
-        self._share = share or depth + 1
-        self._queue: FairQueue[_Waiting[T, R]] = FairQueue(depth, self._share)
-        self._latest: Peer | None = None
-        self._several_until = -math.inf  # time at which the latest peer counts as alone
-        self._changed = threading.Condition()
+        self._peer_limit = peer_limit or depth + 1
+        self._queue: FairQueue[_Waiting[T, R]] = FairQueue(depth, self._peer_limit)
+        self._latest_peer: Peer | None = None
+        self._several_peers_until = -math.inf  # monotonic time at which the latest is alone
+        self._changed = threading.Condition()  # guards all attributes from here and the queue
         self._running = False
-        self._expected = 1
+        self._expected = 1  # items of the last batch
         self._closed = False
         self._thread = threading.Thread(target=self._work, daemon=True, name="batcher")
         self._thread.start()
@@ -114,12 +122,13 @@ class Batcher(Generic[T, R]):
         with self._changed:
             if self._queue.is_at_share(peer):
                 raise OverloadedError(
-                    f"Overloaded: {self._share} of your queries are queued.", "Try again later."
+                    f"Overloaded: {self._peer_limit} of your queries are queued.",
+                    "Try again later.",
                 )
             if not self._queue.has_room(peer):
-                raise self._full()
+                raise self._queue_full_error()
 
-    def _full(self) -> OverloadedError:
+    def _queue_full_error(self) -> OverloadedError:
         """Error of an item that has no place in the full queue."""
         return OverloadedError(f"Overloaded: {self._depth} queries are queued.", "Try again later.")
 
@@ -144,7 +153,7 @@ class Batcher(Generic[T, R]):
             if self._closed:
                 raise CongraspError("The server is shutting down.")
             self._note_peer(peer, now)
-            runs_here = self._is_idle() and waiting.weight <= self._room()
+            runs_here = self._is_idle() and waiting.weight <= self._batch_limit()
             if runs_here:
                 self._running = True
             else:
@@ -152,18 +161,20 @@ class Batcher(Generic[T, R]):
                 evicted = self._queue.add(waiting, peer)
                 self._changed.notify()
         if evicted is not None:
-            _resolve(evicted.future, self._full())
+            _resolve(evicted.future, self._queue_full_error())
         if runs_here:
-            self._answer([_Part(waiting, item)])
+            self._run_batch([_Part(waiting, item)])
         return waiting.future
 
     def _note_peer(self, peer: Peer, now: float) -> None:
-        """Notes the peer of the latest item, which decides whether several send items."""
-        if peer == self._latest:
+        """Notes the peer of the latest item, which decides whether several send items; the caller
+        holds the lock.
+        """
+        if peer == self._latest_peer:
             return
-        if self._latest is not None:
-            self._several_until = now + ALONE_S
-        self._latest = peer
+        if self._latest_peer is not None:
+            self._several_peers_until = now + ALONE_S
+        self._latest_peer = peer
 
     def _is_idle(self) -> bool:
         """True if nothing runs, is queued or is expected to arrive at once."""
@@ -179,12 +190,15 @@ class Batcher(Generic[T, R]):
     def _work(self) -> None:
         """Runs batches until the batcher is closed; runs in the worker thread."""
         while batch := self._collect():
-            self._answer(batch)
+            self._run_batch(batch)
         for waiting in self._queue:
-            waiting.future.set_exception(CongraspError("The server is shutting down."))
+            _resolve(waiting.future, CongraspError("The server is shutting down."))
 
-    def _answer(self, batch: list[_Part[T, R]]) -> None:
-        """Runs a batch without late items, and resolves every item once all its parts have run."""
+    def _run_batch(self, batch: list[_Part[T, R]]) -> None:
+        """Runs a batch without late items, and resolves every item once all its parts have run.
+
+        No error leaves it, since that would end the worker and leave futures unresolved.
+        """
         now = time.monotonic()
         in_time = []
         for part in batch:
@@ -206,9 +220,13 @@ class Batcher(Generic[T, R]):
         items = [part.item for part in batch]
         queued = [now - part.whole.arrival for part in batch]
         try:
-            return self._run(items, queued)
+            results = self._run(items, queued)
         except Exception as error:
             return [error] * len(batch)
+        if len(results) != len(batch):
+            mismatch = RuntimeError(f"A batch of {len(batch)} items has {len(results)} results.")
+            return [mismatch] * len(batch)
+        return results
 
     def _finish(self, part: _Part[T, R], result: R | Exception) -> None:
         """Resolves an item with the result of a part, unless further parts have to run."""
@@ -216,11 +234,11 @@ class Batcher(Generic[T, R]):
         if waiting.future.done():  # a part was running when the item lost its place
             return
         is_whole = part.item is waiting.item
-        if self._parts is not None and not is_whole and not isinstance(result, Exception):
+        if self._splitting is not None and not is_whole and not isinstance(result, Exception):
             waiting.results.append(result)
             if waiting.taken < waiting.weight:
                 return
-            result = self._parts.join(waiting.item, waiting.results)
+            result = _join_results(self._splitting, waiting)
         if isinstance(result, Exception):
             self._fail(waiting, result)
         else:
@@ -253,23 +271,25 @@ class Batcher(Generic[T, R]):
 
     def _is_shared(self) -> bool:
         """True if several peers share batches; the caller holds the lock."""
-        return self._parts is not None and time.monotonic() < self._several_until
+        return self._splitting is not None and time.monotonic() < self._several_peers_until
 
-    def _room(self) -> int:
-        """Limit of a batch's weight; the caller holds the lock."""
-        if self._parts is None or not self._is_shared():
+    def _batch_limit(self) -> int:
+        """Limit of the next batch's weight; the caller holds the lock."""
+        if self._splitting is None or not self._is_shared():
             return self._size
         peers = self._queue.peers_ahead
-        return next((size for size in self._parts.sizes if size >= peers), self._size)
+        return next(
+            (limit for limit in self._splitting.weight_limits if limit >= peers), self._size
+        )
 
-    def _shares(self, room: int) -> dict[Peer, int]:
-        """Limits of the peers' weights in a batch, in the order of their turns: accounts share it,
-        and the peers of an account. The caller holds the lock.
+    def _weight_by_peer(self, batch_limit: int) -> dict[Peer, int]:
+        """Weight that each peer may have in a batch, in the order of their turns: accounts share
+        the batch equally, and the peers of an account its part. The caller holds the lock.
         """
         peers = self._queue.in_turn()
         if not self._is_shared():
             return dict.fromkeys(peers, self._size)
-        of_account = max(1, room // max(1, self._queue.accounts))
+        of_account = max(1, batch_limit // max(1, self._queue.accounts))
         return {peer: max(1, of_account // self._queue.peers_of(peer.account)) for peer in peers}
 
     def _take(self) -> list[_Part[T, R]]:
@@ -278,34 +298,36 @@ class Batcher(Generic[T, R]):
         """
         batch: list[_Part[T, R]] = []
         is_shared = self._is_shared()
-        room = self._room()
-        shares = self._shares(room)
-        while turns := self._turns(shares):
+        rest_of_batch = self._batch_limit()
+        rest_of_peer = self._weight_by_peer(rest_of_batch)
+        while turns := self._turns(rest_of_peer):
             for peer in turns:
                 waiting = self._queue.first(peer)
                 weight = waiting.weight - waiting.taken
                 if is_shared:
-                    weight = min(weight, shares[peer], room)
-                if weight > room or not room:
+                    weight = min(weight, rest_of_peer[peer], rest_of_batch)
+                if weight > rest_of_batch or not rest_of_batch:
                     return batch
-                batch.append(self._part(waiting, weight))
-                shares[peer] -= weight
-                room -= weight
+                batch.append(self._take_part(waiting, weight))
+                rest_of_peer[peer] -= weight
+                rest_of_batch -= weight
                 self._queue.end_turn(peer)
                 if waiting.taken == waiting.weight:
                     self._queue.pop(peer)
         return batch
 
-    def _turns(self, shares: Mapping[Peer, int]) -> list[Peer]:
-        """Peers that have items and a rest of their share, in the order of their turns."""
-        return [peer for peer in self._queue.in_turn() if shares[peer] > 0]
+    def _turns(self, rest_of_peer: Mapping[Peer, int]) -> list[Peer]:
+        """Peers with a queued item that may still add weight to the batch, in the order of their
+        turns.
+        """
+        return [peer for peer in self._queue.in_turn() if rest_of_peer[peer] > 0]
 
-    def _part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
-        """Takes a part of this weight from an item."""
+    def _take_part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
+        """Takes the next part of this weight from an item."""
         first = waiting.taken
         waiting.taken += weight
-        if weight < waiting.weight and self._parts is not None:
-            return _Part(waiting, self._parts.cut(waiting.item, first, waiting.taken))
+        if weight < waiting.weight and self._splitting is not None:
+            return _Part(waiting, self._splitting.cut(waiting.item, first, waiting.taken))
         return _Part(waiting, waiting.item)
 
     def _fail(self, waiting: _Waiting[T, R], error: Exception) -> None:
@@ -315,10 +337,27 @@ class Batcher(Generic[T, R]):
         _resolve(waiting.future, error)
 
 
-def _late(queued: float) -> LateError:
-    """Error of an item that was queued for some seconds, beyond its deadline."""
+def _join_results(splitting: Splitting[T, R], waiting: _Waiting[T, R]) -> R | Exception:
+    """Joins the results of an item's parts, or runs it again if they do not match and its deadline
+    has not passed; returns errors.
+    """
+    try:
+        joined = splitting.join(waiting.results)
+        if joined is not None:
+            return joined
+        now = time.monotonic()
+        queue_s = now - waiting.arrival
+        if waiting.deadline < now:
+            return _late(queue_s)
+        return splitting.run_again(waiting.item, queue_s)
+    except Exception as error:
+        return error
+
+
+def _late(queue_s: float) -> LateError:
+    """Error of an item whose deadline passed in the queue, where it was for `queue_s` seconds."""
     return LateError(
-        f"Too late: the query was queued for {1e3 * queued:.0f} ms, beyond its deadline."
+        f"Too late: the query was queued for {1e3 * queue_s:.0f} ms, beyond its deadline."
     )
 
 

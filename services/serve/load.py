@@ -18,7 +18,7 @@ from congrasp.services.ops.lifetime import Child, command, end_all
 
 
 @contextlib.contextmanager
-def serving(
+def serve_policy(
     policy: pathlib.Path, log: pathlib.Path, certs: pathlib.Path | None = None
 ) -> Iterator[tuple[str, int]]:
     """Context with a server of a policy file on this machine: yields its endpoint and process id.
@@ -58,7 +58,7 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     """Returns the initial state of an episode with a procedural object and one of its headings."""
     import jax
 
-    from congrasp.actors.initial import initial_hand
+    from congrasp.actors.initial_hand import initial_hand
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.objects.pool import scale_objects
@@ -128,8 +128,8 @@ class Load(NamedTuple):
 class _Outcomes(NamedTuple):
     """Results of one client's queries."""
 
-    times: list[float]
-    """Round trips of the answers, ms."""
+    round_trips_ms: list[float]
+    """Round trips of the answers."""
     failed: int
     overloaded: int
 
@@ -144,8 +144,8 @@ def measure(target: Target, episode: Example, load: Load) -> dict[str, float]:
         concurrent.futures.ThreadPoolExecutor(load.concurrency) as pool,
     ):
 
-        def connected(_: int) -> PolicyClient:
-            """Client with its first answer."""
+        def connect(_: int) -> PolicyClient:
+            """Returns a client that has had its first answer."""
             client = PolicyClient(
                 target.connect,
                 target.name,
@@ -158,25 +158,25 @@ def measure(target: Target, episode: Example, load: Load) -> dict[str, float]:
             client.act(episode.state)
             return client
 
-        clients = list(pool.map(connected, range(load.concurrency)))
+        clients = list(pool.map(connect, range(load.concurrency)))
         began = time.perf_counter()
 
-        def outcomes(index: int, client: PolicyClient) -> _Outcomes:
-            """Results of a client, which sends its share of the queries."""
+        def query(index: int, client: PolicyClient) -> _Outcomes:
+            """Sends a client's share of the queries; returns their outcomes."""
             return _query_repeatedly(client, index, episode, load, began)
 
-        results = list(pool.map(outcomes, range(load.concurrency), clients))
+        results = list(pool.map(query, range(load.concurrency), clients))
         duration = time.perf_counter() - began
-    times = np.concatenate([np.array(result.times) for result in results])
+    round_trips_ms = np.concatenate([np.array(result.round_trips_ms) for result in results])
     p50 = float("nan")
     p99 = float("nan")
-    if len(times):
-        p50 = float(np.percentile(times, 50))
-        p99 = float(np.percentile(times, 99))
+    if len(round_trips_ms):
+        p50 = float(np.percentile(round_trips_ms, 50))
+        p99 = float(np.percentile(round_trips_ms, 99))
     return {
         "p50_ms": p50,
         "p99_ms": p99,
-        "answers_per_s": load.states * len(times) / duration,
+        "answers_per_s": load.states * len(round_trips_ms) / duration,
         "failed": sum(result.failed for result in results),
         "overloaded": sum(result.overloaded for result in results),
     }
@@ -194,7 +194,7 @@ def _query_repeatedly(
       load: all queries.
       began: start of the measurement (`time.perf_counter`).
     """
-    times: list[float] = []
+    round_trips_ms: list[float] = []
     failed = 0
     overloaded = 0
     for number in range(max(1, load.repeat // load.concurrency)):
@@ -206,12 +206,12 @@ def _query_repeatedly(
                 answer = client.act(episode.state)
             else:
                 answer = client.act_each([episode.state] * load.states)[0]
-            times.append(answer.round_trip_ms)
+            round_trips_ms.append(answer.round_trip_ms)
         except OverloadedError:
             overloaded += 1
         except TransportError:
             failed += 1
-    return _Outcomes(times, failed, overloaded)
+    return _Outcomes(round_trips_ms, failed, overloaded)
 
 
 def one_answer(policy: Policy, episode: Example) -> str:

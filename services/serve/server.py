@@ -1,9 +1,8 @@
-"""The live policy server: follows a run or a policy file, and answers queries on `policy/act` and
-`policy/health`.
+"""The live policy server: answers queries on `policy/act` and `policy/health` with the newest
+policy of a source (`sources`).
 """
 
 import functools
-import pathlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -20,49 +19,51 @@ from congrasp.common.errors import (
     TransportError,
 )
 from congrasp.common.hands import get_hand
-from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, content_hash
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.senders import sender
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
-from congrasp.services.serve.batching import Batcher, Parts
+from congrasp.services.serve.batching import Batcher, Splitting
 from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
 from congrasp.services.serve.requests import Query
+from congrasp.services.serve.sources import Source
 
-Source = Callable[[int], PolicyBundle | None]
-"""(current version, -1 for none) -> a newer bundle, or None."""
-WINDOW = 0.001
-"""Longest time that a query waits for others to join its batch, s."""
-DEPTH = 64
-"""Limit of queued queries: in excess of it, the client with the most loses its newest."""
-SHARE = 16
+QUEUE_LIMIT = 64
+"""Limit of queued queries. When it is exceeded, the client with the most queued queries loses its
+newest (`FairQueue`)."""
+PEER_LIMIT = 16
 """Limit of queued queries of one peer."""
-SHARED = BATCH_SIZES[1:]
-"""Limits of a batch's states while several peers share it, by their number."""
-_TIMEOUT_S = 1.0
-"""Deadline of a query by default."""
+_BATCH_WINDOW_S = 0.001
+"""Longest time that a query waits for others to join its batch."""
+_SHARED_BATCH_LIMITS = BATCH_SIZES[1:]
+"""Limits of a batch's states while several peers send queries (`Splitting.weight_limits`)."""
+_DEFAULT_TIMEOUT_S = 1.0
+"""Deadline of a query that states none."""
 _MAX_TIMEOUT_S = 60.0
-FOLLOW_SECONDS = 0.5
-"""Time between two requests for newer weights."""
+FOLLOW_PERIOD_S = 0.5
+"""Time between two checks for a newer policy."""
 
 
-class _Held(NamedTuple):
+class _ServedPolicy(NamedTuple):
     """A policy in use."""
 
     bundle: PolicyBundle
-    hash: str
+    digest: str
+    """Hash of the bundle's content."""
     inference_parameters: InferenceParameters
 
 
 class Answer(NamedTuple):
-    """An answer with its policy and times."""
+    """Result of a query, the policy that computed it, and times."""
 
     inference: Inference
-    policy: _Held
+    policy: _ServedPolicy
     queue_s: float
+    """Time from the query's arrival to the start of its inference."""
     infer_s: float
+    """Duration of the inference of its batch, or the sum over its parts' batches."""
 
 
 class PolicyServer:
@@ -83,9 +84,10 @@ class PolicyServer:
           transport: endpoint of the server.
           run: name of the served run.
           source: source of policies.
-          on_answer: called with the outcome of every query (answered, refused, overloaded, late),
-            and its duration.
-          on_batch: called with the number of states of every batch.
+          on_answer: called with the outcome (answered, refused, overloaded, late) of every query
+            that the transport hands over, and its duration in seconds.
+          on_batch: called with the number of states of every batch. A query whose parts are
+            inferred again, since the policy was swapped between them, does not count twice.
 
         Raises:
           CongraspError: there is no policy yet, or the name is not valid.
@@ -101,62 +103,72 @@ class PolicyServer:
         self._on_answer = on_answer
         self._on_batch = on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
-        self._held = _hold(first)
-        self._seconds: dict[int, float] = {}
+        self._served = _prepare(first)
+        self._batch_seconds: dict[int, float] = {}
         self._answered = 0
-        self._trouble = ""
+        self._answered_lock = threading.Lock()
+        self._rejection = ""  # why the newest policy was rejected; empty after a swap
+        self._source_failure = ""  # why the source failed the last time; empty if it did not
         self._closed = threading.Event()
         self._ready = threading.Event()
-        self._began = time.monotonic()
+        self._start_time = time.monotonic()
+        self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._batcher: Batcher[Query, Answer] = Batcher(
-            self._infer,
+            self._run_batch,
             weigh=lambda query: len(query.vectors),
             size=BATCH_SIZES[-1],
-            window=WINDOW,
-            depth=DEPTH,
-            share=SHARE,
-            parts=Parts(SHARED, _cut, self._join),
+            window=_BATCH_WINDOW_S,
+            depth=QUEUE_LIMIT,
+            peer_limit=PEER_LIMIT,
+            splitting=Splitting(_SHARED_BATCH_LIMITS, _cut, join_parts, self._infer_again),
         )
+        try:
+            self._start(transport, keys)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, transport: Transport, keys: Keys) -> None:
+        """Registers the handlers, compiles, and follows the source from then on."""
         transport.serve(keys.health, self._describe)
-        # One may infer while the other receives
         transport.serve(
             below(keys.act),
             self._act,
-            workers=2,
-            depth=DEPTH,
-            admission=self._reject,
+            workers=2,  # one may infer while the other receives
+            depth=QUEUE_LIMIT,
+            admission=self._admit,
             fair=True,
         )
-        self._seconds = self._function.warm_up(self._held.inference_parameters)
+        self._batch_seconds = self._function.warm_up(self._served.inference_parameters)
         self._ready.set()
-        self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
 
     def health(self) -> dict[str, Any]:
-        """Readiness, version, hand, queue, and the reason why a newer policy was rejected
-        (`trouble`), as JSON.
+        """Readiness, version, hand, queue, and the reason why a newer policy was rejected or cannot
+        be read (`trouble`), as JSON.
 
         `queue_limit` and `peer_limit` bound the queued queries of all peers and of one.
-        `states_per_second` is the highest throughput, measured at the start. While the server
-        compiles, it is not ready, and `state` tells for how long.
+        `states_per_second` is the highest throughput, measured at the start. Until the server has
+        compiled, it is not ready, and `state` describes it.
         """
-        if not self._ready.is_set():
-            return {"ready": False, "state": f"compiling, {time.monotonic() - self._began:.0f} s"}
-        held = self._held
-        rates = [size / seconds for size, seconds in self._seconds.items()]
+        not_ready = self._not_ready_state()
+        if not_ready:
+            return {"ready": False, "state": not_ready}
+        served = self._served
+        rates = [states / seconds for states, seconds in self._batch_seconds.items()]
         return {
             "ready": True,
-            "version": held.bundle.version,
-            "hash": held.hash,
-            "hand": held.bundle.spec.hand_name,
-            "surface_points": held.bundle.task.surface_points,
-            "trajectory_points": held.bundle.task.trajectory_points,
+            "version": served.bundle.version,
+            "hash": served.digest,
+            "hand": served.bundle.spec.hand_name,
+            "surface_points": served.bundle.task.surface_points,
+            "trajectory_points": served.bundle.task.trajectory_points,
             "queue": len(self._batcher),
-            "queue_limit": DEPTH,
-            "peer_limit": SHARE,
+            "queue_limit": QUEUE_LIMIT,
+            "peer_limit": PEER_LIMIT,
             "states_per_second": round(max(rates)),
             "answered": self._answered,
-            "trouble": self._trouble,
+            "trouble": self._source_failure or self._rejection,
         }
 
     def _describe(self, key: str, request: Message) -> Message:
@@ -166,97 +178,143 @@ class PolicyServer:
         self._check_ready()
         return Message({}, self._function.metadata())
 
+    def _not_ready_state(self) -> str:
+        """State of a server that cannot answer queries yet; empty once it can."""
+        if self._ready.is_set():
+            return ""
+        if self._closed.is_set():
+            return "closed"
+        return f"compiling, {time.monotonic() - self._start_time:.0f} s"
+
     def _check_ready(self) -> None:
-        """Raises a `StartingError` until all programs are compiled."""
-        if not self._ready.is_set():
-            raise StartingError(f"The policy server is {self.health()['state']}.", "Wait for it.")
+        """Raises a `StartingError` until all programs are compiled.
+
+        Raises:
+          CongraspError: compiling failed, so that the server will not become ready.
+        """
+        not_ready = self._not_ready_state()
+        if not not_ready:
+            return
+        if self._closed.is_set():
+            raise CongraspError("The policy server is closed.", "Start it again.")
+        raise StartingError(f"The policy server is {not_ready}.", "Wait for it.")
 
     def close(self) -> None:
         """Refuses queued queries, and stops following."""
         self._closed.set()
         self._batcher.close()
-        self._follower.join(2 * FOLLOW_SECONDS)
+        if self._follower.is_alive():
+            self._follower.join(2 * FOLLOW_PERIOD_S)
 
-    def _reject(self, key: str) -> None:
-        """Refuses a query for which the queue has no room, before decoding it."""
-        began = time.monotonic()
-        self._check_ready()
+    def _admit(self, key: str) -> None:
+        """Refuses a query before it is decoded, if the server compiles or has no room for it."""
+        arrival = time.monotonic()
         try:
+            self._check_ready()
             self._batcher.check_room(sender(key))
         except CongraspError as error:
-            self._count(error, began)
+            self._count(error, arrival)
             raise
 
     def _act(self, key: str, request: Message) -> "Future[Message]":
         """Queues a query; returns a future of the reply."""
-        began = time.monotonic()
+        arrival = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            timeout = checked_timeout(request.meta.get("timeout", _TIMEOUT_S))
-            future = self._batcher.submit(query, timeout, peer=sender(key))
+            timeout_s = parse_timeout(request.meta.get("timeout", _DEFAULT_TIMEOUT_S))
+            answer = self._batcher.submit(query, timeout_s, peer=sender(key))
         except CongraspError as error:
-            self._count(error, began)
+            self._count(error, arrival)
             raise
-        answer: Future[Message] = Future()
-        future.add_done_callback(functools.partial(self._finish, began, answer))
-        return answer
+        reply: Future[Message] = Future()
+        answer.add_done_callback(functools.partial(self._resolve, arrival, reply))
+        return reply
 
-    def _finish(self, began: float, answer: "Future[Message]", done: "Future[Answer]") -> None:
-        """Resolves a query with the outcome of its batch."""
-        error = done.exception()
-        self._count(error, began)
-        if error is None:
-            answer.set_result(_message(done.result(), time.monotonic() - began))
-        else:
-            answer.set_exception(error)
+    def _resolve(self, arrival: float, reply: "Future[Message]", answer: "Future[Answer]") -> None:
+        """Resolves the reply to a query with its answer or error.
 
-    def _count(self, error: BaseException | None, began: float) -> None:
+        An error here becomes the reply: it would otherwise be lost, and the query never answered.
+        """
+        error = answer.exception()
+        try:
+            self._count(error, arrival)
+            if error is None:
+                reply.set_result(_reply(answer.result(), time.monotonic() - arrival))
+        except Exception as failure:
+            error = failure
+        if error is not None:
+            reply.set_exception(error)
+
+    def _count(self, error: BaseException | None, arrival: float) -> None:
         """Counts the outcome of a query."""
         if error is None:
-            self._answered += 1
+            with self._answered_lock:
+                self._answered += 1
             outcome = "answered"
         elif isinstance(error, OverloadedError | LateError):
             outcome = error.code
         else:
             outcome = "refused"
-        self._on_answer(outcome, time.monotonic() - began)
+        self._on_answer(outcome, time.monotonic() - arrival)
 
-    def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[Answer | Exception]:
-        """Answers a batch."""
-        held = self._held
-        began = time.monotonic()
+    def _run_batch(
+        self, queries: Sequence[Query], queue_s: Sequence[float]
+    ) -> list[Answer | Exception]:
+        """Counts and answers a batch of queries that were queued for some seconds."""
         self._on_batch(sum(len(query.vectors) for query in queries))
-        replies = self._function(held.inference_parameters, queries)
-        infer_s = time.monotonic() - began
+        return self._infer(queries, queue_s)
+
+    def _infer_again(self, query: Query, queue_s: float) -> Answer | Exception:
+        """Answers a query whose parts were answered by different policies."""
+        (answer,) = self._infer([query], [queue_s])
+        return answer
+
+    def _infer(
+        self, queries: Sequence[Query], queue_s: Sequence[float]
+    ) -> list[Answer | Exception]:
+        """Answers queries that were queued for some seconds."""
+        served = self._served
+        start = time.monotonic()
+        inferences = self._function(served.inference_parameters, queries)
+        infer_s = time.monotonic() - start
         answers: list[Answer | Exception] = []
-        for reply, queue_s in zip(replies, queued, strict=True):
-            if isinstance(reply, Exception):
-                answers.append(reply)
+        for inference, queue_s_of_query in zip(inferences, queue_s, strict=True):
+            if isinstance(inference, Exception):
+                answers.append(inference)
             else:
-                answers.append(Answer(reply, held, queue_s, infer_s))
+                answers.append(Answer(inference, served, queue_s_of_query, infer_s))
         return answers
 
-    def _join(self, query: Query, answers: list[Answer]) -> Answer | Exception:
-        """Joins the parts of a query; repeats it if the policy was swapped, so that one policy
-        answers all.
-        """
-        return join_parts(answers, lambda: self._infer([query], [answers[0].queue_s])[0])
-
     def _follow(self) -> None:
-        """Swaps in newer policies; one that does not match is refused, and the current one
-        stays.
+        """Swaps in newer policies until the server is closed; runs in a thread.
+
+        Whatever fails, the current policy stays in use and the server tries again.
         """
-        while not self._closed.wait(FOLLOW_SECONDS):
+        while not self._closed.wait(FOLLOW_PERIOD_S):
             try:
-                newer = self._source(self._held.bundle.version)
-                if newer is not None:
-                    self._swap(newer)
+                newer = self._source(self._served.bundle.version)
             except TransportError:
                 continue  # the learner is disconnected and may return
             except CongraspError as error:
-                if str(error) != self._trouble:
-                    log("warning", str(error))
-                self._trouble = str(error)
+                self._source_failure = _warn_if_new(str(error), self._source_failure)
+                continue
+            except Exception as error:
+                failure = f"A newer policy could not be read: {type(error).__name__}: {error}."
+                self._source_failure = _warn_if_new(failure, self._source_failure)
+                continue
+            self._source_failure = ""
+            if newer is not None:
+                self._try_swap(newer)
+
+    def _try_swap(self, newer: PolicyBundle) -> None:
+        """Serves a newer policy, or notes why it is rejected."""
+        try:
+            self._swap(newer)
+        except CongraspError as error:
+            self._rejection = _warn_if_new(str(error), self._rejection)
+        except Exception as error:
+            rejection = f"A newer policy could not be served: {type(error).__name__}: {error}."
+            self._rejection = _warn_if_new(rejection, self._rejection)
 
     def _swap(self, newer: PolicyBundle) -> None:
         """Serves a newer policy.
@@ -264,23 +322,31 @@ class PolicyServer:
         Raises:
           CongraspError: it has another hand, task or network than the served policy.
         """
-        old = self._held.bundle
+        old = self._served.bundle
         old.spec.require(newer.spec, "that should replace the served one")
         if newer.task != old.task:
             raise CongraspError(
                 "The newer policy was trained on another task.", "Restart the server to serve it."
             )
-        self._held = _hold(newer)
-        self._trouble = ""
+        self._served = _prepare(newer)
+        self._rejection = ""
 
 
-def checked_timeout(seconds: Any) -> float:
-    """Returns the deadline of a query in seconds.
+def _warn_if_new(trouble: str, earlier: str) -> str:
+    """Logs a warning unless it repeats the earlier one; returns it."""
+    if trouble != earlier:
+        log("warning", trouble)
+    return trouble
+
+
+def parse_timeout(seconds: Any) -> float:
+    """Returns a query's timeout in seconds.
 
     Raises:
-      CongraspError: it is not a number above 0 and at most 60.
+      CongraspError: it is not a number, or out of range.
     """
-    if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT_S:
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not is_number or not 0.0 < seconds <= _MAX_TIMEOUT_S:
         raise CongraspError(
             f"The query's 'timeout' is {ascii(seconds)[:40]}.",
             f"It must be seconds, at most {_MAX_TIMEOUT_S:g}.",
@@ -288,80 +354,43 @@ def checked_timeout(seconds: Any) -> float:
     return float(seconds)
 
 
-def join_parts(
-    answers: Sequence[Answer], repeat: Callable[[], Answer | Exception]
-) -> Answer | Exception:
-    """Joins the answers to the parts of a query, in their order.
+def _reply(answer: Answer, total_s: float) -> Message:
+    """Returns the reply to a query: targets, version, times."""
+    return answer.inference.reply(
+        {
+            "version": answer.policy.bundle.version,
+            "hash": answer.policy.digest,
+            "queue_ms": _milliseconds(answer.queue_s),
+            "infer_ms": _milliseconds(answer.infer_s),
+            "total_ms": _milliseconds(total_s),
+        }
+    )
 
-    Args:
-      answers: answers to the parts.
-      repeat: answers the whole query again, for parts that several policies answered.
-    """
+
+def _milliseconds(seconds: float) -> float:
+    """Returns a duration in milliseconds, to the microsecond."""
+    return round(1e3 * seconds, 3)
+
+
+def _cut(query: Query, first: int, end: int) -> Query:
+    """Returns the query of some of its states."""
+    return query._replace(vectors=query.vectors[first:end])
+
+
+def join_parts(answers: list[Answer]) -> Answer | None:
+    """Joins the answers to the parts of a query; None if several policies answered them."""
     first = answers[0]
-    last = answers[-1]
-    if any(answer.policy is not last.policy for answer in answers):
-        return repeat()
+    if any(answer.policy is not first.policy for answer in answers):
+        return None
     vectors = np.concatenate([answer.inference.vectors for answer in answers])
     active: list[list[str]] = []
     for answer in answers:
         active += answer.inference.active
     infer_s = sum(answer.infer_s for answer in answers)
-    return Answer(Inference(vectors, active), last.policy, first.queue_s, infer_s)
+    return Answer(Inference(vectors, active), first.policy, first.queue_s, infer_s)
 
 
-def _message(answer: Answer, seconds: float) -> Message:
-    """Returns the reply: targets, version, times."""
-    bundle = answer.policy.bundle
-    times = {
-        "queue_ms": answer.queue_s,
-        "infer_ms": answer.infer_s,
-        "total_ms": seconds,
-    }
-    meta: dict[str, Any] = {"version": bundle.version, "hash": answer.policy.hash}
-    for name, duration in times.items():
-        meta[name] = round(1e3 * duration, 3)
-    return answer.inference.reply(meta)
-
-
-def _cut(query: Query, first: int, end: int) -> Query:
-    """Returns some states of a query."""
-    return query._replace(vectors=query.vectors[first:end])
-
-
-def _hold(bundle: PolicyBundle) -> _Held:
+def _prepare(bundle: PolicyBundle) -> _ServedPolicy:
     """Prepares a policy for use."""
-    return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.inference_parameters)
-
-
-def follow_file(path: pathlib.Path) -> Source:
-    """Returns a source that rereads a policy file whenever it changes."""
-    loaded_at: float | None = None
-    """Time of the file's last change when it was read."""
-
-    def read(version: int) -> PolicyBundle | None:
-        nonlocal loaded_at
-        try:
-            changed = path.stat().st_mtime
-        except OSError:
-            raise CongraspError(
-                f"The policy {path} cannot be read.", "Pass a file created by 'congrasp train'."
-            ) from None
-        if version >= 0 and loaded_at == changed:
-            return None
-        loaded_at = changed
-        return bundles.load(path)
-
-    return read
-
-
-def follow_run(transport: Transport, run: str, name: str) -> Source:
-    """Returns a source that pulls the newest policy from a learner, under the server's name on the
-    wire.
-    """
-    key = Keys(run).weights_for("server", name)
-
-    def pull(version: int) -> PolicyBundle | None:
-        reply = transport.query(key, Message({}, {"newer_than": version}), timeout=5.0)
-        return PolicyBundle.from_message(reply, "of the learner") if reply.arrays else None
-
-    return pull
+    digest = content_hash(encode(bundle.to_message()))
+    return _ServedPolicy(bundle, digest, bundle.inference_parameters)

@@ -30,7 +30,7 @@ _MAX_BYTES = 128 << 20
 """Bytes of the largest request body, an uploaded mesh."""
 _BODY_TYPES = ("application/json", "application/octet-stream")
 """Types of a request's body; a form of another site cannot send them."""
-_SILENCE_S = 30.0
+SILENCE_S = 30.0
 """Time between two chunks of a body."""
 _TOKEN = re.compile("[0-9a-f]{32}")
 
@@ -151,7 +151,7 @@ async def _body(request: Request) -> bytes:
     chunks: list[bytes] = []
     while True:
         try:
-            async with asyncio.timeout(_SILENCE_S):
+            async with asyncio.timeout(SILENCE_S):
                 chunk = await anext(stream, b"")
         except (TimeoutError, ClientDisconnect):
             raise HTTPException(408, "The request is not complete.") from None

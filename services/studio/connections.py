@@ -15,7 +15,7 @@ from congrasp.common.transport.places import Place, Places
 
 TIMEOUT_S = 30.0
 """Time in which a request's head must arrive, and an answer must be read."""
-_REST_S = 1.0
+REST_S = 1.0
 """Time in which the rest of a body is discarded that was answered without it, so that the client
 reads the answer before the close.
 """
@@ -78,7 +78,7 @@ class Connection(H11Protocol):
             return
         seconds = TIMEOUT_S
         if self.conn.their_state is h11.SEND_BODY:
-            seconds = _REST_S
+            seconds = REST_S
         self._await_head(seconds)
 
     def pause_writing(self) -> None:

@@ -12,8 +12,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import INWARD
-from congrasp.services.appearance.subdivision import finer
-from congrasp.services.appearance.surface_colours import painted
+from congrasp.services.appearance.subdivision import subdivide
+from congrasp.services.appearance.surface_colours import paint_surface
 
 LARGEST = 1e6
 """Bound on each number of a position (m) or direction from a page; its square is finite in single
@@ -137,11 +137,11 @@ class Canvas:
         self._obj = obj
         self.colours: np.ndarray | None = None
         if obj.colours:
-            self.vertices, self.faces, self.colours = painted(
+            self.vertices, self.faces, self.colours = paint_surface(
                 obj.visual_vertices, obj.visual_faces, obj.colours
             )
         else:
-            self.vertices, self.faces = finer(obj.visual_vertices, obj.visual_faces)
+            self.vertices, self.faces = subdivide(obj.visual_vertices, obj.visual_faces)
         self._set(np.zeros(len(obj.points), bool), np.zeros(len(self.vertices), bool))
 
     @property

@@ -30,7 +30,7 @@ from congrasp.services.evaluate.pictures import cause
 from congrasp.services.grasp.approaches import repeated, surface_of
 from congrasp.services.grasp.costs import costs
 from congrasp.services.grasp.reach import with_planned_reach
-from congrasp.services.serve.server import Source, follow_file, follow_run
+from congrasp.services.serve.sources import Source, follow_file, follow_run
 from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.initial import initial_hand
+from congrasp.actors.initial_hand import initial_hand
 from congrasp.common.episode.episode import Episode
 from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.errors import CongraspError
@@ -29,7 +29,7 @@ from congrasp.common.task.constraints.specs import ErrorSpec
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.appearance.surface_colours import painted
+from congrasp.services.appearance.surface_colours import paint_surface
 from congrasp.services.export.formats import FORMATS, export_motions
 from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.episode_file import save_episode
@@ -285,7 +285,7 @@ def _coloured_mesh(episode: Episode) -> dict[str, np.ndarray]:
     """The object's mesh with colours, if it has some."""
     if episode.colours is None:
         return {}
-    vertices, faces, vertex_colours = painted(
+    vertices, faces, vertex_colours = paint_surface(
         episode.object_vertices, episode.object_faces, episode.colours
     )
     return {"visual_vertices": vertices, "visual_faces": faces, "visual_colours": vertex_colours}

@@ -13,7 +13,7 @@ from congrasp.services.studio.application import page_application
 from congrasp.services.studio.connections import TIMEOUT_S, ConnectionConfig
 from congrasp.services.studio.routes import Routes
 
-_CONNECTIONS = 256  # at a time, shared by addresses; a browser opens six
+MAX_CONNECTIONS = 256  # at a time, shared by addresses; a browser opens six
 _HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
@@ -59,7 +59,7 @@ class PageServer:
         """URL of the page for a browser on this machine."""
         config = ConnectionConfig(
             page_application(routes, access, self.port),
-            Places(_CONNECTIONS),
+            Places(MAX_CONNECTIONS),
             loop="asyncio",
             ws="none",
             log_config=None,

@@ -40,7 +40,7 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.ops.lifetime import Stop, on_signal
 from congrasp.services.ops.logs import Watch
-from congrasp.services.serve.load import example_episode, one_answer, serving
+from congrasp.services.serve.load import example_episode, one_answer, serve_policy
 from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import InnerActor, Monitoring, learn
 from congrasp.services.train.presets import FULL, easier
@@ -368,7 +368,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
         policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False
     )
     # The server starts while the episodes run.
-    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
+    with serve_policy(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         (result,) = heading.run([Variation()], keep=True)
         from congrasp.services.viz.render import episode_sheet  # seconds, for the end of a run
         from congrasp.services.viz.sheets import save_png

@@ -27,7 +27,7 @@ from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import Notify, Outputs, run_learner
 from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
-from congrasp.services.ops.lifetime import GRACE
+from congrasp.services.ops.lifetime import GRACE_S
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.status import ask
@@ -45,7 +45,7 @@ class InnerActor(NamedTuple):
 
     physics: PhysicsName
     """Its engine."""
-    end_timeout: float = GRACE
+    end_timeout: float = GRACE_S
     """Deadline for its end, s."""
 
 
@@ -104,7 +104,7 @@ def learn(
             metrics.update(values)
             monitoring.on_update(values)
 
-        stack.enter_context(monitoring.watch.exposed(metrics))
+        stack.enter_context(monitoring.watch.serve_metrics(metrics))
         if inside is not None:
             name = f"actor-{rank}"
             stack.enter_context(_actor_thread(memory_url, config, run_dir, name, inside, stop))

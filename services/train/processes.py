@@ -16,7 +16,7 @@ from congrasp.common.transport.base import Subscription, Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import reachable_url
 from congrasp.learner.run_directory import LOGS
-from congrasp.services.ops.lifetime import CHILD_GRACE, Child, command, end_all, wait_for
+from congrasp.services.ops.lifetime import CHILD_GRACE_S, Child, command, end_all, wait_for
 from congrasp.services.train.launch import LaunchRecord, Plan, write_launch
 
 MAX_RESTARTS = 5
@@ -227,7 +227,7 @@ def _restart_learners(
 ) -> None:
     """Restarts all ranks after one died; the others notice and end, or are terminated."""
     first = next(child for child in learners if child.code)
-    wait_for([child.process for child in learners if child.process], CHILD_GRACE)
+    wait_for([child.process for child in learners if child.process], CHILD_GRACE_S)
     # A rank that lost another one reports no more than that.
     failed = [child for child in learners if child.code and child.code != TransportError.exit_code]
     dead = failed or [first]

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
-from congrasp.services.appearance.palette import MATERIALS as MATERIAL_COLOURS
-from congrasp.services.appearance.palette import SKIN, Colour
+from congrasp.services.appearance.palette import MATERIAL_COLOURS, ROBOT_LINK, Colour
 from congrasp.services.viz.shapes import Shape, between
 
 _SKIN_SHINE = 0.12
@@ -21,7 +20,7 @@ _STILL_M = 1e-3
 class Look(NamedTuple):
     """Look of a hand."""
 
-    tint: Colour = SKIN
+    tint: Colour = ROBOT_LINK
     """A colour to blend with that of the hand."""
     shares: Sequence[float] | np.ndarray | None = None
     """(L,) shares of that colour on each link; zero by default."""
@@ -53,7 +52,7 @@ def skin_shape(
     return Shape(
         "mesh",
         (0, 0),
-        SKIN,
+        ROBOT_LINK,
         alpha=look.alpha,
         shine=_SKIN_SHINE,
         vertices=points,
@@ -78,7 +77,7 @@ def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> 
         turn = Rotation.from_quat(quaternion[i], scalar_first=True)
         for capsule, ends in zip(link.capsules, capsule_ends(link), strict=True):
             start, end = turn.apply(ends) + position[i]
-            shapes.append(between(start, end, capsule.radius, SKIN))
+            shapes.append(between(start, end, capsule.radius, ROBOT_LINK))
     return shapes
 
 

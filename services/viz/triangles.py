@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.objects.spec import Colours
 from congrasp.common.runtime.lazy_trimesh import trimesh
-from congrasp.services.appearance.subdivision import bisected
+from congrasp.services.appearance.subdivision import bisect_longest
 from congrasp.services.viz.kernels import NOTHING, linear
 from congrasp.services.viz.shapes import Shape
 from congrasp.services.viz.texture import NO_TEXTURE, Texture, joined_textures, texture_of
@@ -330,4 +330,4 @@ def _cut_values(values: np.ndarray) -> np.ndarray:
     second = values[:, 2, :3] - values[:, 0, :3]
     area = np.linalg.norm(np.cross(first, second), axis=-1).sum() / 2
     longest = max(_LONGEST_SIDE_M, 3 * float(np.sqrt(area / _MOST_TRIANGLES)))
-    return bisected(values, longest)
+    return bisect_longest(values, longest)

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.initial import InitialConditions, initial_hand, sample
+from congrasp.actors.draws import sample
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.initial_hand import initial_hand
 from congrasp.common.hands.kinematics import hand_center, keypoints, link_transforms
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import optional

@@ -28,7 +28,7 @@ from congrasp.common.task.types import Surface
 from tests import task as suite
 from tests.task import BATCH, HAND, OBJECTS, TASK, warp_engine
 
-WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
+WITHOUT_MESHES = set(protocols.ASSESSED_NAMES) - {"hand_mesh_mm"}
 """What is measured of a hand whose file has no visual meshes."""
 NEVER = 10_000
 """Control steps after which no test goes on."""
@@ -72,12 +72,15 @@ def test_every_lift_is_smooth_and_ends_where_it_should(height):
     lift = frames(height)
     assert lift.height[-1] == pytest.approx(height, abs=1e-5)
     assert abs(lift.speed[-1]) < 1e-4
-    assert lift.speed.max() <= protocols.LIFT_SPEED + 1e-5
+    assert lift.speed.max() <= protocols.LIFT_SPEED_M_S + 1e-5
     assert (np.diff(lift.height) > -1e-6).all()
-    assert np.abs(np.diff(lift.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+    assert (
+        np.abs(np.diff(lift.speed)).max()
+        <= protocols.LIFT_ACCELERATION_M_S2 * TASK.control_dt + 1e-4
+    )
     way = 0.5 * TASK.control_dt * (lift.speed[1:] + lift.speed[:-1])
     # Where the speed has a kink within a step, the trapezoid is off by a dt^2 / 8 at most.
-    kink = protocols.LIFT_ACCELERATION * TASK.control_dt**2 / 8
+    kink = protocols.LIFT_ACCELERATION_M_S2 * TASK.control_dt**2 / 8
     np.testing.assert_allclose(np.diff(lift.height), way, atol=kink + 1e-6)
 
 
@@ -265,7 +268,7 @@ def test_pushes_reach_the_object_through_the_environment():
 
 
 def test_steps_after_the_hold_change_no_metric(monkeypatch):
-    monkeypatch.setattr(protocols, "PUSH_SECONDS", 0.05)
+    monkeypatch.setattr(protocols, "PUSH_S", 0.05)
     steps = TASK.approach_steps + TASK.hold_steps
     after = protocols.stress_steps(TASK)
     plain = suite.worker(renewed=False)
@@ -338,9 +341,9 @@ def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
     survival = protocols.survival(*path(**moves), np.array([True]), TASK)
-    assert tuple(survival[name][0] for name in protocols.SURVIVAL) == survived
+    assert tuple(survival[name][0] for name in protocols.SURVIVAL_NAMES) == survived
     lost = protocols.survival(*path(**moves), np.array([False]), TASK)
-    assert not any(lost[name][0] for name in protocols.SURVIVAL)
+    assert not any(lost[name][0] for name in protocols.SURVIVAL_NAMES)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.client.episode_policy import EpisodePolicy
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.serve.load import Example, example_episode, serving
+from congrasp.services.serve.load import Example, example_episode, serve_policy
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 from tests.benchmarks.attackers import attacked
@@ -103,8 +103,8 @@ def _servers(
     policy = folder / "policy.safetensors"
     bundles.save(untrained(get_preset("quickstart")), policy)
     with (
-        serving(policy, folder / "other.log") as (other, _),
-        serving(policy, folder / "serve.log") as (endpoint, process),
+        serve_policy(policy, folder / "other.log") as (other, _),
+        serve_policy(policy, folder / "serve.log") as (endpoint, process),
     ):
         episode = example_episode(1_000_000)
         with PolicyClient(other, wait=_START) as client:

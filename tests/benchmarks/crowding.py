@@ -20,7 +20,7 @@ from congrasp.common.errors import OverloadedError, TransportError
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.certificates import create_authority, issue
-from congrasp.services.serve.load import Example, example_episode, serving
+from congrasp.services.serve.load import Example, example_episode, serve_policy
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 from tests.benchmarks.attacks import single_query
@@ -187,7 +187,7 @@ def _setting(folder: pathlib.Path, has_certificates: bool) -> Iterator[_Setting]
     episode = example_episode(1_000_000)
     with contextlib.ExitStack() as stack:
         ends = [
-            stack.enter_context(serving(policy, folder / f"{name}.log", server))[0]
+            stack.enter_context(serve_policy(policy, folder / f"{name}.log", server))[0]
             for name in ("here", "elsewhere")
         ]
         clients = []

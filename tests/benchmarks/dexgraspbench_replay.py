@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import EnvInstance, NativePhysics
-from congrasp.actors.stress import FARTHEST, MOST_TURNED, PUSH_FORCE
+from congrasp.actors.stress import MAX_SHIFT_M, MAX_TURN_RAD, PUSH_FORCE_N
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
@@ -87,7 +87,7 @@ def summary(replays: Sequence[Replayed]) -> str:
         [(one.depth_mm, one.self_mm, one.pushed_mm) for one in replays]
     ).T
     return (
-        f"six pushes of {PUSH_FORCE:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from "
+        f"six pushes of {PUSH_FORCE_N:g} N survive {held:.0f} % from the grasp, {closed:.0f} % from "
         f"the pregrasp; "
         f"at the grasp the hand is {np.median(depth):.1f} mm (median) to {depth.max():.1f} mm "
         f"(most) in the object and "
@@ -188,7 +188,7 @@ def _script(
     """Yields targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state,
     then the pushes.
     """
-    pushes = np.tile(PUSH_FORCE * _AXES, (len(grasps), 1))
+    pushes = np.tile(PUSH_FORCE_N * _AXES, (len(grasps), 1))
     # From the grasp the targets are the squeeze at once.
     shares = np.linspace(0.0, 1.0, _STAGE + 1)[1:] if len(stages) > 2 else np.ones(_STAGE)
     rows = pushes
@@ -223,8 +223,8 @@ def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
     way = np.linalg.norm(np.asarray(state.object_position - origin.object_position), axis=-1)
     cosine = np.abs(np.sum(np.asarray(state.object_quaternion * origin.object_quaternion), -1))
     return (
-        (way < FARTHEST)
-        & (2 * np.arccos(np.minimum(cosine, 1.0)) < MOST_TURNED)
+        (way < MAX_SHIFT_M)
+        & (2 * np.arccos(np.minimum(cosine, 1.0)) < MAX_TURN_RAD)
         & ~np.asarray(state.diverged)
     )
 

@@ -23,7 +23,7 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.sampling.build import build_bank
-from congrasp.services.evaluate.plan import protocol, two_seconds
+from congrasp.services.evaluate.plan import protocol, required_hold_steps
 
 
 def measures(
@@ -46,11 +46,11 @@ def measures(
     """
     console, threads, physics = Console(), threads or cores(), resolve_physics(engine)
     policy = bundles.load(policy_file(None, "human"))
-    task = protocol(policy.task, two_seconds(policy.task))
+    task = protocol(policy.task, required_hold_steps(policy.task))
     hand = get_hand(policy.spec.hand)
     objects = scale_objects(hand, task, load_pool(ObjectsConfig(count=16, seed=HELD_OUT_SEED)))
     bank = build_bank(hand, task, objects, 0)
-    steps = task.approach_steps + two_seconds(task)
+    steps = task.approach_steps + required_hold_steps(task)
     began = time.perf_counter()
     field = jax.block_until_ready(distance_field(objects))
     seconds = time.perf_counter() - began

@@ -20,15 +20,15 @@ from rich.table import Table
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
+from congrasp.services.assets.objects.fidelity import MAX_SURFACE_ERROR_M, MAX_VOLUME_ERROR
 from congrasp.services.assets.objects.meshes import import_source
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import Source, find_sources
 
 _DEFINITION = (
-    f"Within: surface error at most {1000 * MOST_SURFACE:g} mm and volume error at most "
-    f"{MOST_VOLUME:.0%}. s: processor time of the import and its child processes."
+    f"Within: surface error at most {1000 * MAX_SURFACE_ERROR_M:g} mm and volume error at most "
+    f"{MAX_VOLUME_ERROR:.0%}. s: processor time of the import and its child processes."
 )
 
 
@@ -49,8 +49,8 @@ class ShapeErrors:
     @property
     def within(self) -> bool:
         """True if both errors are within the tolerances."""
-        is_volume_close = abs(self.volume_percent or 0.0) <= 100 * MOST_VOLUME
-        return is_volume_close and self.surface_mm <= 1000 * MOST_SURFACE
+        is_volume_close = abs(self.volume_percent or 0.0) <= 100 * MAX_VOLUME_ERROR
+        return is_volume_close and self.surface_mm <= 1000 * MAX_SURFACE_ERROR_M
 
 
 def shapes(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import (
     CLOSURES,
-    WIDEST,
+    WIDEST_GAP_M,
     closure_pose,
     preshape,
     table_of_gaps,
@@ -66,7 +66,7 @@ def test_the_widest_pose_opens_by_a_quarter_and_faces_the_object_as_the_open_one
     frame = grasp_frame(hand)
     assert (np.diff(gaps) < 0).all()
     assert widest_gap(hand) > 1.25 * gaps[CLOSURES.tolist().index(0.0)]
-    assert widest_gap(hand) > 0.9 * WIDEST * hand.object_scale
+    assert widest_gap(hand) > 0.9 * WIDEST_GAP_M * hand.object_scale
     tips = _tips(hand, wide_angles(hand))
     across = tips[1:].mean(0) - tips[0]
     assert across @ frame.cross / np.linalg.norm(across) > np.cos(np.radians(5))

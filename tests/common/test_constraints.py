@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.initial import InitialConditions, sample
+from congrasp.actors.draws import sample
+from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.request import GraspRequest

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import TooWideError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.closure import CENTER, CLOSURES, Outline, depth_below, outline
+from congrasp.common.hands.closure import CENTER_ONLY, CLOSURES, Outline, depth_below, outline
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects.procedural import FAMILIES, GROUPS, generate, generate_many
 from congrasp.common.task.sampling.heading_sampler import HeadingOptions, sample_headings
@@ -357,11 +357,11 @@ def test_distance_back_is_limited():
     """
     both = made(([0, 0, -0.05], DOWN), ([0, 0, -0.06], DOWN))
     point = SimpleNamespace(points=np.zeros((1, 3)))
-    (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER, opposed=False)
+    (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER_ONLY, opposed=False)
     np.testing.assert_array_equal(reachable, [True, False])
     np.testing.assert_allclose(cleared.position[:, 2], [-0.04, -0.06], atol=2e-6)
     deep = Headings(*(part[1:] for part in both))
-    (cleared,), (reachable,) = within_reach(deep, point, FLAT[None], CENTER, opposed=False)
+    (cleared,), (reachable,) = within_reach(deep, point, FLAT[None], CENTER_ONLY, opposed=False)
     assert reachable[0]
     np.testing.assert_allclose(cleared.position[0, 2], -0.04, atol=2e-6)
 
@@ -407,7 +407,7 @@ def test_opposing_surfaces_of_corner_and_strip():
     both = Headings(0.02 * direction + [[0, 0, 0], [0, 1, 0]], direction, cross)
     for opposed, expected in ((True, [False, True]), (False, [True, True])):
         np.testing.assert_array_equal(
-            within_reach(both, part, FLAT[None], CENTER, opposed=opposed)[1], [expected]
+            within_reach(both, part, FLAT[None], CENTER_ONLY, opposed=opposed)[1], [expected]
         )
 
 

@@ -15,7 +15,12 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text
 from congrasp.common.hands.mjcf import WRIST_JOINTS, add_hand
-from congrasp.common.hands.motors import coupled, joint_positions, motor_limits, motor_positions
+from congrasp.common.hands.motors import (
+    follow_couplings,
+    joint_positions,
+    motor_limits,
+    motor_positions,
+)
 from congrasp.common.hands.spec import Coupling, Motor
 from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.task.sampling.closed_poses import finger_groups
@@ -82,13 +87,13 @@ def test_motors_go_to_joints_and_back_within_all_limits(hand):
     m = np.random.default_rng(0).uniform(lower, upper, (50, len(hand.motors))).astype(np.float32)
     q = joint_positions(hand, m)
     np.testing.assert_allclose(motor_positions(hand, q), m, atol=1e-6)
-    np.testing.assert_allclose(coupled(hand, q), q, atol=1e-6)
+    np.testing.assert_allclose(follow_couplings(hand, q), q, atol=1e-6)
     assert (q > hand.lower - 1e-5).all()
     assert (q < hand.upper + 1e-5).all()
     human = get_hand("human")
     assert motor_positions(human, q) is q
     assert joint_positions(human, q) is q
-    assert coupled(human, q) is q
+    assert follow_couplings(human, q) is q
 
 
 def test_poses_follow_and_fingers_that_one_motor_moves_close_together(hand):
@@ -174,7 +179,7 @@ def test_warp_couples_joints_as_mujoco_c_does(hand):
     np.testing.assert_allclose(data.qpos.numpy()[0], native.qpos, atol=1e-5)
     q = native.qpos[6:]
     assert np.abs(q - hand.q_open).max() > 0.3
-    np.testing.assert_allclose(coupled(hand, q), q, atol=2e-3)
+    np.testing.assert_allclose(follow_couplings(hand, q), q, atol=2e-3)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ import yaml
 
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import load
-from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, serve_metrics
 from tests.conftest import ROOT
 from tests.services.ops.test_metrics import STATUS, scrape
 
@@ -338,7 +338,7 @@ def test_every_expression_names_metrics_that_are_exposed():
     server.health = lambda: {"ready": True, "version": 5, "queue": 2}
     server.answer("answered", 0.01)
     server.batch(3)
-    with exposed(port, "127.0.0.1", learner, actor, server):
+    with serve_metrics(port, "127.0.0.1", learner, actor, server):
         metrics = scrape(port)
     names = {name for name, *_ in metrics}
     labels = set()

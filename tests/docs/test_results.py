@@ -9,9 +9,16 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import pretrained_file, pretrained_hands
-from congrasp.services.evaluate.results import KINDS, ROOT, filled, pages, read_results, recorded
+from congrasp.services.evaluate.results import (
+    KINDS,
+    ROOT,
+    fill_tables,
+    pages,
+    read_all_results,
+    read_results,
+)
 
-RESULTS = recorded()
+RESULTS = read_all_results()
 MARKS = "<!-- results human {kind} -->\n{text}<!-- end of results -->\n"
 
 
@@ -48,16 +55,16 @@ def test_a_file_is_written_by_its_command(name):
 def test_a_table_is_written_between_its_marks_and_nothing_else_changes():
     results = RESULTS["human"]
     page = "Before.\n\n" + MARKS.format(kind="rates", text="old\n") + "\nAfter.\n"
-    new = filled(page, {"human": results})
+    new = fill_tables(page, {"human": results})
     assert new.startswith("Before.\n\n<!-- results human rates -->\n\n| constraint |")
     assert "old" not in new
     assert new.endswith("<!-- end of results -->\n\nAfter.\n")
-    assert filled(new, {"human": results}) == new
+    assert fill_tables(new, {"human": results}) == new
     row = results.rows[0]
     assert f"| {row.episodes} ({row.independent:.0f}) |" in new
     assert f"{100 * row.success:.1f} % (" in new
     other = dataclasses.replace(results, rows=[dataclasses.replace(row, success=0.123)])
-    assert "12.3 % (" in filled(page, {"human": other}) != new
+    assert "12.3 % (" in fill_tables(page, {"human": other}) != new
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -82,7 +89,7 @@ def test_conditions_name_the_policy_the_machine_and_the_command():
 @pytest.mark.parametrize("marks", ["human nothing", "unknown rates"])
 def test_a_mark_without_results_is_an_error(marks):
     with pytest.raises(CongraspError, match="does not exist"):
-        filled(f"<!-- results {marks} -->\n<!-- end of results -->", RESULTS)
+        fill_tables(f"<!-- results {marks} -->\n<!-- end of results -->", RESULTS)
 
 
 def test_a_file_of_another_kind_is_an_error(tmp_path):

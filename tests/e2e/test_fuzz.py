@@ -51,7 +51,7 @@ from congrasp.services.record.reader import read_episodes, read_metrics
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
-from congrasp.services.serve.server import checked_timeout
+from congrasp.services.serve.server import parse_timeout
 from congrasp.services.train.command import untrained
 from tests.episodes import episode, episode_message
 from tests.rollouts import bundle, learner_hub, rollout
@@ -247,7 +247,7 @@ def served(endpoint, folder):
     """
 
     def act(key, request):
-        checked_timeout(request.meta.get("timeout", 1.0))
+        parse_timeout(request.meta.get("timeout", 1.0))
         LAYOUT.parse(request)
         return Message()
 

@@ -106,18 +106,18 @@ class _Module(types.ModuleType):
 
     def __init__(self, module, lacks=(), has=None):
         super().__init__(module.__name__)
-        vars(self).update(_module=module, _lacks=frozenset(lacks), _has=has or {})
+        vars(self).update(module=module, lacks=frozenset(lacks), has=has or {})
 
     def __getattr__(self, name):
-        if name in self._has:
-            return self._has[name]
-        if name in self._lacks:
-            _note(f"{self._module.__name__}.{name}")
+        if name in self.has:
+            return self.has[name]
+        if name in self.lacks:
+            _note(f"{self.module.__name__}.{name}")
             raise AttributeError(f"module '{self.__name__}' has no attribute '{name}'")
-        return getattr(self._module, name)
+        return getattr(self.module, name)
 
     def __setattr__(self, name, value):
-        setattr(self._module, name, value)
+        setattr(self.module, name, value)
 
 
 def _context(method=None):

@@ -98,7 +98,10 @@ def lacking(packages: list[str], system: System, folder: pathlib.Path) -> list[s
     if len(packages) == 1:
         print(done.stderr)
         return packages
-    return [each for package in packages for each in lacking([package], system, folder)]
+    without_wheel = []
+    for package in packages:
+        without_wheel += lacking([package], system, folder)
+    return without_wheel
 
 
 @pytest.mark.index

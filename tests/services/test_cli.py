@@ -22,7 +22,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.services.cli import console
 from congrasp.services.cli import main as cli
 from congrasp.services.cli.main import COMMANDS, load
-from congrasp.services.ops.logs import announced
+from congrasp.services.ops.logs import announce_progress
 from tests.children import python
 from tests.printed import errors
 
@@ -544,18 +544,20 @@ def test_a_misspelt_file_is_named_before_anything_is_imported(
 def test_long_work_alone_is_announced_with_its_duration(
     capsys: pytest.CaptureFixture,
 ) -> None:
-    with announced("Compiling", first=60.0):
+    with announce_progress("Compiling", first=60.0):
         pass
     assert not capsys.readouterr().err
     lines: list[str] = []
-    with announced("Compiling", first=0.01, every=0.01):
+    with announce_progress("Compiling", first=0.01, every=0.01):
         while len(lines) < 2:
             lines += capsys.readouterr().err.splitlines()
     assert set(lines) == {"Compiling: 0 s so far."}
 
 
 def test_progress_without_a_terminal_names_task_and_counts(capsys, monkeypatch):
-    monkeypatch.setattr(console, "announced", functools.partial(announced, first=0.01, every=0.01))
+    monkeypatch.setattr(
+        console, "announce_progress", functools.partial(announce_progress, first=0.01, every=0.01)
+    )
     with console.tracked() as track:
         track("heading", 12)(5)
         capsys.readouterr()
@@ -566,7 +568,7 @@ def test_progress_without_a_terminal_names_task_and_counts(capsys, monkeypatch):
 
 
 def test_a_phase_without_counts_has_no_total(monkeypatch):
-    monkeypatch.setattr(console, "announced", lambda task: contextlib.nullcontext())
+    monkeypatch.setattr(console, "announce_progress", lambda task: contextlib.nullcontext())
     with console.bars() as progress:
         phases = console.PhaseBar(progress, "Starting")
         phases.update("mug: Attempting", 360, 400)
@@ -578,7 +580,7 @@ def test_a_phase_without_counts_has_no_total(monkeypatch):
 
 
 def test_a_bar_without_a_step_shows_no_counts(monkeypatch):
-    monkeypatch.setattr(console, "announced", lambda task: contextlib.nullcontext())
+    monkeypatch.setattr(console, "announce_progress", lambda task: contextlib.nullcontext())
     with console.bars() as progress:
         task = progress.add_task("Episodes", total=12)
         assert console.current_activity(progress) == "Episodes"

@@ -9,7 +9,7 @@ maxima below.
 import numpy as np
 
 from congrasp.common import chance, rotations
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.types import Array
@@ -57,7 +57,7 @@ def disturbed_fingers(hand: Hand, q: Array, amount: Array, uniform: Array) -> Ar
     amount = amount[:, None]
     q = q_open + (1 + amount * (closure - 1)) * (q - q_open)
     q = q + amount * JOINTS * chance.normal(uniform[:, 1:])
-    return coupled(hand, jnp.clip(q, hand.lower, hand.upper))
+    return follow_couplings(hand, jnp.clip(q, hand.lower, hand.upper))
 
 
 def disturbed_wrist(

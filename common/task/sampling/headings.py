@@ -21,12 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from congrasp.common.hands.closure import Outline
+from congrasp.common.hands.closure import MAX_OBJECT_WIDTH_M, Outline
 from congrasp.common.objects.spec import GraspObject
 
 INWARD = 0.02
 """Distance from the surface to the heading position along the heading direction, m."""
-MAX_WIDTH = 0.12
+MAX_WIDTH = MAX_OBJECT_WIDTH_M
 """Greatest width of the object along the cross-finger axis, m."""
 AVOID_MARGIN = 0.01
 """Distance of an approach from the avoid region, m; closing fingers of this thickness must not meet
@@ -80,7 +80,7 @@ def max_width(outline: Outline, scale: float) -> float:
     """Greatest width of an object for a hand, m: the paper's 12 cm times its scale, or the hand's
     opening.
     """
-    return min(scale * MAX_WIDTH, float(outline.openings[0]) - 2 * _SKIN)
+    return min(scale * MAX_WIDTH, float(outline.gaps[0]) - 2 * _SKIN)
 
 
 def local_width(headings: Headings, points: np.ndarray) -> np.ndarray:

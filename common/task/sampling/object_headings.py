@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.closure import CENTER, Outline
+from congrasp.common.hands.closure import CENTER_ONLY, Outline
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import feasible_indices
@@ -50,7 +50,7 @@ def headings_of(
     seed: tuple[int, int],
     prescribed: Headings | None = None,
     scale: float = 1.0,
-    hand_outline: Outline = CENTER,
+    hand_outline: Outline = CENTER_ONLY,
 ) -> dict[str, np.ndarray]:
     """Computes headings and resting poses of one object; resting poses without a reachable heading
     are dropped.
@@ -165,7 +165,7 @@ def _reach(
         graspable region.
       opposed: see `within_reach`.
     """
-    outline = CENTER if task.headings == "center" else hand_outline
+    outline = CENTER_ONLY if task.headings == "center" else hand_outline
     whole, graspable = regions.both()
     rests = obj.rest_poses
     cleared, reachable = within_reach(whole, obj, rests, outline, opposed=opposed)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.common.hands.closure import CENTER, Outline, depth_below
+from congrasp.common.hands.closure import CENTER_ONLY, Outline, depth_below
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import (
@@ -39,7 +39,7 @@ class _Way(NamedTuple):
 def clear_table(
     headings: Headings,
     rest_pose: np.ndarray,
-    outline: Outline = CENTER,
+    outline: Outline = CENTER_ONLY,
     width: np.ndarray | float = 0.0,
     max_back: float = _MAX_BACK_WITHOUT_ALTERNATIVE,
 ) -> Headings:
@@ -68,7 +68,7 @@ def clear_table(
 def feasible(
     headings: Headings,
     rest_pose: np.ndarray,
-    outline: Outline = CENTER,
+    outline: Outline = CENTER_ONLY,
     width: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """(H,) bool: headings that can be followed while the object rests on the table in a resting
@@ -76,7 +76,7 @@ def feasible(
 
     The approach must come from above or level (its direction rises by at most 0.1 per metre), and
     the hand must be above the table at the heading position in one of the poses that are open wide
-    enough for the object (`actors.initial` lifts the start of an approach over the table). All
+    enough for the object (`actors.initial_hand` lifts the start of an approach over the table). All
     headings of a thin object may be infeasible: see `clear_table`.
 
     Args:
@@ -123,7 +123,7 @@ def within_reach(
     width = local_width(headings, obj.points)
     ways = [_Way(outline, _MAX_BACK), _Way(outline, _MAX_BACK_WITHOUT_ALTERNATIVE)]
     if avoid is None:
-        ways.append(_Way(CENTER, _MAX_BACK_WITHOUT_ALTERNATIVE))
+        ways.append(_Way(CENTER_ONLY, _MAX_BACK_WITHOUT_ALTERNATIVE))
     for way in ways:
         cleared = []
         reachable = []
@@ -178,6 +178,6 @@ def _room(
     side_z = np.cross(headings.direction, headings.cross) @ up
     below = depth_below(outline, np.stack([direction_z, cross_z, side_z], -1))
     needed = np.broadcast_to(width, height.shape) + 2 * AVOID_MARGIN
-    wide = outline.openings[:, None] >= needed
+    wide = outline.gaps[:, None] >= needed
     wide[0] = True  # no pose is wider
     return height - np.where(wide, below, np.inf).min(0), direction_z

@@ -2,10 +2,10 @@
 
 Definitions of terms that the paper leaves open:
 
-* continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row
-  are missing;
-* too complex: the path is more than `DETOUR` times its straight line, or the wrist rotates by more
-  than `TURN` in total.
+* continuous: the wrist moves at most `MAX_STEP_M` between two frames, and at most
+  `MAX_MISSING_FRAMES` in a row are missing;
+* too complex: the path is more than `MAX_DETOUR` times its straight line, or the wrist rotates by
+  more than `MAX_TURN_RAD` in total.
 """
 
 from typing import NamedTuple
@@ -16,22 +16,22 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.rotations import continuous
 from congrasp.services.assets.captures.sequence import Dropped
 
-NEAREST = 0.08
-"""Least distance from which a wrist must come, m."""
-FARTHEST = 0.20
-"""Greatest distance at which a trajectory begins, m."""
-JUMP = 0.10
-"""Motion of a wrist between two frames, m."""
-GAP = 3
-"""Frames in a row that may be missing."""
-DETOUR = 2.0
-"""Length of a path relative to its straight line."""
-TURN = 2.5
-"""Rotation of a wrist on its way, rad."""
-DIP = 0.01
-"""Decrease of the distance, going backwards, after which its maximum counts as passed, m."""
-_MAX_RESTING_STEP = 1e-6
-"""Step of a wrist at rest, m."""
+MIN_START_DISTANCE_M = 0.08
+"""Least distance of the wrist from the object at the start of a trajectory."""
+MAX_START_DISTANCE_M = 0.20
+"""Greatest such distance; what precedes it is left out."""
+MAX_STEP_M = 0.10
+"""Greatest motion of a wrist between two frames."""
+MAX_MISSING_FRAMES = 3
+"""Greatest number of missing frames in a row."""
+MAX_DETOUR = 2.0
+"""Greatest length of a path relative to its straight line."""
+MAX_TURN_RAD = 2.5
+"""Greatest sum of a wrist's rotations on its way."""
+DISTANCE_DIP_M = 0.01
+"""Decrease of the distance, backwards in time, after which its maximum counts as passed."""
+_MAX_RESTING_STEP_M = 1e-6
+"""Greatest step of a wrist at rest."""
 
 
 class Approach(NamedTuple):
@@ -68,24 +68,22 @@ def approach(
     Raises:
       Dropped: the wrist starts too near or does not move, or its path is too complex.
     """
-    start = _farthest(position, far, present, frame)
-    if far[start] < NEAREST:
-        reason = (
-            f"the wrist comes from only {100 * far[start]:.1f} cm ({100 * NEAREST:.0f} cm are "
-            f"needed)"
-        )
+    start = _find_start(position, far, present, frame)
+    if far[start] < MIN_START_DISTANCE_M:
+        needed_cm = f"{100 * MIN_START_DISTANCE_M:.0f} cm"
+        reason = f"the wrist comes from only {100 * far[start]:.1f} cm ({needed_cm} are needed)"
         raise Dropped(name, "starts too near", reason)
     frames = np.flatnonzero(present[start : frame + 1]) + start
-    path, turns = _truncated(position[frames], rotation[frames], far[frames])
+    path, turns = _truncate(position[frames], rotation[frames], far[frames])
     steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
-    if steps.max(initial=0.0) <= _MAX_RESTING_STEP:
+    if steps.max(initial=0.0) <= _MAX_RESTING_STEP_M:
         raise Dropped(name, "no approach", "the wrist does not move before the grasp")
     _check_complexity(name, path, turns)
-    waypoint_positions, waypoint_quaternions = _resampled(path, turns, waypoints)
+    waypoint_positions, waypoint_quaternions = _resample(path, turns, waypoints)
     return Approach(start, waypoint_positions, waypoint_quaternions)
 
 
-def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
+def _find_start(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
     """Frame of the local maximum of the distance, along continuous motion before a frame.
 
     Args:
@@ -101,8 +99,8 @@ def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame:
             continue
         step = np.linalg.norm(position[previous] - position[t])
         elapsed = previous - t
-        is_interrupted = elapsed > GAP + 1 or step > JUMP * elapsed
-        is_past_maximum = far[t] < far[farthest] - DIP
+        is_interrupted = elapsed > MAX_MISSING_FRAMES + 1 or step > MAX_STEP_M * elapsed
+        is_past_maximum = far[t] < far[farthest] - DISTANCE_DIP_M
         if is_interrupted or is_past_maximum:
             break
         previous = t
@@ -111,10 +109,10 @@ def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame:
     return farthest
 
 
-def _truncated(
+def _truncate(
     path: np.ndarray, rotations: np.ndarray, distance: np.ndarray
 ) -> tuple[np.ndarray, Rotation]:
-    """Path from its last entry within `FARTHEST` on.
+    """Path from its last entry within `MAX_START_DISTANCE_M` on.
 
     The entry point is interpolated between two frames.
 
@@ -124,11 +122,11 @@ def _truncated(
       distance: (n,) distance from the surface, m.
     """
     rotation = Rotation.from_matrix(rotations)
-    outside = np.flatnonzero(distance > FARTHEST)
+    outside = np.flatnonzero(distance > MAX_START_DISTANCE_M)
     if len(outside) == 0 or outside[-1] == len(distance) - 1:
         return path, rotation
     i = int(outside[-1])
-    share = (distance[i] - FARTHEST) / (distance[i] - distance[i + 1])
+    share = (distance[i] - MAX_START_DISTANCE_M) / (distance[i] - distance[i + 1])
     entry_rotation = Slerp([0.0, 1.0], rotation[[i, i + 1]])(share)
     entry = (1 - share) * path[i] + share * path[i + 1]
     truncated = np.concatenate([entry[None], path[i + 1 :]])
@@ -139,25 +137,25 @@ def _check_complexity(name: str, path: np.ndarray, rotation: Rotation) -> None:
     """Drops a sequence whose path (n, 3) has too much detour or rotation."""
     length = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()
     straight = np.linalg.norm(path[-1] - path[0])
-    if length > DETOUR * straight:
+    if length > MAX_DETOUR * straight:
         raise Dropped(
             name,
             "too complex",
             f"the wrist's path is {length / max(straight, 1e-9):.1f} times its straight line",
         )
     turn = float((rotation[1:] * rotation[:-1].inv()).magnitude().sum())
-    if turn > TURN:
+    if turn > MAX_TURN_RAD:
         raise Dropped(name, "too complex", f"the wrist rotates by {turn:.1f} rad on its way")
 
 
-def _resampled(
+def _resample(
     path: np.ndarray, rotation: Rotation, waypoints: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """K waypoints at equal distances along the path, with quaternions of continuous sign."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
     length = np.concatenate([[0.0], steps.cumsum()])
     # While the wrist rests the path length does not grow: the last of such frames is used.
-    moves_next = np.append(np.diff(length) > _MAX_RESTING_STEP, True)
+    moves_next = np.append(np.diff(length) > _MAX_RESTING_STEP_M, True)
     length = length[moves_next]
     path = path[moves_next]
     rotation = rotation[moves_next]

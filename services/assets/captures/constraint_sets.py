@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from congrasp.common.hands.closure import CENTER, outline
+from congrasp.common.hands.closure import CENTER_ONLY, outline
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
@@ -29,15 +29,15 @@ from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.options import Options
 from congrasp.services.assets.captures.postures import posture_deviations
 from congrasp.services.assets.captures.references import (
-    deepest,
     demonstrated_headings,
-    separated,
-    transferred,
+    greatest_overlap,
+    separate_fingers,
+    transfer,
 )
 from congrasp.services.assets.captures.surface import Surface
 
-IN_TABLE = 0.005
-"""Tolerated depth of a captured hand in the table if no resting pose avoids it, m."""
+MAX_DEPTH_IN_TABLE_M = 0.005
+"""Tolerated depth of a captured hand in the table if no resting pose avoids it."""
 _above_table = jax.jit(above_table)
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)
 _height_over_table = jax.jit(height_over_table, static_argnums=0)
@@ -94,13 +94,13 @@ def build_set(hand: Hand, group: Group, options: Options, number: int, source: s
         captured = demonstrated_headings(group.demonstrations, scale)
         headings = Headings(*(np.resize(field, (HEADINGS, 3)) for field in captured))
     # Human grasps are not tested against the hand's outline, since their table was elsewhere.
-    tested_outline = CENTER if headings else outline(hand)
+    tested_outline = CENTER_ONLY if headings else outline(hand)
     seed = (options.seed, number)
     fields = headings_of(task, scaled, seed, headings, scale, tested_outline)
     references = _references(hand, group.demonstrations, scaled, scale)
     position = references.position
     quaternion = references.quaternion
-    q = separated(hand, references.q)
+    q = separate_fingers(hand, references.q)
     clear = usable_resting_poses(hand, references._replace(q=q), fields["rest"])
     agrees = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     own_fields = {
@@ -110,11 +110,11 @@ def build_set(hand: Hand, group: Group, options: Options, number: int, source: s
     }
     row = ConstraintBank(
         **own_fields,
-        pose_q=_twice(q),
-        pose_position=_twice(position[:, -1]),
-        pose_quaternion=_twice(quaternion[:, -1]),
-        trajectory_position=_twice(position),
-        trajectory_quaternion=_twice(quaternion),
+        pose_q=_for_both_regions(q),
+        pose_position=_for_both_regions(position[:, -1]),
+        pose_quaternion=_for_both_regions(quaternion[:, -1]),
+        trajectory_position=_for_both_regions(position),
+        trajectory_quaternion=_for_both_regions(quaternion),
         pose_valid=np.stack([clear.T, (clear & agrees[:, None]).T]),
         weight=np.float32(1.0),  # people held it, however flat it lies
         mass=np.float32(scaled.mass),
@@ -152,7 +152,7 @@ def report_rows(hand: Hand, group: Group, built: BuiltSet) -> Iterator[dict[str,
     arrays = built.message.arrays
     usable = arrays["pose/allowed"].any((0, 1))
     below = from_below(hand, built.message)
-    overlap = np.asarray(deepest(hand, built.captured_q))
+    overlap = np.asarray(greatest_overlap(hand, built.captured_q))
     moved = np.abs(arrays["pose/q"][0] - built.captured_q).max(-1)
     posture = posture_deviations(
         hand,
@@ -196,7 +196,7 @@ def _references(
         position = np.stack([demonstration.position for demonstration in demonstrations])
         quaternion = np.stack([demonstration.quaternion for demonstration in demonstrations])
     else:
-        q, position, quaternion = transferred(hand, demonstrations, scaled, scale)
+        q, position, quaternion = transfer(hand, demonstrations, scaled, scale)
     return References(
         q.astype(np.float32), position.astype(np.float32), quaternion.astype(np.float32)
     )
@@ -207,7 +207,7 @@ def usable_resting_poses(hand: Hand, references: References, rest: np.ndarray) -
 
     The wrist must stay above the table and the hand outside it, as for other references. If no
     resting pose allows that, because captured hands are off by some millimetres, the one with the
-    least depth is used, up to `IN_TABLE`.
+    least depth is used, up to `MAX_DEPTH_IN_TABLE_M`.
 
     Args:
       hand: hand of the references.
@@ -220,7 +220,7 @@ def usable_resting_poses(hand: Hand, references: References, rest: np.ndarray) -
     height = _height_over_table(hand, q, position, quaternion, rests)
     clear_height = np.where(clear, height, -np.inf)
     highest = clear_height.max(1, keepdims=True)
-    return clear & (clear_height >= np.clip(highest, -IN_TABLE, -SOFT))
+    return clear & (clear_height >= np.clip(highest, -MAX_DEPTH_IN_TABLE_M, -SOFT))
 
 
 def from_below(hand: Hand, message: Message) -> np.ndarray:
@@ -236,7 +236,7 @@ def from_below(hand: Hand, message: Message) -> np.ndarray:
     return np.asarray(above.any(-1) & ~clear.any(-1))
 
 
-def _twice(values: np.ndarray) -> np.ndarray:
+def _for_both_regions(values: np.ndarray) -> np.ndarray:
     """Repeats values for both regions (2, ...): the whole surface, and the graspable region."""
     return np.stack([values, values])
 

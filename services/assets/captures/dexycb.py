@@ -9,7 +9,7 @@ names the hand's side.
 
 import pathlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -59,6 +59,15 @@ OBJECTS = (
 """Names by DexYCB's ids, from 1."""
 
 
+class _DataSet(NamedTuple):
+    """Inputs that all sequences share."""
+
+    root: pathlib.Path
+    """Folder that holds `calibration`."""
+    meshes: Meshes
+    model: ManoModel
+
+
 def read(
     path: pathlib.Path, meshes: Meshes, model: ManoModel | None
 ) -> Iterator[Sequence | Dropped]:
@@ -74,9 +83,10 @@ def read(
         )
     root = _root(path)
     all_meshes = meshes.beside(root / "models")
+    data_set = _DataSet(root, all_meshes, model)
     for file in sorted(path.glob("**/meta.yml")):
         name = f"{file.parent.parent.name}/{file.parent.name}"
-        yield read_or_drop(name, _sequence, name, file.parent, root, all_meshes, model)
+        yield read_or_drop(name, _read_sequence, name, file.parent, data_set)
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
@@ -87,10 +97,9 @@ def _root(path: pathlib.Path) -> pathlib.Path:
     return path
 
 
-def _sequence(
-    name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel
-) -> Sequence:
+def _read_sequence(name: str, folder: pathlib.Path, data_set: _DataSet) -> Sequence:
     """Reads the sequence of a session's folder."""
+    model = data_set.model
     meta = _yaml(name, folder / "meta.yml")
     sides = _value(name, meta, "mano_sides")
     if sides != ["right"]:
@@ -122,9 +131,8 @@ def _sequence(
     has_hand = np.isfinite(hand).all(-1) & (hand != 0).any(-1)
     present = has_object & has_hand
     object_pose, hand = known_frames(name, present, object_pose, hand)
-    skeleton = human.skeleton(
-        model, calibrated_shape(name, root, _value(name, meta, "mano_calib")[0])
-    )
+    calibration = _value(name, meta, "mano_calib")[0]
+    skeleton = human.skeleton(model, calibrated_shape(name, data_set.root, calibration))
     angles = model.hand_mean + hand[:, 3:48] @ model.components
     wrist, joints = skeleton.posed(
         Rotation.from_rotvec(hand[:, :3]), Rotation.from_rotvec(angles.reshape(-1, 15, 3))
@@ -133,7 +141,7 @@ def _sequence(
     return Sequence(
         name=name,
         object_name=object_name,
-        mesh=meshes.find(name, object_name, inside="textured_simple.obj"),
+        mesh=data_set.meshes.find(name, object_name, inside="textured_simple.obj"),
         wrist_position=skeleton.wrist + hand[:, 48:],
         wrist_rotation=wrist,
         joints=joints,

@@ -13,7 +13,7 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.captures.approach import approach
 from congrasp.services.assets.captures.contact import (
-    CONTACT,
+    CONTACT_DISTANCE_M,
     before_carried,
     first_contact,
     opposed_frame,
@@ -23,11 +23,11 @@ from congrasp.services.assets.captures.human import Fit, fit
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.assets.captures.surface import Surface
 
-BEYOND = 0.1
-"""Tolerance of a captured joint beyond its limits, rad."""
-_MAX_DISTANCE = 1.0
-"""Wrist-object distance above which positions are not in metres, m."""
-_FAR_AWAY = 1e3
+LIMIT_TOLERANCE_RAD = 0.1
+"""Tolerance of a captured joint beyond its limits."""
+_MAX_DISTANCE_M = 1.0
+"""Wrist-object distance above which positions are taken not to be in metres."""
+_FAR_AWAY_M = 1e3
 """Coordinate of a wrist in a missing frame, m."""
 
 
@@ -55,7 +55,11 @@ class Demonstration:
 
 
 def extract(
-    sequence: Sequence, obj: GraspObject, surface: Surface, waypoints: int, beyond: float = BEYOND
+    sequence: Sequence,
+    obj: GraspObject,
+    surface: Surface,
+    waypoints: int,
+    beyond: float = LIMIT_TOLERANCE_RAD,
 ) -> Demonstration:
     """Extracts the reference pose and the trajectory of a sequence.
 
@@ -91,7 +95,7 @@ def extract(
         q=np.clip(finger_fit.q, HUMAN.lower, HUMAN.upper),
         position=path.position,
         quaternion=path.quaternion,
-        contact=surface.within(*skin_balls(skin[touched], CONTACT)),
+        contact=surface.within(*skin_balls(skin[touched], CONTACT_DISTANCE_M)),
     )
 
 
@@ -115,11 +119,11 @@ def _wrist_distance(sequence: Sequence, surface: Surface, position: np.ndarray) 
       Dropped: hand and object are never present together, or their positions are not in metres.
     """
     present = sequence.present
-    distance = surface.distance(np.where(present[:, None], position, _FAR_AWAY))
+    distance = surface.distance(np.where(present[:, None], position, _FAR_AWAY_M))
     if not present.any():
         raise Dropped(sequence.name, "frames missing", "no frame has both the hand and the object")
     nearest = distance[present].min()
-    if nearest > _MAX_DISTANCE:
+    if nearest > _MAX_DISTANCE_M:
         reason = (
             f"the wrist stays {nearest:.3g} m from the object: check that its positions are in "
             f"metres"

@@ -9,6 +9,7 @@ the grasping frame; otherwise the labels of the object's contacts give the touch
 import functools
 import pathlib
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -52,6 +53,16 @@ _GraspingFrames = dict[tuple[str, str], int]
 """First grasping frame of each (subject, sequence)."""
 
 
+class _DataSet(NamedTuple):
+    """Inputs that all sequences share."""
+
+    root: pathlib.Path
+    """Folder that holds `tools`."""
+    meshes: Meshes
+    model: ManoModel | None
+    grasping_frames: _GraspingFrames
+
+
 def read(
     path: pathlib.Path, meshes: Meshes, model: ManoModel | None
 ) -> Iterator[Sequence | Dropped]:
@@ -60,8 +71,10 @@ def read(
     all_meshes = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
     grasping_frames = _grasping_frames(root)
     files = sorted(path.glob("**/s*/*.npz")) if path.is_dir() else [path]
+    data_set = _DataSet(root, all_meshes, model, grasping_frames)
     for file in files:
-        yield read_or_drop(file.stem, _sequence, file, root, all_meshes, model, grasping_frames)
+        name = f"{file.parent.name}/{file.stem}"
+        yield read_or_drop(name, _read_sequence, name, file, data_set)
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
@@ -87,15 +100,8 @@ def _grasping_frames(root: pathlib.Path) -> _GraspingFrames:
     return first
 
 
-def _sequence(
-    file: pathlib.Path,
-    root: pathlib.Path,
-    meshes: Meshes,
-    model: ManoModel | None,
-    grasping_frames: _GraspingFrames,
-) -> Sequence:
+def _read_sequence(name: str, file: pathlib.Path, data_set: _DataSet) -> Sequence:
     """Reads the sequence of a file."""
-    name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
     bodies = {key.partition("/")[0] for key in data}
     if "rhand" not in bodies and "lhand" in bodies:
@@ -103,7 +109,7 @@ def _sequence(
     shapes = {field: (width,) for field, width in _FIELD_WIDTHS.items()}
     arrays = frames_of(name, "the file", data, shapes)
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
-    skeleton = _skeleton(model, hand_template(root, data))
+    skeleton = _skeleton(data_set.model, hand_template(data_set.root, data))
     frame_count = len(arrays[0])
     present = np.isfinite(np.concatenate(arrays, 1)).all(-1)
     fields = dict(zip(shapes, known_frames(name, present, *arrays), strict=True))
@@ -111,13 +117,13 @@ def _sequence(
     wrist, joints = skeleton.posed(
         Rotation.from_rotvec(fields[_WRIST_ROTATION]), Rotation.from_rotvec(finger_rotations)
     )
-    grasp = grasping_frames.get((file.parent.name, file.stem))
+    grasp = data_set.grasping_frames.get((file.parent.name, file.stem))
     if grasp is not None and grasp >= frame_count:
         grasp = None
     return Sequence(
         name=name,
         object_name=object_name,
-        mesh=meshes.find(name, object_name),
+        mesh=data_set.meshes.find(name, object_name),
         wrist_position=skeleton.wrist + fields[_WRIST_TRANSLATION],
         wrist_rotation=wrist,
         joints=joints,
@@ -125,7 +131,7 @@ def _sequence(
         object_rotation=Rotation.from_rotvec(fields[_OBJECT_ROTATION]).inv().as_matrix(),
         present=present,
         grasp=grasp,
-        touching=_touching(data, frame_count),
+        touching=_touching_fingers(data, frame_count),
     )
 
 
@@ -149,7 +155,7 @@ def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> human.S
     return human.skeleton(model, template=template)
 
 
-def _touching(data: dict[str, np.ndarray], frame_count: int) -> np.ndarray | None:
+def _touching_fingers(data: dict[str, np.ndarray], frame_count: int) -> np.ndarray | None:
     """Contact flags (T, 5), from the labels of the object's contacts; None without labels."""
     labels = data.get("contact/object")
     if labels is None or labels.ndim != 2 or len(labels) != frame_count:

@@ -30,6 +30,7 @@ from congrasp.services.assets.captures.sequence import (
 
 HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
+"""Position of MyoHand's base, m, world frame; the following are m, too."""
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
 """Origin of the forearm in the base."""
 _FOREARM = Rotation.from_quat(
@@ -37,9 +38,10 @@ _FOREARM = Rotation.from_quat(
 )
 _PRONATION = np.array([-0.017161, 0.992666, -0.119668])
 _WRIST = np.array([0.018, -0.242, 0.025])
-"""Pose of the wrist in the forearm."""
+"""Position of the wrist in the forearm."""
 _OBJECT = np.array([0.0, 0.0, 0.035])
-_LARGEST = 2 * np.pi
+"""Position of the object while its slides are zero."""
+_MAX_ANGLE_RAD = 2 * np.pi
 
 
 def read(
@@ -83,7 +85,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
         raise Dropped(name, "frames missing", reason)
     robot, pose = known_frames(name, present, robot, pose)
     largest = float(np.abs(robot[:, 3:]).max())
-    if largest > _LARGEST:
+    if largest > _MAX_ANGLE_RAD:
         raise Dropped(
             name,
             "wrong units",

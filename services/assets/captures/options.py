@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from congrasp.services.assets.captures.extract import BEYOND
+from congrasp.services.assets.captures.extract import LIMIT_TOLERANCE_RAD
 from congrasp.services.assets.captures.regions import Affordance
 
 
@@ -17,7 +17,7 @@ class Options:
     """parts: labelled parts touched by fingers are graspable; contacts: the touched points; auto:
     parts if labelled.
     """
-    beyond: float = BEYOND
+    beyond: float = LIMIT_TOLERANCE_RAD
     """Tolerance in rad of a captured joint beyond its limits; it is then clamped. Only for
     `human`.
     """

@@ -10,7 +10,7 @@ from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.posture import unnatural
-from congrasp.services.assets.captures.contact import CONTACT
+from congrasp.services.assets.captures.contact import CONTACT_DISTANCE_M
 from congrasp.services.assets.captures.surface import Surface
 
 _SAMPLES = 9
@@ -26,7 +26,7 @@ def posture_deviations(
 ) -> np.ndarray:
     """Returns deviations (M,) of captured grasps from natural postures, rad.
 
-    A link touches the object if its skin is within `CONTACT` of the surface, or below it.
+    A link touches the object if its skin is within `CONTACT_DISTANCE_M` of the surface, or below.
 
     Args:
       hand: the hand.
@@ -41,7 +41,7 @@ def posture_deviations(
     gaps = surface.distance(points).min(-1) - hand.capsule_radii
     touching = np.zeros((len(q), len(hand.links)), bool)
     for capsule, link in enumerate(hand.capsule_links):
-        touching[:, link] |= gaps[:, capsule] <= CONTACT
+        touching[:, link] |= gaps[:, capsule] <= CONTACT_DISTANCE_M
     return np.asarray(unnatural(hand, jnp.asarray(q), jnp.asarray(touching)))
 
 

@@ -32,12 +32,12 @@ from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.sequence import Dropped
 
-DEEPEST = 0.01
-"""Tolerated depth of skin in the object, similar to the error of captured hands, m."""
-OVERLAP = 0.001
-"""Tolerated overlap of two links, as skin and flesh give way, m."""
+MAX_DEPTH_M = 0.01
+"""Tolerated depth of skin in the object, similar to the error of captured hands."""
+MAX_OVERLAP_M = 0.001
+"""Tolerated overlap of two links, as skin and flesh give way."""
 _MAX_ITERATIONS = 100
-_ALONG = np.linspace(0.0, 1.0, 5)[:, None]
+_AXIS_SHARES = np.linspace(0.0, 1.0, 5)[:, None]
 """Shares of a capsule's axis at which its depth is computed."""
 _POSES_AT_ONCE = 20
 """Number of poses closed in one compiled call."""
@@ -64,10 +64,10 @@ def check_reference(
         )
         raise Dropped(demonstration.name, "too wide", reason)
     skin_depth = depth(demonstration, obj) if hand is HUMAN else 0.0
-    if skin_depth > DEEPEST:
+    if skin_depth > MAX_DEPTH_M:
+        tolerated_mm = f"{1000 * MAX_DEPTH_M:.0f} mm"
         reason = (
-            f"the hand is {1000 * skin_depth:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm "
-            f"at most)"
+            f"the hand is {1000 * skin_depth:.0f} mm deep in the object ({tolerated_mm} at most)"
         )
         raise Dropped(demonstration.name, "too deep", reason)
 
@@ -82,16 +82,15 @@ def width(demonstration: Demonstration) -> float:
 def depth(demonstration: Demonstration, obj: GraspObject) -> float:
     """Returns the depth of the human hand's skin in a piece of the object, m.
 
-    It is negative without contact.
-
-    It is exact if a finger's axis is in the piece, and an upper bound beyond its edges.
+    It is negative without contact, exact if a finger's axis is in the piece, and an upper bound
+    beyond its edges.
     """
     ends = np.asarray(_capsules(HUMAN, demonstration.q.astype(np.float32)), float)
-    axes = (1 - _ALONG) * ends[:, :1] + _ALONG * ends[:, 1:]
+    axes = (1 - _AXIS_SHARES) * ends[:, :1] + _AXIS_SHARES * ends[:, 1:]
     turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
     points = turn.apply(axes.reshape(-1, 3)) + demonstration.position[-1]
     outside = np.min([_above_faces(piece, points) for piece in obj.pieces], axis=0)
-    return float((np.repeat(HUMAN.capsule_radii, len(_ALONG)) - outside).max())
+    return float((np.repeat(HUMAN.capsule_radii, len(_AXIS_SHARES)) - outside).max())
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -124,7 +123,7 @@ def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float)
     return Headings(*(rows.astype(np.float32) for rows in (centers, heading_axes, cross_axes)))
 
 
-def transferred(
+def transfer(
     hand: Hand, demonstrations: Sequence[Demonstration], obj: GraspObject, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns reference poses and wrist trajectories of another hand that follow demonstrations.
@@ -140,7 +139,7 @@ def transferred(
       (M, K, 4) of its wrist in the object frame.
     """
     headings = demonstrated_headings(demonstrations, scale)
-    q, last_positions = _closed_at(hand, headings, obj)
+    q, last_positions = _close_at(hand, headings, obj)
     onto_human = _onto_human(hand)
     centers = _centers(demonstrations)
     positions = []
@@ -156,7 +155,7 @@ def transferred(
     return q, np.array(positions), np.array(quaternions)
 
 
-def _closed_at(hand: Hand, headings: Headings, obj: GraspObject) -> tuple[np.ndarray, np.ndarray]:
+def _close_at(hand: Hand, headings: Headings, obj: GraspObject) -> tuple[np.ndarray, np.ndarray]:
     """Finger angles (M, F) and wrist positions (M, 3) m of a hand that closes at M headings."""
     points = obj.points.astype(np.float32)
     normals = obj.normals.astype(np.float32)
@@ -172,10 +171,11 @@ def _closed_at(hand: Hand, headings: Headings, obj: GraspObject) -> tuple[np.nda
     return np.concatenate(q)[:count], np.concatenate(positions)[:count]
 
 
-def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
-    """Returns the path of a hand's wrist whose open grasp moves like that of a human hand.
-
-    It is for captures without fingers.
+def follow_human_wrist(
+    hand: Hand, position: np.ndarray, rotation: Rotation
+) -> tuple[np.ndarray, Rotation]:
+    """Returns the path of a hand's wrist on which its open grasp moves like that of a human hand:
+    for captures without fingers.
 
     Args:
       hand: any hand.
@@ -207,8 +207,8 @@ def _axes(hand: Hand) -> np.ndarray:
     return np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
 
 
-def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """Returns the nearest finger angles whose links overlap by at most `OVERLAP`.
+def separate_fingers(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """Returns the nearest finger angles whose links overlap by at most `MAX_OVERLAP_M`.
 
     They minimise |q - q_0|^2 subject to the limit on all pairs of
     `common.task.plausibility.overlaps`, by sequential quadratic programming. The variables are
@@ -218,20 +218,20 @@ def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
       hand: any hand.
       q: (M, F) rad, within the limits; poses within the limit are returned unchanged.
     """
-    overlap = np.asarray(deepest(hand, q)) > OVERLAP
+    overlap = np.asarray(greatest_overlap(hand, q)) > MAX_OVERLAP_M
     poses = []
     for pose, overlaps_too_far in zip(q, overlap, strict=True):
-        poses.append(_apart(hand, pose) if overlaps_too_far else pose)
+        poses.append(_separate_pose(hand, pose) if overlaps_too_far else pose)
     return np.stack(poses)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def deepest(hand: Hand, q: Array) -> Array:
+def greatest_overlap(hand: Hand, q: Array) -> Array:
     """Returns the greatest overlap (M,) of two links at finger angles (M, F), m; 0 if none."""
     return jnp.maximum(overlaps(hand, link_transforms(hand, q)).max(-1), 0.0)
 
 
-def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
+def _separate_pose(hand: Hand, q: np.ndarray) -> np.ndarray:
     """Separates one pose (F,)."""
     drive = transmission(hand)
     weight = np.bincount(drive.motor, drive.ratio**2)
@@ -243,15 +243,15 @@ def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
         bounds=_motor_bounds(hand, q),
         constraints={
             "type": "ineq",
-            "fun": lambda way: np.asarray(_room(hand, q, way), float),
+            "fun": lambda way: np.asarray(_clearance(hand, q, way), float),
             # For two intersecting axes the direction of separation is undefined.
-            "jac": lambda way: np.nan_to_num(np.asarray(_room_change(hand, q, way), float)),
+            "jac": lambda way: np.nan_to_num(np.asarray(_clearance_jacobian(hand, q, way), float)),
         },
         options={"maxiter": _MAX_ITERATIONS},
     )
     moved = q + drive.ratio * result.x[drive.motor]
     apart = np.clip(moved, hand.lower, hand.upper).astype(q.dtype)
-    before, after = deepest(hand, np.stack([q, apart]))
+    before, after = greatest_overlap(hand, np.stack([q, apart]))
     return apart if after < before else q
 
 
@@ -271,7 +271,7 @@ def _motor_bounds(hand: Hand, q: np.ndarray) -> list[tuple[float, float]]:
     return bounds
 
 
-def _room_of(hand: Hand, q: Array, way: Array) -> Array:
+def _clearance_of(hand: Hand, q: Array, way: Array) -> Array:
     """Remaining clearance (Q,) in mm of pairs of links after a motion of the motors.
 
     Args:
@@ -281,8 +281,8 @@ def _room_of(hand: Hand, q: Array, way: Array) -> Array:
     """
     drive = transmission(hand)
     moved = q + drive.ratio * way[drive.motor]
-    return 1e3 * (OVERLAP - overlaps(hand, link_transforms(hand, moved)))
+    return 1e3 * (MAX_OVERLAP_M - overlaps(hand, link_transforms(hand, moved)))
 
 
-_room = jax.jit(_room_of, static_argnums=0)
-_room_change = jax.jit(jax.jacfwd(_room_of, 2), static_argnums=0)
+_clearance = jax.jit(_clearance_of, static_argnums=0)
+_clearance_jacobian = jax.jit(jax.jacfwd(_clearance_of, 2), static_argnums=0)

@@ -1,6 +1,5 @@
 """Graspable regions of captured objects: the parts or the points that fingers touch."""
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,12 +10,23 @@ from congrasp.common.io.inputs import safe_name
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
-from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
+from congrasp.services.assets.objects.affordance import (
+    SmallRegionError,
+    near_points,
+    relabelled,
+)
 from congrasp.services.assets.objects.assembly import UNLABELLED
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
-_TOUCHED_RADIUS = 0.03
-"""Radius around touched points that counts as touched, m."""
+"""Graspable region of a captured object.
+
+- parts: the labelled parts that fingers touch;
+- contacts: the surface around the touched points;
+- none: the whole surface;
+- auto: as parts if the object has labelled parts, else the whole surface.
+"""
+CONTACT_RADIUS_M = 0.03
+"""Surface points within this distance of a touched point are graspable (`contacts`)."""
 _MIN_CONTACT_POINTS = 3
 """Contact points that make a part of an object graspable."""
 
@@ -29,65 +39,112 @@ class _Part(NamedTuple):
     """(n, 3) in the object frame, m."""
 
 
+class _Partition(NamedTuple):
+    """P parts of an object, each in the graspable region or not."""
+
+    object_name: str
+    """Name of the object with these parts."""
+    part_names: list[str]
+    graspable: list[bool]
+    """(P,) True for parts of the graspable region."""
+    labels: np.ndarray
+    """(512,) int: part of each surface point of the object."""
+
+
 def with_touched_region(
     sequence: Sequence, obj: GraspObject, demonstration: Demonstration, affordance: Affordance
 ) -> GraspObject:
-    """Returns the object with a grasp's partition into graspable and avoid region.
+    """Returns the object with the graspable and the avoid region of a grasp.
 
-    It has a name of its own, unless the whole object is graspable.
+    It gets a name that differs from the object's, unless its whole surface is graspable.
 
     Args:
       sequence: the captured sequence.
       obj: its object.
       demonstration: the grasp.
-      affordance: see `build.Options`.
+      affordance: the graspable region.
 
     Raises:
       Dropped: the object has no labelled parts, or too small a region is touched.
     """
-    parts = _parts(sequence, obj)
+    parts = _labelled_parts(sequence, obj)
     if affordance == "none" or (affordance == "auto" and not parts):
         return obj
     if affordance == "contacts":
-        touched = near_points(obj, demonstration.contact, _TOUCHED_RADIUS)
-        name = safe_name(f"{obj.name}-{sequence.name}")
-        return _with_region(sequence, lambda: two_parts(obj, touched, name))
+        partition = _partition_by_contacts(sequence, obj, demonstration)
+    else:
+        partition = _partition_by_parts(sequence, obj, demonstration, parts)
+    try:
+        return relabelled(
+            obj,
+            partition.labels,
+            partition.part_names,
+            partition.graspable,
+            partition.object_name,
+        )
+    except SmallRegionError as error:
+        reason = str(error).split(". ")[0]
+        raise Dropped(sequence.name, "graspable region too small", reason) from None
+    except CongraspError as error:
+        raise Dropped(sequence.name, "unusable region", str(error)) from None
+
+
+def _partition_by_contacts(
+    sequence: Sequence, obj: GraspObject, demonstration: Demonstration
+) -> _Partition:
+    """Partition into the surface around touched points, and the rest."""
+    is_near_contact = near_points(obj, demonstration.contact, CONTACT_RADIUS_M)
+    return _Partition(
+        object_name=safe_name(f"{obj.name}-{sequence.name}"),
+        part_names=["grasp", "avoid"],
+        graspable=[True, False],
+        labels=np.where(is_near_contact, 0, 1),
+    )
+
+
+def _partition_by_parts(
+    sequence: Sequence, obj: GraspObject, demonstration: Demonstration, parts: list[_Part]
+) -> _Partition:
+    """Partition into the labelled parts; those with enough contact points are graspable.
+
+    Raises:
+      Dropped: there is no part, or none is touched.
+    """
     if not parts:
         raise Dropped(
             sequence.name,
             "no labelled parts",
             f"the parts of '{sequence.object_name}' are not labelled",
         )
-    counts = np.bincount(_nearest(parts, demonstration.contact), minlength=len(parts))
-    graspable = [bool(count >= _MIN_CONTACT_POINTS) for count in counts]
+    contact_parts = _nearest(parts, demonstration.contact)
+    contact_counts = np.bincount(contact_parts, minlength=len(parts))
+    graspable = [bool(count >= _MIN_CONTACT_POINTS) for count in contact_counts]
     if not any(graspable):
-        reason = f"fingers touch no part in {_MIN_CONTACT_POINTS} points ({counts.max()} at most)"
+        most = contact_counts.max()
+        reason = f"fingers touch no part in {_MIN_CONTACT_POINTS} points ({most} at most)"
         raise Dropped(sequence.name, "no part touched", reason)
-    names = [part.name for part in parts]
-    name = obj.name
+    object_name = obj.name
     if not all(graspable):
-        touched_names = [name for name, touched in zip(names, graspable, strict=True) if touched]
-        name = safe_name("-".join([obj.name, *touched_names]))
-    labels = _nearest(parts, obj.points)
-    return _with_region(sequence, lambda: relabelled(obj, labels, names, graspable, name))
+        touched = []
+        for part, is_graspable in zip(parts, graspable, strict=True):
+            if is_graspable:
+                touched.append(part.name)
+        object_name = safe_name("-".join([obj.name, *touched]))
+    return _Partition(
+        object_name=object_name,
+        part_names=[part.name for part in parts],
+        graspable=graspable,
+        labels=_nearest(parts, obj.points),
+    )
 
 
-def _parts(sequence: Sequence, obj: GraspObject) -> list[_Part]:
+def _labelled_parts(sequence: Sequence, obj: GraspObject) -> list[_Part]:
     """The parts labelled by the data set, or by the object's files."""
     if sequence.parts:
         return [_Part(part.name, part.points + obj.origin) for part in sequence.parts]
     if obj.part_names == UNLABELLED:
         return []
     return [_Part(name, obj.points[obj.labels == i]) for i, name in enumerate(obj.part_names)]
-
-
-def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspObject:
-    """The object of `make`; drops the sequence if its graspable region is too small."""
-    try:
-        return make()
-    except CongraspError as error:
-        reason = str(error).split(". ")[0]
-        raise Dropped(sequence.name, "graspable region too small", reason) from None
 
 
 def _nearest(parts: list[_Part], points: np.ndarray) -> np.ndarray:

@@ -150,14 +150,14 @@ def array_of(
     fixed_sizes = [size for size in shape if isinstance(size, int)]
     if len(fixed_sizes) == len(shape) and array.size == math.prod(fixed_sizes):
         return array.reshape(fixed_sizes)
-    if not _fits(array, shape):
+    if not _has_sizes(array, shape):
         raise Dropped(
             name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}"
         )
     return array
 
 
-def _fits(array: np.ndarray, shape: tuple[int | str, ...]) -> bool:
+def _has_sizes(array: np.ndarray, shape: tuple[int | str, ...]) -> bool:
     """True for an array of these sizes, where a letter matches any."""
     if array.ndim != len(shape):
         return False

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.objects.spec import GraspObject
 
-_SPACING = 0.0015
+_SAMPLE_SPACING_M = 0.0015
 """Distance of neighbouring samples, m."""
 _MIN_SAMPLES = 4000
 _MAX_SAMPLES = 40_000
@@ -17,7 +17,7 @@ class Surface:
 
     def __init__(self, obj: GraspObject):
         mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
-        count = int(np.clip(mesh.area / _SPACING**2, _MIN_SAMPLES, _MAX_SAMPLES))
+        count = int(np.clip(mesh.area / _SAMPLE_SPACING_M**2, _MIN_SAMPLES, _MAX_SAMPLES))
         points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
         self.points = np.asarray(points)
         self._normals = np.asarray(mesh.face_normals)[faces]

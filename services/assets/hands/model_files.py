@@ -13,7 +13,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import faults, hand_from_text, hand_text
-from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save_meshes
+from congrasp.common.hands.meshes import MAX_DISTANCE_M, Meshes, load_meshes, save_meshes
 from congrasp.common.hands.motors import fitting_scale
 from congrasp.common.hands.spec import Hand, Link, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
@@ -224,11 +224,11 @@ def _meshes(tree: Tree, notes: list[str]) -> Meshes:
         if mesh is None:
             continue
         vertices, _ = mesh
-        if np.abs(vertices).max() > MAX_DISTANCE:
+        if np.abs(vertices).max() > MAX_DISTANCE_M:
             too_far.append(tree.names[link])
         else:
             meshes[tree.names[link]] = mesh
     notes += listed(
-        f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped", too_far
+        f"drawn more than {MAX_DISTANCE_M:g} m from the palm (in mm?), and dropped", too_far
     )
     return meshes

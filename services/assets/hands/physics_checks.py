@@ -88,7 +88,7 @@ def grip_finding(grip: Grip, *, is_sound: bool) -> Finding:
       is_sound: False if another check failed, which explains this failure.
     """
     lifted, survives_half_weight, survives_newton = (
-        grip.survived[name] for name in protocols.SURVIVAL
+        grip.survived[name] for name in protocols.SURVIVAL_NAMES
     )
     verdict: Verdict
     if not grip.held:

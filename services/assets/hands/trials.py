@@ -306,7 +306,7 @@ def _disturbances(
       base: (T, 4) orientations of the wrist's base.
     """
     frame = protocols.frame(protocol, task, time + 0.5)
-    wrist = protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame)
+    wrist = protocols.targets_to_world_frame(jnp.zeros((len(time), 6)), hand, base, frame)
     everywhere = jnp.ones(len(time))
     pushes = []
     for n in range(count):
@@ -339,7 +339,7 @@ def _results(
     last_hold = _HOLD_STEPS - 1
     # It was released at the origin
     moved = np.linalg.norm(states.object_position[last_hold], axis=-1)
-    held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)
+    held = (moved < protocols.MAX_SHIFT_M) & ~states.diverged.any(0)
     survived = protocols.survival(positions[last_hold:], quaternions[last_hold:], held, task)
     touching = states.contact_found[last_hold].any(-1)
     results = []

@@ -29,9 +29,9 @@ from congrasp.services.assets.objects.mesh_files import (
     upright,
 )
 
-LEAST_SHARE = 0.10
+MIN_GRASPABLE_SHARE = 0.10
 """Share of the surface that the graspable region must have (paper, section Constraint Setup)."""
-_PART_DISTANCE = 0.003
+_MAX_PART_DISTANCE_M = 0.003
 """Distance from a part's mesh up to which a surface point belongs to the part, m."""
 _PART_SAMPLES = 8000
 """Points on a part's mesh."""
@@ -39,11 +39,15 @@ _BOX_TOLERANCE = 0.1
 """Tolerance of the bounding box of a painted file, as a share of the object's length."""
 _COLOUR_TOLERANCE = 60
 """Largest distance of two colours in RGB that count as one."""
-_LISTED_COLOURS = 5
+_MAX_LISTED_COLOURS = 5
 """Colours that a message lists."""
-_CUTS = (0.5, 0.65, 0.35, 0.8, 0.2)
+_CUT_SHARES = (0.5, 0.65, 0.35, 0.8, 0.2)
 """Shares of the surface points on the near side of a cut, in the order in which they are tried."""
 UNCOVERED = "none of its halves can be held without the other: it has no affordance"
+
+
+class SmallRegionError(CongraspError):
+    """The graspable region has less than `MIN_GRASPABLE_SHARE` of the surface."""
 
 
 def relabelled(
@@ -63,15 +67,15 @@ def relabelled(
       name: name of the new object; unchanged if empty.
 
     Raises:
-      CongraspError: the graspable region has less than a tenth of the surface.
+      SmallRegionError: the graspable region has less than a tenth of the surface.
     """
     labels = np.asarray(labels, np.int32)
     share = float(np.asarray(graspable, bool)[labels].mean())
-    if share < LEAST_SHARE:
-        raise CongraspError(
+    if share < MIN_GRASPABLE_SHARE:
+        raise SmallRegionError(
             f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
-            f"It must be at least {LEAST_SHARE:.0%}: select a larger part, or swap the regions "
-            f"with --invert.",
+            f"It must be at least {MIN_GRASPABLE_SHARE:.0%}: select a larger part, or swap the "
+            f"regions with --invert.",
         )
     return dataclasses.replace(
         obj,
@@ -172,15 +176,15 @@ def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
       CongraspError: the file cannot be read, or the part lies elsewhere.
     """
     distance = from_part(obj, path)
-    if distance.min() > _PART_DISTANCE:
+    if distance.min() > _MAX_PART_DISTANCE_M:
         raise CongraspError(
             f"{path} is {100 * distance.min():.1f} cm away from the surface of '{obj.name}'.",
             "Export the part in the frame and unit of the object's file.",
         )
-    return distance <= _PART_DISTANCE
+    return distance <= _MAX_PART_DISTANCE_M
 
 
-def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) -> np.ndarray:
+def find_painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) -> np.ndarray:
     """Returns (512,) bool: surface points whose nearest vertex in a file has a colour.
 
     Args:
@@ -264,11 +268,11 @@ def cut_to_hold(obj: GraspObject) -> GraspObject:
     make the graspable half larger or smaller. If no half can be held in any resting pose, a note is
     added.
     """
-    coverable = int(covered(obj, use_affordance=False).sum())
+    coverable = int(find_covered_rests(obj, use_affordance=False).sum())
     best = obj
     best_covered = -1
     for candidate in _cuts(obj):
-        candidate_covered = int(covered(candidate).sum())
+        candidate_covered = int(find_covered_rests(candidate).sum())
         if candidate_covered > best_covered:
             best = candidate
             best_covered = candidate_covered
@@ -279,7 +283,7 @@ def cut_to_hold(obj: GraspObject) -> GraspObject:
     return dataclasses.replace(best, notes=(*best.notes, UNCOVERED))
 
 
-def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
+def find_covered_rests(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
     """Returns (R,) bool: resting poses in which the human hand has a heading.
 
     Args:
@@ -304,7 +308,7 @@ def _cuts(obj: GraspObject) -> Iterator[GraspObject]:
     """Yields the object with its current partition, then with others."""
     yield obj
     first = int(np.flatnonzero(obj.graspable)[0])
-    for cut in _CUTS:
+    for cut in _CUT_SHARES:
         labels = halves(obj.points, cut)
         for half in (first, 1 - first):
             is_current = cut == 0.5 and half == first
@@ -315,4 +319,4 @@ def _cuts(obj: GraspObject) -> Iterator[GraspObject]:
 def _commonest(rgb: np.ndarray) -> np.ndarray:
     """The most frequent colours (n, 3) among rows (N, 3)."""
     colours, counts = np.unique(rgb, axis=0, return_counts=True)
-    return colours[np.argsort(-counts)[:_LISTED_COLOURS]]
+    return colours[np.argsort(-counts)[:_MAX_LISTED_COLOURS]]

@@ -7,15 +7,15 @@ import trimesh
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
-from congrasp.services.assets.objects.units import LONGEST
+from congrasp.services.assets.objects.units import MAX_LENGTH_M
 
 _MAX_FLATNESS = 0.08
 """Greatest thickness of a table, as a share of its width."""
 _MIN_TABLE_RATIO = 2
 """Width of a table relative to that of the object on it."""
-_MIN_OBJECT = 0.03
+_MIN_OBJECT_LENGTH_M = 0.03
 """Least length of what is left of a scan without its table, m."""
-_MAX_GAP = 0.02
+_MAX_BOX_GAP = 0.02
 """Distance of the boxes of bodies that belong together, as a share of the mesh's size."""
 
 
@@ -40,10 +40,10 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     if labels.max() == 0:
         return mesh
-    margin = _MAX_GAP / 2 * mesh.scale
+    margin = _MAX_BOX_GAP / 2 * mesh.scale
     boxes = _boxes(np.asarray(mesh.vertices), labels)
     boxes = _Boxes(boxes.low - margin, boxes.high + margin)
-    body = _joined(boxes)
+    body = _join_touching(boxes)
     bodies_count = len(np.unique(body))
     if bodies_count == 1:
         return mesh
@@ -61,7 +61,8 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> trimesh.Trimesh:
-    """Returns a scan longer than `LONGEST` without its table: a flat, wide body, and the longest.
+    """Returns a scan longer than `MAX_LENGTH_M` without its table: its longest body, if that is
+    flat and wide.
 
     The rest, without debris, must be at least 3 cm long and lie on one side of the table; otherwise
     the scan is returned unchanged.
@@ -71,7 +72,7 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
       metres: metres per unit.
       notes: a table is appended.
     """
-    if mesh.extents.max() * metres <= LONGEST:
+    if mesh.extents.max() * metres <= MAX_LENGTH_M:
         return mesh
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     boxes = _boxes(mesh.vertices, labels)
@@ -83,7 +84,7 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
     rest_notes: list[str] = []
     rest = largest_body(rest, rest_notes)
     ratio = _table_ratio(mesh.vertices[is_table], rest.vertices)
-    if ratio is None or rest.extents.max() * metres < _MIN_OBJECT:
+    if ratio is None or rest.extents.max() * metres < _MIN_OBJECT_LENGTH_M:
         return mesh
     notes.append(f"a flat body {ratio:.1f} times as wide as the rest was left out: a table")
     notes += rest_notes
@@ -133,7 +134,7 @@ def _boxes(vertices: np.ndarray, labels: np.ndarray) -> _Boxes:
     return _Boxes(low, high)
 
 
-def _joined(boxes: _Boxes) -> np.ndarray:
+def _join_touching(boxes: _Boxes) -> np.ndarray:
     """(C,) body of each component: those whose boxes touch are one, from the largest on."""
     low, high = boxes
     body = np.arange(len(low))

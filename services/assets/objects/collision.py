@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from congrasp.common.objects import shapes
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.decompose import CUT_DEPTH, Decomposition, decompose
+from congrasp.services.assets.objects.decompose import CUT_DEPTH_M, Decomposition, decompose
 from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
 from congrasp.services.assets.objects.hulls import corners_of, simplify
 from congrasp.services.assets.objects.merging import merge
@@ -72,7 +72,7 @@ def convex_pieces(
       scipy.spatial.QhullError: the object has no volume.
     """
     if not own_pieces:
-        cut = _cut(surfaces, options, notes)
+        cut = _cut_or_fill(surfaces, options, notes)
         notes.append(str(cut))
         return cut
     hulls = merge(list(own_pieces), options.max_pieces, surfaces.triangles, surfaces.volume)
@@ -80,16 +80,16 @@ def convex_pieces(
         notes.append(
             f"its {len(own_pieces)} convex pieces were merged into {len(hulls)} (--max-pieces)"
         )
-    merged = _simplified(surfaces, hulls, [0] * len(hulls))
-    if merged.errors.excess <= 1 or not has_surface:
+    merged = _collision_of(surfaces, hulls, [0] * len(hulls))
+    if merged.errors.tolerance_ratio <= 1 or not has_surface:
         notes.append(f"its own {merged}")
         return merged
     cut_notes: list[str] = []
     try:
-        cut = _cut(surfaces, options, cut_notes)
+        cut = _cut_or_fill(surfaces, options, cut_notes)
     except QhullError:
         cut = merged  # the surface lies in a plane
-    if cut.errors.excess < merged.errors.excess:
+    if cut.errors.tolerance_ratio < merged.errors.tolerance_ratio:
         notes.extend(cut_notes)
         notes.append(
             f"{cut}; they were cut from its mesh, for its own {len(merged.hulls)} are coarser: "
@@ -100,7 +100,7 @@ def convex_pieces(
     return merged
 
 
-def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collision:
+def _cut_or_fill(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collision:
     """A decomposition of each mesh, or the hulls of the meshes if those are closer.
 
     Each mesh may have pieces according to its share of the volume. Pieces that are too coarse are
@@ -110,20 +110,20 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
     volumes = np.array([hull.volume for hull in mesh_hulls])
     limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
     cut_notes: list[str] = []
-    cut = _cut_to_depth(surfaces, limits, CUT_DEPTH, cut_notes)
+    cut = _cut_to_depth(surfaces, limits, CUT_DEPTH_M, cut_notes)
     count = len(cut.hulls)
     is_convex = count == len(mesh_hulls)
-    if cut.errors.excess > 1 and not is_convex and count < options.max_pieces:
+    if cut.errors.tolerance_ratio > 1 and not is_convex and count < options.max_pieces:
         finer_notes: list[str] = []
-        finer = _cut_to_depth(surfaces, limits, CUT_DEPTH / 2, finer_notes)
-        if finer.errors.excess < cut.errors.excess:
+        finer = _cut_to_depth(surfaces, limits, CUT_DEPTH_M / 2, finer_notes)
+        if finer.errors.tolerance_ratio < cut.errors.tolerance_ratio:
             cut = finer
             cut_notes = finer_notes
     notes += cut_notes
-    if cut.errors.excess <= 1 or is_convex:
+    if cut.errors.tolerance_ratio <= 1 or is_convex:
         return cut
-    filled = _filled(surfaces, mesh_hulls)
-    if filled.errors.excess < cut.errors.excess:
+    filled = _hulls_of_meshes(surfaces, mesh_hulls)
+    if filled.errors.tolerance_ratio < cut.errors.tolerance_ratio:
         notes.append(
             f"its convex hull is closer to its shape than {len(cut.hulls)} pieces ({cut.errors}): "
             f"hollows are filled"
@@ -150,7 +150,7 @@ def _cut_to_depth(
         notes += decomposition.notes
         hulls += decomposition.pieces
         owners += [owner] * len(decomposition.pieces)
-    return _simplified(surfaces, hulls, owners)
+    return _collision_of(surfaces, hulls, owners)
 
 
 def _cut_mesh(surfaces: Surfaces, owner: int, max_pieces: int, depth: float) -> Decomposition:
@@ -172,13 +172,13 @@ def _cut_mesh(surfaces: Surfaces, owner: int, max_pieces: int, depth: float) -> 
     )
 
 
-def _filled(surfaces: Surfaces, mesh_hulls: Sequence[ConvexHull]) -> Collision:
+def _hulls_of_meshes(surfaces: Surfaces, mesh_hulls: Sequence[ConvexHull]) -> Collision:
     """The hull of each mesh."""
     corners = [corners_of(hull) for hull in mesh_hulls]
-    return _simplified(surfaces, corners, list(range(len(corners))))
+    return _collision_of(surfaces, corners, list(range(len(corners))))
 
 
-def _simplified(surfaces: Surfaces, pieces: list[np.ndarray], owners: list[int]) -> Collision:
+def _collision_of(surfaces: Surfaces, pieces: list[np.ndarray], owners: list[int]) -> Collision:
     """Pieces (V, 3) of few vertices, and their errors."""
     hulls = [simplify(piece) for piece in pieces]
     is_closed = surfaces.volume is not None

@@ -16,10 +16,10 @@ from congrasp.services.assets.objects.options import Up
 
 _DEFAULT_COLOUR = (102, 102, 102)
 """Colour of a material in trimesh whose file does not specify one."""
-_DENSITY = 8
+_CANDIDATES_PER_POINT = 8
 """Points that are compared, for each point of the result."""
 _NEIGHBOURS = 6
-_LEAST_CHANGE = 1e-3
+_EVEN_CHANGE = 1e-3
 """Change of colour that an even surface has, so that its points can be drawn."""
 
 
@@ -87,11 +87,11 @@ def _sample_meshes(meshes: list[trimesh.Trimesh], rng: np.random.Generator) -> C
     The first half is spread evenly over the surfaces. The other half is where colours change, so
     that their edges are known to a fraction of a millimetre.
     """
-    dense = _sample_evenly(meshes, _DENSITY * COLOUR_POINTS, rng)
+    dense = _sample_evenly(meshes, _CANDIDATES_PER_POINT * COLOUR_POINTS, rng)
     order = rng.permutation(len(dense.points))
     even = order[: COLOUR_POINTS // 2]
     others = order[COLOUR_POINTS // 2 :]
-    changes = _changes(dense)[others] + _LEAST_CHANGE
+    changes = _changes(dense)[others] + _EVEN_CHANGE
     count = COLOUR_POINTS - len(even)
     at_edges = rng.choice(others, count, replace=False, p=changes / changes.sum())
     chosen = np.concatenate([even, at_edges])

@@ -25,31 +25,31 @@ from congrasp.services.assets.objects.bodies import bodies
 from congrasp.services.assets.objects.hulls import corners_of, deepest, solid_hull
 from congrasp.services.assets.objects.interior import enclosed
 from congrasp.services.assets.objects.manifold import manifold
-from congrasp.services.assets.objects.merging import DEPTH, GROWTH, merge
+from congrasp.services.assets.objects.merging import MAX_JOIN_DEPTH_M, MAX_JOIN_GROWTH, merge
 
-CUT_DEPTH = 2 * DEPTH
+CUT_DEPTH_M = 2 * MAX_JOIN_DEPTH_M
 """Depth of a hollow in a piece from which it is cut, m, at first."""
 _WALL_COARSENESS = 1.5
 """Depth for an open surface relative to a closed one's: it becomes a thin wall, which a finer cut
 would divide into hundreds of pieces.
 """
-PROCESSOR_LIMIT = 300.0
+MAX_PROCESSOR_S = 300.0
 """Processor time of a decomposer, s, after which the import is an error; most take 1 to 15 s."""
-STARVED = 20.0
+MAX_WALL_CLOCK_RATIO = 20.0
 """Ratio of wall-clock to processor time above which the machine counts as too busy."""
-LEAST_MEMORY = 2 << 30
+MIN_CHILD_MEMORY_BYTES = 2 << 30
 """Bytes of memory for which a child is started."""
-_ADDRESS_SPACE = 6 << 30
+_ADDRESS_SPACE_BYTES = 6 << 30
 """Bytes of address space of a child: the same on every machine."""
-_FINEST_THRESHOLD = 0.01
+_MIN_THRESHOLD = 0.01
 """The smallest threshold that CoACD takes, as a share of half the longest side."""
 _SEARCH = {"mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1, "resolution": 1500}
 """Work of CoACD for each cut. Measured: fine cuts that are joined afterwards are as faithful as a
 longer search, in a third of the time.
 """
-_RESOLUTION = 50
+_REPAIR_CELLS = 50
 """Cells along a closed surface that is repaired by CoACD."""
-_WALL_RESOLUTION = 40
+_WALL_CELLS = 40
 """Cells along an open surface from which CoACD makes a thin wall."""
 _MAX_VHACD_HULLS = 1 << 20
 _MESH = "mesh.npz"
@@ -86,7 +86,7 @@ def decompose(
     volume: float | None,
     max_pieces: int = MAX_MESH_PIECES,
     shown: np.ndarray | None = None,
-    depth: float = CUT_DEPTH,
+    depth: float = CUT_DEPTH_M,
 ) -> Decomposition:
     """Decomposes a triangle mesh into as few convex pieces as preserve its shape.
 
@@ -101,7 +101,7 @@ def decompose(
       depth: depth of a hollow in a piece from which it is cut, m.
 
     Raises:
-      CongraspError: a decomposer exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for
+      CongraspError: a decomposer exceeds `MAX_PROCESSOR_S`, or the machine lacks time or memory for
         it.
     """
     if shown is None:
@@ -114,7 +114,7 @@ def decompose(
     for method in ("coacd", "vhacd"):
         cut = _Cut(method=method, volume=volume, max_pieces=max_pieces, depth=depth)
         try:
-            pieces = _in_child(mesh, cut)
+            pieces = _cut_in_child(mesh, cut)
             return Decomposition(pieces, method, notes)
         except ChildProcessError as error:
             notes.append(f"{method} {error}")
@@ -122,7 +122,7 @@ def decompose(
     return Decomposition([corners_of(hull)], "hull", notes)
 
 
-def _in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
+def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
     """Vertices (V, 3) of the pieces that a confined process cuts.
 
     Args:
@@ -130,10 +130,10 @@ def _in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
       cut: options of the cut.
 
     Raises:
-      CongraspError: it exceeds `PROCESSOR_LIMIT`, or the machine lacks time or memory for it.
+      CongraspError: it exceeds `MAX_PROCESSOR_S`, or the machine lacks time or memory for it.
       ChildProcessError: it failed, or found no piece; a predicate without a subject.
     """
-    patience = STARVED * PROCESSOR_LIMIT + STARVED
+    patience = MAX_WALL_CLOCK_RATIO * MAX_PROCESSOR_S + MAX_WALL_CLOCK_RATIO
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder = pathlib.Path(name)
         np.savez(folder / _MESH, **mesh)
@@ -142,13 +142,13 @@ def _in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
                 write_pieces,
                 folder,
                 cut._asdict(),
-                memory=_ADDRESS_SPACE,
-                seconds=PROCESSOR_LIMIT,
+                memory=_ADDRESS_SPACE_BYTES,
+                seconds=MAX_PROCESSOR_S,
                 patience=patience,
             )
         except TimeoutError:
             raise CongraspError(
-                f"The machine is too busy: {cut.method} got less than {PROCESSOR_LIMIT:g} s of "
+                f"The machine is too busy: {cut.method} got less than {MAX_PROCESSOR_S:g} s of "
                 f"processor time in {patience:.0f} s.",
                 "Stop other programs and try again.",
             ) from None
@@ -224,9 +224,9 @@ def _body_by_coacd(
     is_manifold = closed and is_watertight(faces_to_edges(faces))[0]
     pieces = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
-        threshold=min(1.0, max(_FINEST_THRESHOLD, depth / size)),
+        threshold=min(1.0, max(_MIN_THRESHOLD, depth / size)),
         preprocess_mode="off" if is_manifold else "auto",
-        preprocess_resolution=_RESOLUTION if closed else _WALL_RESOLUTION,
+        preprocess_resolution=_REPAIR_CELLS if closed else _WALL_CELLS,
         merge=False,
         seed=0,
         **_SEARCH,
@@ -242,4 +242,6 @@ def _is_convex(hull: ConvexHull, triangles: np.ndarray, volume: float) -> bool:
       triangles: (F, 3, 3) of the mesh, m.
       volume: of the mesh, m^3.
     """
-    return volume > (1 - GROWTH) * hull.volume and deepest(hull, triangles) < DEPTH
+    return (
+        volume > (1 - MAX_JOIN_GROWTH) * hull.volume and deepest(hull, triangles) < MAX_JOIN_DEPTH_M
+    )

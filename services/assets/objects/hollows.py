@@ -8,8 +8,8 @@ from congrasp.services.assets.objects.holes import fill, hole_loops
 from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.voxels import voxels
 
-OPENING = 0.01
-"""Width of an opening that no finger enters, m."""
+MAX_OPENING_M = 0.01
+"""Width of an opening that no finger enters."""
 _PROBE_STEPS = (1.0, 1.5, 2.0)
 """Steps from a triangle to the cubes before it, in sides of a cube."""
 _VOLUME_RATIOS = (0.8, 1.2)
@@ -19,17 +19,18 @@ _VOLUME_RATIOS = (0.8, 1.2)
 def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """Returns a closed mesh without the walls of hollows, whose openings are closed.
 
-    A hollow is where a ball as wide as `OPENING` fits that cannot get out; it ends where one from
-    outside gets to. The mesh is returned unchanged if its openings cannot be closed.
+    A hollow is a space in which a ball as wide as `MAX_OPENING_M` fits but cannot leave it; it ends
+    where a ball from outside can get to. The mesh is returned unchanged if its openings cannot be
+    closed.
     """
-    cubes = voxels(np.asarray(mesh.triangles), OPENING)
+    cubes = voxels(np.asarray(mesh.triangles), MAX_OPENING_M)
     outside = ~cubes.inside
-    fits_ball = distance_transform_edt(outside, cubes.spacing) > OPENING / 2
+    fits_ball = distance_transform_edt(outside, cubes.spacing) > MAX_OPENING_M / 2
     spaces, count = label(fits_ball)
     if count < 2:
         return mesh
     outer = spaces == spaces[0, 0, 0]
-    reached = distance_transform_edt(~outer, cubes.spacing) < OPENING / 2 + cubes.spacing
+    reached = distance_transform_edt(~outer, cubes.spacing) < MAX_OPENING_M / 2 + cubes.spacing
     hollow = binary_propagation((spaces > 0) & ~outer, mask=outside & ~reached)
     centers = np.asarray(mesh.triangles_center)
     normals = np.asarray(mesh.face_normals)

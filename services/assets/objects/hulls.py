@@ -8,7 +8,7 @@ from congrasp.common.objects.spec import MAX_MESH_VERTICES
 
 SURFACE_SAMPLES = 6000
 """Points on an object's surface, whose depths in a hull are computed."""
-_MIN_VOLUME = 1e-11
+_MIN_VOLUME_M3 = 1e-11
 """Volume of the smallest piece, m^3."""
 
 
@@ -18,7 +18,7 @@ def solid_hull(vertices: np.ndarray) -> ConvexHull | None:
         hull = shapes.hull_of(vertices)
     except QhullError:
         return None
-    return hull if hull.volume > _MIN_VOLUME else None
+    return hull if hull.volume > _MIN_VOLUME_M3 else None
 
 
 def corners_of(hull: ConvexHull) -> np.ndarray:

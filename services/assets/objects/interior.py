@@ -8,8 +8,8 @@ from trimesh.triangles import mass_properties
 from congrasp.common.objects import shapes
 from congrasp.services.assets.objects.rays import Crossings, cast_rays, grid_of, intervals
 
-SEAM = 4e-4
-"""Width of a gap that counts as closed, m."""
+SEAM_WIDTH_M = 4e-4
+"""Gaps along a ray that are narrower than this count as closed."""
 _MIN_OVERLAP = 1e-3
 """Share of its volume that a mesh may count twice."""
 
@@ -88,7 +88,7 @@ def interior(triangles: np.ndarray, count: int) -> np.ndarray:
     starts = []
     ends = []
     for crossings in cast_rays(triangles, grid):
-        entries, exits, _ = intervals(crossings, SEAM / grid.spacing)
+        entries, exits, _ = intervals(crossings, SEAM_WIDTH_M / grid.spacing)
         starts.append(crossings.points[entries])
         ends.append(crossings.points[exits])
     start = np.concatenate(starts)

@@ -13,13 +13,13 @@ from congrasp.services.assets.objects.interior import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import Material, materials_of
 from congrasp.services.assets.objects.repair import encloses
 
-DENSITIES = (500.0, 2500.0)
+DENSITY_LIMITS = (500.0, 2500.0)
 """Limits of the density of an object of unknown material, kg/m^3."""
-PER_SURFACE = 4.0
+MASS_PER_SURFACE = 4.0
 """Mass of an object of unknown material per surface, kg/m^2: 2 mm of wall at 2,000 kg/m^3."""
-HEAVIEST_GUESS = 0.5
+MAX_GUESSED_MASS_KG = 0.5
 """Largest mass of an object of unknown material, kg."""
-_SHEET = 5e-4
+_MAX_SHEET_THICKNESS_M = 5e-4
 """Mean thickness below which an open mesh is a sheet without thickness, m."""
 
 
@@ -52,7 +52,7 @@ def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
     thickness = mean_thickness(mesh)
     if thickness > material.thickest:
         return True
-    return not encloses(mesh) and thickness < _SHEET
+    return not encloses(mesh) and thickness < _MAX_SHEET_THICKNESS_M
 
 
 def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> Weight:
@@ -157,9 +157,9 @@ def guessed_mass(volume: float, area: float) -> float:
       volume: m^3.
       area: of its surface, m^2.
     """
-    lowest, highest = DENSITIES
-    mass = max(PER_SURFACE * area, lowest * volume)
-    return min(mass, highest * volume, HEAVIEST_GUESS)
+    lowest, highest = DENSITY_LIMITS
+    mass = max(MASS_PER_SURFACE * area, lowest * volume)
+    return min(mass, highest * volume, MAX_GUESSED_MASS_KG)
 
 
 def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObject:

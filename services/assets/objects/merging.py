@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from congrasp.common.objects import shapes
-from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
+from congrasp.services.assets.objects.fidelity import MAX_SURFACE_ERROR_M, MAX_VOLUME_ERROR
 from congrasp.services.assets.objects.hulls import (
     SURFACE_SAMPLES,
     corners_of,
@@ -23,17 +23,17 @@ from congrasp.services.assets.objects.hulls import (
 from congrasp.services.assets.objects.interior import interior
 from congrasp.services.assets.objects.voxels import voxels
 
-DEPTH = 1.5e-3
+MAX_JOIN_DEPTH_M = 1.5e-3
 """Largest depth of the surface in a hull, or distance of the hull from it, for joins below the
-limit of pieces, m.
+limit of pieces.
 """
-GROWTH = 0.02
+MAX_JOIN_GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
-_HULL_PROBES = 200
+_PROBES_PER_HULL = 200
 """Points on the hull of two pieces, whose distances from the mesh are computed."""
 _DIRECTIONS = 300
 """Directions whose extreme vertices larger hulls are reduced to."""
-_NEIGHBOUR_DISTANCE = 5e-4
+_MAX_NEIGHBOUR_GAP_M = 5e-4
 """Largest gap between neighbouring pieces, m."""
 _INNER_POINTS = 60_000
 """Points inside of the mesh."""
@@ -45,7 +45,7 @@ _MIN_HOLLOW_SHARE = 0.03
 """Hollow share of its hull from which a piece is thinned."""
 _MAX_THINNING = 0.9
 """Largest share by which a piece is thinned."""
-_MAX_WALL = 0.02
+_MAX_WALL_M = 0.02
 """Thickness of a wall, m; thicker pieces are not thinned."""
 
 
@@ -58,8 +58,8 @@ class _Part(NamedTuple):
     hollow: float
     """Volume of its hull before it was thinned, without that of the mesh in it, m^3."""
     error: float
-    """Largest of the way that thinning moves a side, the depth of the surface in it, and its
-    distance from it, m.
+    """Largest of three lengths, m: the shift of a side by thinning, the depth of the surface in the
+    piece, and the piece's distance from the surface.
     """
 
 
@@ -80,8 +80,8 @@ class _Merger:
         """Takes the arguments of `merge`."""
         random = np.random.default_rng(0)
         surface = shapes.on_triangles(triangles, random.random((SURFACE_SAMPLES, 3)))[0]
-        self._surface = _sorted(surface)
-        self._probes = random.random((_HULL_PROBES, 3))
+        self._surface = _sort_by_x(surface)
+        self._probes = random.random((_PROBES_PER_HULL, 3))
         self._directions = random.normal(size=(3, _DIRECTIONS))
         hulls = [hull for hull in map(solid_hull, pieces) if hull is not None]
         if volume is None:
@@ -91,8 +91,8 @@ class _Merger:
             triangles = np.concatenate([mesh.triangles for mesh in hull_meshes])
         else:
             self._volume = volume
-            self._inner = _sorted(interior(triangles, _INNER_POINTS))
-        self._voxels = voxels(triangles, MOST_SURFACE)
+            self._inner = _sort_by_x(interior(triangles, _INNER_POINTS))
+        self._voxels = voxels(triangles, MAX_SURFACE_ERROR_M)
         self._distance = distance_transform_edt(~self._voxels.inside, self._voxels.spacing)
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
         self._count = len(self.parts)
@@ -100,7 +100,7 @@ class _Merger:
         self._joins: list[_Join] = []
         for i in self.parts:
             for j in range(i):
-                if _touch(self.parts[i].hull, self.parts[j].hull):
+                if _are_neighbours(self.parts[i].hull, self.parts[j].hull):
                     self._neighbors[i].add(j)
                     self._neighbors[j].add(i)
                     self._add_join(i, j)
@@ -112,7 +112,7 @@ class _Merger:
         shift = 0.0
         if self._inner is not None:
             hollow_share = self._hollow_share(hull, self._inner)
-            thinned, shift = _thinned(hull, hollow_share)
+            thinned, shift = _thin(hull, hollow_share)
         near_surface = _in_box(thinned, self._surface)
         depth = -signed_distances(thinned, near_surface).min(initial=0.0)
         probes, _, _ = shapes.on_triangles(thinned.points[thinned.simplices], self._probes)
@@ -140,8 +140,8 @@ class _Merger:
             if join.first not in self.parts or join.second not in self.parts:
                 continue
             is_optional = len(self.parts) <= max_pieces
-            too_coarse = join.part.error > DEPTH
-            too_large = grown + join.growth > GROWTH * self._volume
+            too_coarse = join.part.error > MAX_JOIN_DEPTH_M
+            too_large = grown + join.growth > MAX_JOIN_GROWTH * self._volume
             if is_optional and (too_coarse or too_large):
                 continue
             grown += join.growth
@@ -158,7 +158,7 @@ class _Merger:
         part = self._part(shapes.hull_of(vertices))
         growth = max(0.0, part.hull.volume - first.hull.volume - second.hull.volume)
         filled = max(0.0, part.hollow - first.hollow - second.hollow)
-        cost = part.error / MOST_SURFACE + filled / (MOST_VOLUME * self._volume)
+        cost = part.error / MAX_SURFACE_ERROR_M + filled / (MAX_VOLUME_ERROR * self._volume)
         join = _Join(cost=cost, first=i, second=j, growth=growth, part=part)
         heapq.heappush(self._joins, join)
 
@@ -183,10 +183,10 @@ def merge(
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
     The cost of a join is the volume that it adds and its deviation from the surface, each as a
-    share of the tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of
-    the deepest surface point in the piece, the way that thinning moves its sides, or the distance
-    of its farthest point from the mesh, by samples. Pieces that do not touch are never joined, so
-    that more than `max_pieces` remain if there are more separate bodies.
+    share of the tolerance (`fidelity.MAX_VOLUME_ERROR`, `MAX_SURFACE_ERROR_M`). The deviation is
+    the depth of the deepest surface point in the piece, the way that thinning moves its sides, or
+    the distance of its farthest point from the mesh, by samples. Pieces that do not touch are never
+    joined, so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
@@ -199,27 +199,28 @@ def merge(
     return [corners_of(part.hull) for part in merger.parts.values()]
 
 
-def _thinned(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
-    """The hull without its hollow share, along its shortest axis, and the way of its sides, m.
+def _thin(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
+    """Returns the hull made thinner along its shortest axis by its hollow share, and the shift of
+    its sides, m.
 
     The hull is unchanged if it is full, or too thick for a wall.
     """
     vertices = corners_of(hull)
     axis = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2][-1]
     along = vertices @ axis
-    if hollow_share <= _MIN_HOLLOW_SHARE or np.ptp(along) >= _MAX_WALL:
+    if hollow_share <= _MIN_HOLLOW_SHARE or np.ptp(along) >= _MAX_WALL_M:
         return hull, 0.0
     middle = (along.max() + along.min()) / 2
     inwards = min(hollow_share, _MAX_THINNING) * (middle - along)
     largest = np.abs(inwards).max()
-    shift = min(MOST_SURFACE, largest)
+    shift = min(MAX_SURFACE_ERROR_M, largest)
     return shapes.hull_of(vertices + np.outer(inwards * shift / largest, axis)), shift
 
 
-def _touch(first: ConvexHull, second: ConvexHull) -> bool:
+def _are_neighbours(first: ConvexHull, second: ConvexHull) -> bool:
     """True if the boxes around two hulls touch, and no side of one separates it from the other."""
-    before = (first.min_bound < second.max_bound + _NEIGHBOUR_DISTANCE).all()
-    after = (second.min_bound < first.max_bound + _NEIGHBOUR_DISTANCE).all()
+    before = (first.min_bound < second.max_bound + _MAX_NEIGHBOUR_GAP_M).all()
+    after = (second.min_bound < first.max_bound + _MAX_NEIGHBOUR_GAP_M).all()
     if not (before and after):
         return False
     return not (_separates(first, second) or _separates(second, first))
@@ -228,10 +229,10 @@ def _touch(first: ConvexHull, second: ConvexHull) -> bool:
 def _separates(hull: ConvexHull, other: ConvexHull) -> bool:
     """True if all of another hull is in front of one side of a hull."""
     distances = corners_of(other) @ hull.equations[:, :3].T + hull.equations[:, 3]
-    return bool((distances.min(0) > _NEIGHBOUR_DISTANCE).any())
+    return bool((distances.min(0) > _MAX_NEIGHBOUR_GAP_M).any())
 
 
-def _sorted(points: np.ndarray) -> np.ndarray:
+def _sort_by_x(points: np.ndarray) -> np.ndarray:
     """Points (N, 3) in the order of their first coordinate."""
     return points[np.argsort(points[:, 0])]
 

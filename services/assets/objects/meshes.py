@@ -16,7 +16,11 @@ from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects.assembly import assemble
-from congrasp.services.assets.objects.decompose import LEAST_MEMORY, PROCESSOR_LIMIT, STARVED
+from congrasp.services.assets.objects.decompose import (
+    MAX_PROCESSOR_S,
+    MAX_WALL_CLOCK_RATIO,
+    MIN_CHILD_MEMORY_BYTES,
+)
 from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sources import Source
@@ -84,11 +88,11 @@ def import_sources(
                 except Exception as error:  # raised in the caller's thread
                     done.put((i, error))
 
-    processes_in_memory = max(1, memory() // LEAST_MEMORY)
+    processes_in_memory = max(1, memory() // MIN_CHILD_MEMORY_BYTES)
     for _ in range(min(len(sources), cores(), processes_in_memory)):
         threading.Thread(target=work, daemon=True).start()
     most_meshes = max((len(source.visuals) for source in sources), default=0)
-    patience = STARVED * most_meshes * PROCESSOR_LIMIT + _PATIENCE_S
+    patience = MAX_WALL_CLOCK_RATIO * most_meshes * MAX_PROCESSOR_S + _PATIENCE_S
     try:
         for _ in sources:
             i, result = done.get(timeout=patience)

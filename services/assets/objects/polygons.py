@@ -9,7 +9,7 @@ _MAX_CORNERS_IN_FILE = 20_000
 """Corners of all cut polygons of more than four corners."""
 _POLYGONS_AT_A_TIME = 4096
 """Polygons whose corners stay in the processor's cache."""
-_MIN_DENT = 0.01
+_MIN_DENT_SINE = 0.01
 """Sine of the least turn of a corner against the others."""
 _MAX_AREA_ERROR = 1e-6
 """Relative difference between the areas of a polygon and of its triangles. It is larger if the
@@ -84,7 +84,7 @@ def _dents(points: np.ndarray, polygons: np.ndarray) -> np.ndarray:
     """(m, n) bool, True for corners of polygons (m, n) that turn against the others."""
     batches = np.array_split(polygons, len(polygons) // _POLYGONS_AT_A_TIME + 1)
     turns = np.concatenate([_turns(points[batch]) for batch in batches])
-    return turns < -_MIN_DENT
+    return turns < -_MIN_DENT_SINE
 
 
 def _cut_quadrangle(is_dent: np.ndarray) -> Triangles:

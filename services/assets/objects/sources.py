@@ -14,7 +14,7 @@ from congrasp.services.assets.objects.file_kinds import CONVERT, SUFFIXES
 from congrasp.services.assets.objects.mesh_files import read_mesh
 
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
-_NO_PART_POSITION = 0.346408
+_NO_PART_POSITION_M = 0.346408
 """Coordinates (m) of the 1 cm cube by which GraspXL marks the absence of a non-graspable part."""
 _NO_PART_TOLERANCE = 0.01
 
@@ -206,4 +206,4 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
 def _marks_absence(file: pathlib.Path) -> bool:
     """True for the cube of GraspXL that replaces a part."""
     middle = read_mesh(file).bounds.mean(0)
-    return np.allclose(middle, _NO_PART_POSITION, atol=_NO_PART_TOLERANCE)
+    return np.allclose(middle, _NO_PART_POSITION_M, atol=_NO_PART_TOLERANCE)

@@ -8,11 +8,11 @@ from congrasp.services.assets.objects.sizes import length, lengths
 Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
-LONGEST = 1.0
+MAX_LENGTH_M = 1.0
 """Longest side that a unit of the user may give, m."""
-_MIN_THICKNESS = 2e-4
+_MIN_THICKNESS_M = 2e-4
 """Thickness of an object that is not flat, m."""
-_PROPOSED_SIZE = 0.1
+_MAX_SIZE_FOR_SCALE_M = 0.1
 """Longest side for which --scale is proposed, m."""
 
 
@@ -27,11 +27,11 @@ class _Lengths(NamedTuple):
         return self.low <= length <= self.high
 
 
-_IN_METRES = _Lengths(0.01, 0.6)
+_SIZES_IN_METRES = _Lengths(0.01, 0.6)
 """Sizes for which numbers are taken as metres."""
-_POSSIBLE = _Lengths(0.005, LONGEST)
+_POSSIBLE_SIZES = _Lengths(0.005, MAX_LENGTH_M)
 """Sizes that the user's unit may give."""
-_LIKELY = _Lengths(0.02, 0.4)
+_LIKELY_SIZES = _Lengths(0.02, 0.4)
 """Sizes for which a unit is proposed."""
 
 
@@ -58,7 +58,7 @@ def metres_per_unit(
         )
     is_open = unit in ("auto", "guess")
     assumed: str = "m" if is_open else unit
-    allowed = _IN_METRES if is_open else _POSSIBLE
+    allowed = _SIZES_IN_METRES if is_open else _POSSIBLE_SIZES
     if not allowed.contains(longest * METRES[assumed]):
         fitting = _likely_units(longest, assumed)
         if unit != "guess" or len(fitting) != 1:
@@ -73,7 +73,7 @@ def metres_per_unit(
         )
     factor = METRES[assumed] * scale
     thickness = min(sides) * factor
-    if thickness < _MIN_THICKNESS:
+    if thickness < _MIN_THICKNESS_M:
         raise CongraspError(
             f"{path} is flat: it is {length(thickness)} thick.",
             "Give it a thickness in a modelling program.",
@@ -91,12 +91,12 @@ def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
       CongraspError: there is no such unit.
     """
     longest = max(sides)
-    if _IN_METRES.contains(longest):
+    if _SIZES_IN_METRES.contains(longest):
         return "m"
-    fitting = [unit for unit, metres in METRES.items() if _LIKELY.contains(longest * metres)]
+    fitting = [unit for unit, metres in METRES.items() if _LIKELY_SIZES.contains(longest * metres)]
     if len(fitting) == 1:
         return fitting[0]
-    is_possible = any(_POSSIBLE.contains(longest * metres) for metres in METRES.values())
+    is_possible = any(_POSSIBLE_SIZES.contains(longest * metres) for metres in METRES.values())
     if not fitting and not is_possible:
         raise CongraspError(
             f"{path} is {longest:.4g} units long, which is not a size for a hand in any of the "
@@ -115,14 +115,14 @@ def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, boo
     sizes = {}
     for unit, metres in METRES.items():
         text = lengths([side * metres for side in sides])
-        sizes[unit] = (text, _POSSIBLE.contains(max(sides) * metres))
+        sizes[unit] = (text, _POSSIBLE_SIZES.contains(max(sides) * metres))
     return sizes
 
 
 def _likely_units(longest: float, assumed: str) -> list[str]:
     """Units other than the assumed one in which a longest side is that of an object."""
     units = [unit for unit in ("mm", "cm", "in", "m") if unit != assumed]
-    return [unit for unit in units if _LIKELY.contains(longest * METRES[unit])]
+    return [unit for unit in units if _LIKELY_SIZES.contains(longest * METRES[unit])]
 
 
 def _wrong_size(
@@ -142,7 +142,7 @@ def _wrong_size(
     for other in _likely_units(longest, unit):
         size = length(longest * METRES[other])
         proposals.append(f"{UNIT_NAMES[other]}, add '--unit {other}' ({size})")
-    proposed_scale = _PROPOSED_SIZE / (max(sides) * METRES[unit])
+    proposed_scale = _MAX_SIZE_FOR_SCALE_M / (max(sides) * METRES[unit])
     remedy = f"Set '--scale {proposed_scale:.3g}' for an object of 10 cm."
     if proposals:
         where = "options of 'objects import' and 'grasp'"

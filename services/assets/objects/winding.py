@@ -15,16 +15,16 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from congrasp.common.objects import shapes
-from congrasp.services.assets.objects.hollows import OPENING
+from congrasp.services.assets.objects.hollows import MAX_OPENING_M
 from congrasp.services.assets.objects.rays import OFF_GRID, line_crossings
 
-_COUNT = 96
+_LATTICE_POINTS = 96
 """Points of the lattice along the longest side."""
-_EDGE = 2
+_MARGIN_POINTS = 2
 """Points of the lattice outside of the mesh on each side."""
 _WEIGHTS = {1: 1 / 21, 2: 4 / 105, 3: 9 / 280}
 """Weights of directions with one, two and three coordinates that are not zero."""
-_SAMPLES = 100_000
+_SURFACE_SAMPLES = 100_000
 """Points of the surface from which the distance of the boundary is computed."""
 
 
@@ -57,7 +57,7 @@ def open_volume(triangles: np.ndarray) -> float | None:
 
     Returns:
       The volume where the winding number is above 1/2; None without any, or if an opening is wider
-      than `OPENING`, as that of a sheet.
+      than `MAX_OPENING_M`, as that of a sheet.
     """
     winding = winding_numbers(triangles)
     inside = winding.number > 0.5
@@ -65,15 +65,15 @@ def open_volume(triangles: np.ndarray) -> float | None:
         return None
     boundary = inside & ~binary_erosion(inside)
     points = winding.low + winding.spacing * np.argwhere(boundary)
-    random = np.random.default_rng(0).random((_SAMPLES, 3))
+    random = np.random.default_rng(0).random((_SURFACE_SAMPLES, 3))
     samples = shapes.on_triangles(triangles, random)[0]
     distances = cKDTree(samples).query(points)[0]
-    if distances.max() > OPENING / 2 + winding.spacing:
+    if distances.max() > MAX_OPENING_M / 2 + winding.spacing:
         return None
     return float(inside.sum()) * winding.spacing**3
 
 
-def winding_numbers(triangles: np.ndarray, count: int = _COUNT) -> WindingNumbers:
+def winding_numbers(triangles: np.ndarray, count: int = _LATTICE_POINTS) -> WindingNumbers:
     """Returns winding numbers of points in and around a mesh.
 
     Args:
@@ -82,8 +82,8 @@ def winding_numbers(triangles: np.ndarray, count: int = _COUNT) -> WindingNumber
     """
     corners = triangles.reshape(-1, 3)
     spacing = float(np.ptp(corners, axis=0).max()) / count
-    low = corners.min(0) - _EDGE * spacing
-    shape = np.ceil(np.ptp(corners, axis=0) / spacing).astype(int) + 2 * _EDGE + 2
+    low = corners.min(0) - _MARGIN_POINTS * spacing
+    shape = np.ceil(np.ptp(corners, axis=0) / spacing).astype(int) + 2 * _MARGIN_POINTS + 2
     on_lattice = (triangles - low) / spacing + OFF_GRID
     number = np.zeros(shape)
     for direction in _directions():

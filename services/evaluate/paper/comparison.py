@@ -88,7 +88,7 @@ def compare(
     return cells
 
 
-def unmatched(results: Sequence[PartResult]) -> list[tuple[PartResult, Row]]:
+def rows_without_counterpart(results: Sequence[PartResult]) -> list[tuple[PartResult, Row]]:
     """Returns our rows without a counterpart in the paper."""
     rows_without_line = []
     for result in results:

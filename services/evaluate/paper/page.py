@@ -10,8 +10,13 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.services.evaluate.columns import PLAUSIBILITY, RATE, RATES
 from congrasp.services.evaluate.lineup import PolicyKey
-from congrasp.services.evaluate.pages import Picture, embedded, template
-from congrasp.services.evaluate.paper.comparison import SUCCESS, Cell, summary, unmatched
+from congrasp.services.evaluate.pages import Picture, embed, template
+from congrasp.services.evaluate.paper.comparison import (
+    SUCCESS,
+    Cell,
+    rows_without_counterpart,
+    summary,
+)
 from congrasp.services.evaluate.paper.evaluation import PartResult
 from congrasp.services.evaluate.paper.figures import TABLES
 from congrasp.services.evaluate.scores import UNITS, Row
@@ -93,7 +98,7 @@ def _page(reproduction: Reproduction, tables: Sequence[Table]) -> str:
         everywhere=_differences(reproduction.results),
         absent=absent.html() if absent.rows else "",
         details=_titled_html(_detail_tables(reproduction.results)),
-        pictures=[embedded(picture) for picture in pictures],
+        pictures=[embed(picture) for picture in pictures],
         policies=Table("", ("hand", "method", "policy"), policies).html(),
         failures=reproduction.failures,
     )
@@ -226,7 +231,7 @@ def _paper_errors(line: list[Cell]) -> Styled:
 
 def _error_differences(line: list[Cell]) -> Styled:
     """Our errors minus the paper's."""
-    texts = [_signed(cell, 1.0, 3) for cell in line[1:]]
+    texts = [_format_difference(cell, 1.0, 3) for cell in line[1:]]
     return Styled(_joined_errors(line, texts), "errors")
 
 
@@ -238,7 +243,7 @@ def _joined_errors(line: list[Cell], texts: Sequence[str]) -> str:
     return " / ".join(f"{text} {unit}".strip() for text, unit in zip(texts, units, strict=True))
 
 
-def _signed(cell: Cell, factor: float, digits: int) -> str:
+def _format_difference(cell: Cell, factor: float, digits: int) -> str:
     """Formats a signed difference."""
     if cell.difference is None:
         return NONE
@@ -253,7 +258,7 @@ _COLUMNS: Columns[list[Cell]] = (
     ("episodes", lambda line: str(line[0].episodes or NONE)),
     ("success, %", _success),
     ("paper", lambda line: Styled(percent(line[0].paper, unit=""), "paper")),
-    ("difference", lambda line: _signed(line[0], 100.0, 1)),
+    ("difference", lambda line: _format_difference(line[0], 100.0, 1)),
     ("error", _errors),
     ("paper", _paper_errors),
     ("difference", _error_differences),
@@ -296,7 +301,7 @@ def _detail_tables(results: Sequence[PartResult]) -> list[Table]:
     return [
         Table.of(
             "Rows without a counterpart in the paper",
-            unmatched(results),
+            rows_without_counterpart(results),
             _with_policy(RATES[:-1]),
         ),
         Table.of(

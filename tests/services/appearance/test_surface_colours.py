@@ -6,15 +6,15 @@ import trimesh
 
 from congrasp.common.objects.spec import Colours
 from congrasp.services.appearance import surface_colours
-from congrasp.services.appearance.subdivision import finer
-from congrasp.services.appearance.surface_colours import colours_at, painted
+from congrasp.services.appearance.subdivision import subdivide
+from congrasp.services.appearance.surface_colours import colours_at, paint_surface
 
 
 @pytest.mark.parametrize("sections", [8, 512, 2048])
 def test_the_surface_stays_and_faces_are_bounded(sections):
     # Slivers, where there are many sections
     mesh = trimesh.creation.cylinder(0.03, 0.15, sections=sections)
-    vertices, faces = finer(mesh.vertices, mesh.faces, 0.003, 9_000)
+    vertices, faces = subdivide(mesh.vertices, mesh.faces, 0.003, 9_000)
     fine = trimesh.Trimesh(vertices, faces, process=False)
     assert len(mesh.faces) < len(faces) <= 9_000
     assert fine.area == pytest.approx(mesh.area, rel=1e-4)
@@ -25,14 +25,14 @@ def test_the_surface_stays_and_faces_are_bounded(sections):
 
 def test_edges_become_short():
     mesh = trimesh.creation.cylinder(0.03, 0.15, sections=8)
-    vertices, faces = finer(mesh.vertices, mesh.faces, 0.004, 100_000)
+    vertices, faces = subdivide(mesh.vertices, mesh.faces, 0.004, 100_000)
     corners = vertices[faces]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() <= 0.004 + 1e-6
 
 
 def test_a_mesh_of_many_faces_is_left_as_it_is():
     mesh = trimesh.creation.icosphere(3)
-    vertices, faces = finer(mesh.vertices, mesh.faces, 0.001, 1_000)
+    vertices, faces = subdivide(mesh.vertices, mesh.faces, 0.001, 1_000)
     np.testing.assert_array_equal(faces, mesh.faces)
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
 
@@ -74,24 +74,24 @@ def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
 
     def counted(*mesh):
         cuts.append(mesh)
-        return finer(*mesh)
+        return subdivide(*mesh)
 
-    monkeypatch.setattr(surface_colours, "finer", counted)
+    monkeypatch.setattr(surface_colours, "subdivide", counted)
     ball = trimesh.creation.icosphere(2, 0.0317)
     colours = Colours(
         np.array([[0, 0, -1], [0, 0, 1]], np.float32),
         np.array([[255, 0, 0], [0, 0, 255]], np.uint8),
     )
-    first = painted(ball.vertices, ball.faces, colours)
-    again = painted(
+    first = paint_surface(ball.vertices, ball.faces, colours)
+    again = paint_surface(
         np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours))
     )
     assert len(cuts) == 1
     assert all(a is b for a, b in zip(first, again, strict=True))
     with pytest.raises(ValueError, match="read-only"):
         first[2][0] = 0
-    other = painted(ball.vertices, ball.faces, colours._replace(values=colours.values[::-1]))
+    other = paint_surface(ball.vertices, ball.faces, colours._replace(values=colours.values[::-1]))
     assert len(cuts) == 2
     assert not np.array_equal(other[2], first[2])
-    painted(1.01 * ball.vertices, ball.faces, colours)
+    paint_surface(1.01 * ball.vertices, ball.faces, colours)
     assert len(cuts) == 3

@@ -85,8 +85,8 @@ def loader() -> Callable:
 def short_protocol():
     """Holds and pushes that last an eighth and a twelfth of their time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "HOLD_SECONDS", 0.25)
-        patch.setattr(stress, "PUSH_SECONDS", 0.02)
+        patch.setattr(plan, "REQUIRED_HOLD_S", 0.25)
+        patch.setattr(stress, "PUSH_S", 0.02)
         yield
 
 
@@ -111,8 +111,8 @@ def columns(dataset) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
-    monkeypatch.setattr(plan, "HOLD_SECONDS", 2.0)  # as in the process
-    monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
+    monkeypatch.setattr(plan, "REQUIRED_HOLD_S", 2.0)  # as in the process
+    monkeypatch.setattr(stress, "PUSH_S", 0.25)
     made(dataset := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

@@ -77,8 +77,10 @@ def test_references_are_grasps_and_made_once(experiment, monkeypatch):
 def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
     hold = task.TASK.hold_steps
     # The programs are the experiment's
-    monkeypatch.setattr(plan, "HOLD_SECONDS", hold * task.TASK.control_dt)
-    monkeypatch.setattr(simulation, "two_seconds", lambda task: 0)  # without the stress test, too
+    monkeypatch.setattr(plan, "REQUIRED_HOLD_S", hold * task.TASK.control_dt)
+    monkeypatch.setattr(
+        simulation, "required_hold_steps", lambda task: 0
+    )  # without the stress test, too
     folder = tmp_path / "objects"
     out = tmp_path / "rows.json"
     samples = {}
@@ -275,7 +277,7 @@ def test_numbers_out_of_range(policy, arguments):
 
 
 def test_nominal_mass_and_friction_and_two_seconds():
-    assert Experiment(task.policy(), []).steps == plan.two_seconds(task.TASK) == 200
+    assert Experiment(task.policy(), []).steps == plan.required_hold_steps(task.TASK) == 200
     ranged = dataclasses.replace(
         task.TASK,
         mass_range=(0.8, 1.5),

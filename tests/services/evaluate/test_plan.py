@@ -132,10 +132,10 @@ def test_episodes_are_independent_of_other_objects(bank):
         among_others = _all(bank, among)
         part = _all(fewer, alone, size=4)
         for i, (obj, number) in enumerate(
-            zip(alone.episodes.objects, alone.episodes.numbers, strict=True)
+            zip(alone.episodes.objects, alone.episodes.episode_numbers, strict=True)
         ):
             (at,) = np.flatnonzero(
-                (among.episodes.objects == obj + 1) & (among.episodes.numbers == number)
+                (among.episodes.objects == obj + 1) & (among.episodes.episode_numbers == number)
             )
             for ours, theirs in zip(
                 jax.tree.leaves((part.goal, part.reset_state.base_position)),

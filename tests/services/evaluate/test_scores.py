@@ -13,8 +13,8 @@ from congrasp.common.episode.episode import Episode
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.services.evaluate.columns import RATE, tables_of
-from congrasp.services.evaluate.episodes import PROBED_EPISODES, Sample, joined
-from congrasp.services.evaluate.intervals import clustered, independent_episodes, wilson
+from congrasp.services.evaluate.episodes import MAX_PROBED_EPISODES, Sample, join_samples
+from congrasp.services.evaluate.intervals import clustered_interval, independent_episodes, wilson
 from congrasp.services.evaluate.object_groups import object_groups
 from congrasp.services.evaluate.paper.figures import CENTER_GROUP, paper_row
 from congrasp.services.evaluate.pictures import cause
@@ -108,8 +108,12 @@ def test_a_row_averages_over_successful_episodes():
         ("f", 1, 0.0),
     ]
     objects = sample.values["object_index"]
-    assert (row.success_low, row.success_high) == clustered(np.array([1, 1, 0, 1]), objects)
-    assert (row.held_2s_low, row.held_2s_high) == clustered(np.array([1, 0, 0, 1]), objects)
+    assert (row.success_low, row.success_high) == clustered_interval(
+        np.array([1, 1, 0, 1]), objects
+    )
+    assert (row.held_2s_low, row.held_2s_high) == clustered_interval(
+        np.array([1, 0, 0, 1]), objects
+    )
     assert row.errors["pose_rad"] == pytest.approx(0.2)
     assert row.errors["pose_m"] == pytest.approx(0.02)
     assert row.errors["traj_rad"] == pytest.approx(0.5)
@@ -199,20 +203,20 @@ def test_rows_are_matched_by_equal_settings(source, hand, method, constraint, gr
 def test_joined_samples_keep_forces_beside_their_episodes():
     parts = [
         _sample([1] * 3, [1] * 3).first(2),
-        _sample([1] * (PROBED_EPISODES + 5), [1] * (PROBED_EPISODES + 5)),
+        _sample([1] * (MAX_PROBED_EPISODES + 5), [1] * (MAX_PROBED_EPISODES + 5)),
     ]
     parts[0].link_force[:] = 1.0
-    sample = joined(parts)
-    assert len(sample.values["success"]) == PROBED_EPISODES + 7
-    assert len(sample.link_force) == PROBED_EPISODES
+    sample = join_samples(parts)
+    assert len(sample.values["success"]) == MAX_PROBED_EPISODES + 7
+    assert len(sample.link_force) == MAX_PROBED_EPISODES
     assert sample.link_force[:2].min() == 1.0
     assert sample.link_force[2:].max() == 0.0
     # What follows a sample without all its forces must not move up to another episode's place.
-    late = joined([sample, parts[0]])
-    assert len(late.values["success"]) == PROBED_EPISODES + 9
-    assert len(late.link_force) == PROBED_EPISODES
-    odd = late.where(np.arange(PROBED_EPISODES + 9) % 2 == 1)
-    assert len(odd.link_force) == PROBED_EPISODES // 2
+    late = join_samples([sample, parts[0]])
+    assert len(late.values["success"]) == MAX_PROBED_EPISODES + 9
+    assert len(late.link_force) == MAX_PROBED_EPISODES
+    odd = late.where(np.arange(MAX_PROBED_EPISODES + 9) % 2 == 1)
+    assert len(odd.link_force) == MAX_PROBED_EPISODES // 2
     assert odd.link_force[0].min() == 1.0
 
 
@@ -334,7 +338,7 @@ def test_clusters_count_by_the_design_effect():
     clusters = np.repeat([7, 3, 5, 1], 4)
     assert independent_episodes(outcomes, clusters) == pytest.approx(6.0)
     # n = 6, p = 1/2: half width 1.96 sqrt(1/24 + 0.026677) / 1.640243.
-    assert clustered(outcomes, clusters) == pytest.approx((0.18761, 0.81239), abs=1e-4)
+    assert clustered_interval(outcomes, clusters) == pytest.approx((0.18761, 0.81239), abs=1e-4)
 
 
 def test_an_interval_is_never_narrower_than_that_of_independent_episodes():
@@ -347,7 +351,7 @@ def test_an_interval_is_never_narrower_than_that_of_independent_episodes():
 
 def test_clusters_that_end_alike_count_once():
     assert independent_episodes(np.ones(20, bool), np.repeat(np.arange(5), 4)) == 5.0
-    assert clustered(np.ones(20, bool), np.repeat(np.arange(5), 4)) == wilson(1.0, 5.0)
+    assert clustered_interval(np.ones(20, bool), np.repeat(np.arange(5), 4)) == wilson(1.0, 5.0)
     assert independent_episodes(np.array([1, 0, 1, 1]), np.zeros(4)) == 4.0, "one object alone"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.actors import initial
+from congrasp.actors import draws
 from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.config import TaskConfig
@@ -102,7 +102,7 @@ def test_sensing_levels_match_their_labels(bank):
     """
     sensed = SENSING[0].task(TASK)
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
-    sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
+    sample = jax.jit(draws.sample, static_argnames=("hand", "task", "batch"))
     drawn = sample(task.HAND, sensed, one, jax.random.key(0), 4)
     episodes = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
     assert len(episodes) == len(SENSING)
@@ -222,7 +222,7 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
         "row",
         lambda self, variation, sample: mock.Mock(group=variation.label, episodes=4),
     )
-    monkeypatch.setattr(experiments, "joined", lambda samples: None)
+    monkeypatch.setattr(experiments, "join_samples", lambda samples: None)
     results = dataclasses.replace(experiment, track=lambda label, total: told.append).run(
         variations
     )

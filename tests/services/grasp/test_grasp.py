@@ -14,7 +14,7 @@ from congrasp.actors.attempts import Outcome, Phases
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Trace
-from congrasp.actors.stress import ASSESSED, SURVIVAL
+from congrasp.actors.stress import ASSESSED_NAMES, SURVIVAL_NAMES
 from congrasp.common import mirror
 from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
@@ -148,7 +148,7 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
 def test_costs_of_attempts():
     """Costs of five attempts, computed by hand."""
     zeros = np.zeros(5)
-    metrics = {name: zeros.copy() for name in ("moved_at_removal", *ASSESSED)}
+    metrics = {name: zeros.copy() for name in ("moved_at_removal", *ASSESSED_NAMES)}
     metrics |= {
         "held": np.array([0.0, 1, 1, 1, 1]),
         "success": np.array([0.0, 1, 1, 1, 1]),
@@ -157,7 +157,7 @@ def test_costs_of_attempts():
         "force_link_max": np.array([0.0, 0.0, 10.0, 0.0, 0.0]),  # one for 10 N
         "pose_rad": np.full(5, 9.0),  # not requested
         "clean": np.array([0.0, 0, 0, 1, 1]),
-        **dict.fromkeys(SURVIVAL, np.array([0.0, 0, 1, 1, 1])),
+        **dict.fromkeys(SURVIVAL_NAMES, np.array([0.0, 0, 1, 1, 1])),
     }
     trace = Trace(*(np.zeros((3, 5, 3)) for _ in Trace._fields))
     computed = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.initial import handover_speed
+from congrasp.actors.initial_hand import handover_speed
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame

@@ -3,8 +3,14 @@
 import signal
 import subprocess
 import sys
+import threading
+import types
 
 import pytest
+
+from congrasp.services.ops import interrupts
+from congrasp.services.ops.interrupts import interrupts_reach
+from congrasp.services.ops.lifetime import Stop
 
 LOOP = """
 import gc, signal, sys, time
@@ -65,3 +71,22 @@ def test_command_ends_with_one_line(kind, number, code, word):
     assert process.returncode == code
     (line,) = error.splitlines()
     assert word in line
+
+
+def test_no_interrupt_is_raised_after_the_command(monkeypatch):
+    """The command ends while the swallowed interrupt is being raised: it waits for that."""
+    raising = threading.Event()
+    proceed = threading.Event()
+    raised = threading.Event()
+
+    def raise_slowly():
+        raising.set()
+        assert proceed.wait(30)
+        raised.set()
+
+    monkeypatch.setattr(interrupts, "raise_in_main_thread", raise_slowly)
+    with interrupts_reach(Stop()):
+        sys.unraisablehook(types.SimpleNamespace(exc_type=KeyboardInterrupt))
+        assert raising.wait(30)
+        threading.Timer(0.3, proceed.set).start()
+    assert raised.is_set()

@@ -20,7 +20,7 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import main
 from congrasp.services.ops.logs import log, log_error, logging_as
-from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, serve_metrics
 from tests.waits import eventually, together
 
 STATUS = {
@@ -66,7 +66,7 @@ def test_a_learner_shows_its_status_and_its_last_update():
     metrics = LearnerMetrics(lambda: STATUS)
     port = free_port()
     metrics.update({"episode/success": 0.5, "update_seconds": 0.25})
-    with exposed(port, "127.0.0.1", metrics):
+    with serve_metrics(port, "127.0.0.1", metrics):
         scraped = scrape(port)
     assert scraped["congrasp_learner_version",] == 7
     assert scraped["congrasp_learner_ready",] == 1
@@ -87,7 +87,7 @@ def test_a_learner_that_starts_is_not_ready():
         raise TransportError("No response.")
 
     port = free_port()
-    with exposed(port, "127.0.0.1", LearnerMetrics(ask)):
+    with serve_metrics(port, "127.0.0.1", LearnerMetrics(ask)):
         assert scrape(port)["congrasp_learner_ready",] == 0
 
 
@@ -95,7 +95,7 @@ def test_an_actor_shows_its_last_rollout():
     metrics = ActorMetrics()
     port = free_port()
     metrics.rollout({"version": 3.0, "rollouts": 12.0, "steps_per_second": 99.0})
-    with exposed(port, "127.0.0.1", metrics):
+    with serve_metrics(port, "127.0.0.1", metrics):
         scraped = scrape(port)
     assert scraped["congrasp_actor_rollouts_total",] == 12
     assert scraped["congrasp_actor_version",] == 3
@@ -113,7 +113,7 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
             metrics.answer("overloaded", 0.0)
             metrics.batch(3)
 
-    with exposed(port, "127.0.0.1", metrics):
+    with serve_metrics(port, "127.0.0.1", metrics):
         together(answer, range(4))
         scraped = scrape(port)
     assert (
@@ -263,6 +263,6 @@ def test_a_port_in_use_is_an_error_in_words():
         busy.listen()
         with (
             pytest.raises(CongraspError, match=rf"127.0.0.1:{port}: .*--metrics-port"),
-            exposed(port, "127.0.0.1"),
+            serve_metrics(port, "127.0.0.1"),
         ):
             pass

@@ -13,8 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
-from congrasp.services.appearance.palette import JOINT, SKIN
-from congrasp.services.appearance.palette import MATERIALS as COLOURS
+from congrasp.services.appearance.palette import MATERIAL_COLOURS, ROBOT_JOINT, ROBOT_LINK
 from congrasp.services.record import hand_parts
 from congrasp.services.record.hand_parts import surface_parts, surface_points
 
@@ -41,7 +40,7 @@ def test_a_robots_parts_are_its_surface_in_every_pose(name: str) -> None:
     assert cKDTree(parts.mean(1)).query(surface.mean(1))[0].max() < 1e-4
     assert cKDTree(surface.mean(1)).query(parts.mean(1))[0].max() < 1e-4
     parts = itertools.chain(*surface_parts(get_hand(name)))
-    assert {part.colour for part in parts} == {SKIN, JOINT}
+    assert {part.colour for part in parts} == {ROBOT_LINK, ROBOT_JOINT}
 
 
 def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> None:
@@ -60,7 +59,7 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     distance = cKDTree(points).query(surface.mean(1))[0]
     assert np.percentile(distance, 95) < 0.004
     colours = {part.colour for part in itertools.chain(*surface_parts(hand))}
-    assert colours == {COLOURS[name] for name in ("flesh", "nail", "sleeve")}
+    assert colours == {MATERIAL_COLOURS[name] for name in ("flesh", "nail", "sleeve")}
 
 
 def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(

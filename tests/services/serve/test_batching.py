@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError, LateError, OverloadedError
 from congrasp.common.transport.senders import Peer
-from congrasp.services.serve.batching import Batcher, Parts
+from congrasp.services.serve.batching import Batcher, Splitting
 
 
 class Gate:
@@ -66,7 +66,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
 
 
 def test_peers_take_turns_and_a_flooding_peer_is_refused(gate):
-    batcher = Batcher(gate, size=2, window=0.0, depth=10, share=3)
+    batcher = Batcher(gate, size=2, window=0.0, depth=10, peer_limit=3)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0, peer=Peer("greedy")) for i in (1, 2, 3)]
     for refuse in (
@@ -98,13 +98,16 @@ class Letters(Gate):
         self.batches.append(list(items))
         return [CongraspError("bad") if "!" in item else item.upper() for item in items]
 
-    def batcher(self):
-        parts = Parts(
-            (4,), lambda item, first, end: item[first:end], lambda item, results: "".join(results)
-        )
-        return Batcher(self, size=8, window=0.0, depth=10, weigh=len, parts=parts)
+    join = staticmethod("".join)
+    run_again = staticmethod(lambda item, queue_s: f"{item} again")
 
-    def run(self, *items):
+    def batcher(self):
+        splitting = Splitting(
+            (4,), lambda item, first, end: item[first:end], self.join, self.run_again
+        )
+        return Batcher(self, size=8, window=0.0, depth=10, weigh=len, splitting=splitting)
+
+    def run(self, *items, timeout=10.0):
         """Submits (peer, item) while the first is held back; their futures."""
         batcher = self.batcher()
         first = Future()
@@ -113,7 +116,7 @@ class Letters(Gate):
             target=lambda: first.set_result(batcher.submit(item, 10.0, Peer(peer))), daemon=True
         ).start()
         assert self.entered.acquire(timeout=10)
-        futures = [batcher.submit(item, 10.0, Peer(peer)) for peer, item in rest]
+        futures = [batcher.submit(item, timeout, Peer(peer)) for peer, item in rest]
         self.go.set()
         return [first.result(10), *futures], batcher
 
@@ -154,6 +157,36 @@ def test_an_item_of_which_a_part_fails_is_run_no_further(several):
     assert str(futures[1].exception(10)) == "bad"
     assert [futures[i].result(10) for i in (0, 2, 3)] == ["K", "L", "IJ"]
     assert gate.batches == [["k"], ["ab", "l"], ["!def"], ["ij"]]
+    batcher.close()
+
+
+def test_an_error_of_joining_fails_its_item_alone(several):
+    """The worker continues."""
+    gate = Letters()
+    gate.join = lambda results: 1 / 0
+    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("a", "l"))
+    assert isinstance(futures[1].exception(10), ZeroDivisionError)
+    assert batcher.submit("m", 10.0).result(10) == "M"
+    batcher.close()
+
+
+def test_an_item_whose_parts_do_not_match_runs_again(several):
+    gate = Letters()
+    gate.join = lambda results: None
+    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"))
+    assert futures[1].result(10) == "abcdefg again"
+    batcher.close()
+
+
+def test_an_item_runs_again_only_before_its_deadline(several):
+    def join_late(results):
+        time.sleep(0.3)
+
+    gate = Letters()
+    gate.join = join_late
+    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), timeout=0.25)
+    with pytest.raises(LateError):
+        futures[1].result(10)
     batcher.close()
 
 

@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import os
 import pathlib
 import threading
 from unittest import mock
@@ -10,7 +11,12 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.errors import (
+    CongraspError,
+    OverloadedError,
+    RefusedError,
+    TransportError,
+)
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
@@ -18,18 +24,18 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.metrics import ServerMetrics, exposed
+from congrasp.services.ops.metrics import ServerMetrics, serve_metrics
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
 from congrasp.services.serve.server import (
-    DEPTH,
-    SHARE,
+    PEER_LIMIT,
+    QUEUE_LIMIT,
     Answer,
     PolicyServer,
-    follow_file,
-    follow_run,
     join_parts,
+    parse_timeout,
 )
+from congrasp.services.serve.sources import follow_file, follow_run
 from congrasp.services.train.command import untrained
 from tests import task
 from tests.services.ops.test_metrics import scrape
@@ -67,8 +73,8 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
         health = client.health()
         assert health["ready"]
         assert health["hand"] == "human"
-        assert health["queue_limit"] == DEPTH
-        assert health["peer_limit"] == SHARE
+        assert health["queue_limit"] == QUEUE_LIMIT
+        assert health["peer_limit"] == PEER_LIMIT
         assert health["states_per_second"] > 100
     assert first.q_target.shape == (20,)
     assert first.u_target.shape == (6,)
@@ -84,7 +90,7 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
 def test_answers_refusals_and_batches_are_counted(served, metrics):
     _, endpoint, episode = served
     port = free_port()
-    with PolicyClient(endpoint) as client, exposed(port, "127.0.0.1", metrics):
+    with PolicyClient(endpoint) as client, serve_metrics(port, "127.0.0.1", metrics):
         before = scrape(port)
         client.reset(episode.request)
         for _ in range(3):
@@ -107,7 +113,7 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
 
 def test_swapping_weights_fails_no_query(served, monkeypatch):
     path, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_PERIOD_S", 0.001)
     policy = task.policy()
     swapped = threading.Event()
 
@@ -177,16 +183,11 @@ def part_of_answer(policy: object, value: float) -> Answer:
     return Answer(Inference(np.full((2, 3), value), [["x"]] * 2), policy, 0.25, 0.5)
 
 
-def test_a_query_answered_in_parts_by_two_policies_is_repeated():
-    parts = [part_of_answer(object(), 1.0), part_of_answer(object(), 2.0)]
-    repeated = Answer(Inference(np.full((4, 3), 7.0), [["y"]] * 4), object(), 0.25, 0.75)
-    assert join_parts(parts, lambda: repeated) is repeated
-
-
-def test_parts_of_an_answer_by_one_policy_are_joined():
+def test_parts_are_joined_only_if_one_policy_answered_all():
+    old = object()
     new = object()
-    parts = [part_of_answer(new, 1.0), part_of_answer(new, 2.0)]
-    joined = join_parts(parts, lambda: pytest.fail("the query is repeated"))
+    assert join_parts([part_of_answer(old, 1.0), part_of_answer(new, 2.0)]) is None
+    joined = join_parts([part_of_answer(new, 1.0), part_of_answer(new, 2.0)])
     np.testing.assert_array_equal(joined.inference.vectors[:, 0], [1.0, 1.0, 2.0, 2.0])
     assert joined.inference.active == [["x"]] * 4
     assert joined.policy is new
@@ -230,14 +231,15 @@ def test_queries_beyond_the_queue_are_refused_at_once(served, metrics, monkeypat
 
     with contextlib.ExitStack() as stack:
         clients = [
-            stack.enter_context(PolicyClient(endpoint, timeout=50.0)) for _ in range(DEPTH + 2)
+            stack.enter_context(PolicyClient(endpoint, timeout=50.0))
+            for _ in range(QUEUE_LIMIT + 2)
         ]
         pool = stack.enter_context(concurrent.futures.ThreadPoolExecutor(len(clients)))
         stack.callback(go.set)
         futures = [pool.submit(ask, clients[0])]
         assert entered.acquire(timeout=60)
         futures += [pool.submit(ask, client) for client in clients[1:-1]]
-        eventually(lambda: clients[-1].health()["queue"] >= DEPTH)
+        eventually(lambda: clients[-1].health()["queue"] >= QUEUE_LIMIT)
         with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
@@ -279,7 +281,7 @@ def test_following_a_run_pulls_only_what_is_newer():
 
 def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
     """Its policy stays until the learner answers again with a newer one."""
-    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_SECONDS", 0.001)
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_PERIOD_S", 0.001)
     monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
     first = task.policy()
     newer = dataclasses.replace(first, version=first.version + 1)
@@ -298,6 +300,110 @@ def test_a_server_outlives_restarts_of_its_learner(monkeypatch):
         eventually(lambda: server.health()["version"] == newer.version)
         assert served_while_lost == 20 * [first.version]
         server.close()
+
+
+@pytest.fixture
+def quick_start(monkeypatch):
+    """Servers look for newer policies often, and compile nothing."""
+    monkeypatch.setattr("congrasp.services.serve.server.FOLLOW_PERIOD_S", 0.001)
+    monkeypatch.setattr(PolicyFunction, "warm_up", lambda function, weights: {1: 0.01})
+
+
+def test_a_server_outlives_any_error_of_its_source(quick_start):
+    """Its health reports the error until the source works again."""
+    first = task.policy()
+    outcome: list[object] = [ZeroDivisionError("reason")]
+
+    def pull(version):
+        if version < 0:
+            return first
+        if isinstance(outcome[0], Exception):
+            raise outcome[0]
+        return outcome[0]
+
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", pull)
+        eventually(lambda: "reason" in server.health()["trouble"])
+        outcome[0] = None
+        eventually(lambda: server.health()["trouble"] == "")
+        outcome[0] = dataclasses.replace(first, version=first.version + 1)
+        eventually(lambda: server.health()["version"] == first.version + 1)
+        server.close()
+
+
+def test_a_policy_file_that_was_missing_for_a_while_is_no_trouble(quick_start, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    bundles.save(task.policy(), path)
+    with MemoryTransport(MemoryHub()) as transport:
+        server = PolicyServer(transport, "p", follow_file(path))
+        path.rename(tmp_path / "aside")
+        eventually(lambda: "cannot be read" in server.health()["trouble"])
+        (tmp_path / "aside").rename(path)
+        eventually(lambda: server.health()["trouble"] == "")
+        server.close()
+
+
+def test_a_policy_file_is_read_again_after_a_failure(tmp_path, monkeypatch):
+    """Its time of change is the same: only the reading failed."""
+    path = tmp_path / "policy.safetensors"
+    bundles.save(task.policy(), path)
+    read = follow_file(path)
+    version = read(-1).version
+    os.utime(path, (1.0, 1.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(bundles, "load", mock.Mock(side_effect=CongraspError("disk")))
+        with pytest.raises(CongraspError, match="disk"):
+            read(version)
+    assert read(version).version == version
+    assert read(version) is None
+
+
+def test_queries_to_a_compiling_server_are_refused_and_counted(monkeypatch):
+    compiling = threading.Event()
+    done = threading.Event()
+
+    def warm_up(function, weights):
+        compiling.set()
+        assert done.wait(60)
+        return {1: 0.01}
+
+    monkeypatch.setattr(PolicyFunction, "warm_up", warm_up)
+    outcomes = []
+    with (
+        MemoryTransport(MemoryHub()) as transport,
+        concurrent.futures.ThreadPoolExecutor(1) as pool,
+    ):
+        starting = pool.submit(
+            PolicyServer,
+            transport,
+            "p",
+            lambda version: task.policy(),
+            on_answer=lambda outcome, seconds: outcomes.append(outcome),
+        )
+        assert compiling.wait(60)
+        with pytest.raises(RefusedError, match="compiling"):
+            transport.query(Keys("p").act_for("peer"), Message({}, {}), timeout=10.0)
+        done.set()
+        starting.result(60).close()
+    assert outcomes == ["refused"]
+
+
+def test_a_failed_start_leaves_no_thread(quick_start, monkeypatch):
+    monkeypatch.setattr(PolicyFunction, "warm_up", mock.Mock(side_effect=ZeroDivisionError))
+    before = threading.enumerate()
+    with MemoryTransport(MemoryHub()) as transport:
+        with pytest.raises(ZeroDivisionError):
+            PolicyServer(transport, "p", lambda version: task.policy())
+        started = [thread.name for thread in threading.enumerate() if thread not in before]
+        assert not {"batcher", "follow"} & set(started)
+        with pytest.raises(RefusedError, match="The policy server is closed"):
+            transport.query(Keys("p").health, Message({}, {"metadata": True}), timeout=10.0)
+
+
+@pytest.mark.parametrize("timeout", [True, 0.0, -1, 61, float("nan"), "1", None])
+def test_a_timeout_that_is_no_duration_is_refused(timeout):
+    with pytest.raises(CongraspError, match="'timeout' is"):
+        parse_timeout(timeout)
 
 
 def test_a_server_needs_a_readable_policy(tmp_path: pathlib.Path):

@@ -11,7 +11,8 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.inference import PolicyFunction
-from congrasp.services.serve.server import PolicyServer, follow_file
+from congrasp.services.serve.server import PolicyServer
+from congrasp.services.serve.sources import follow_file
 from tests import task
 from tests.waits import eventually
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from congrasp.actors.attempts import Outcome
-from congrasp.actors.stress import ASSESSED
+from congrasp.actors.stress import ASSESSED_NAMES
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.services.studio import grasping
@@ -35,7 +35,7 @@ class Source:
 
 def outcome(held: list[int], error: list[float]) -> Outcome:
     names = ("success", "held", "heading_rad", "heading_m", "moved_at_removal", "force_link_max")
-    metrics = {name: np.zeros(ATTEMPTS) for name in (*names, *ASSESSED)}
+    metrics = {name: np.zeros(ATTEMPTS) for name in (*names, *ASSESSED_NAMES)}
     metrics["success"][held] = metrics["held"][held] = 1.0
     metrics["heading_rad"][: len(error)] = error
 

@@ -216,7 +216,7 @@ def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_client_that_does_not_read_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "TIMEOUT_S", 0.5)
-    monkeypatch.setattr(server_module, "_CONNECTIONS", 1)
+    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1)
     large = Routes({"/api/large": lambda query: Picture(bytes(64 << 20))}, {})
     with (
         contextlib.closing(PageServer(lambda browser: large, "127.0.0.1", 0)) as server,
@@ -251,7 +251,7 @@ def _posted(server: PageServer, path: str) -> socket.socket:
 
 
 def test_silence_within_a_body_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(application, "_SILENCE_S", 0.2)
+    monkeypatch.setattr(application, "SILENCE_S", 0.2)
     routes = Routes({}, {"/api/do": lambda query, body: {}})
     with (
         contextlib.closing(PageServer(lambda browser: routes, "127.0.0.1", 0)) as server,
@@ -262,7 +262,7 @@ def test_silence_within_a_body_is_answered(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_rest_of_a_refused_body_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "_REST_S", 0.2)
+    monkeypatch.setattr(connections, "REST_S", 0.2)
     with (
         contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
         _posted(server, "/api/none") as connection,

@@ -16,7 +16,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields, metric_names
 from congrasp.services.cli.plot import plot
 from congrasp.services.evaluate.episodes import Sample
-from congrasp.services.evaluate.plots import compared, plot_evaluation
+from congrasp.services.evaluate.plots import comparison_table, plot_evaluation
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.record.writer import JsonChannels, LogWriter, nest
 from congrasp.services.viz.metric_titles import titled
@@ -209,7 +209,7 @@ def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> Non
 
 
 def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> None:
-    table = compared([Row.from_json(row) for row in evaluation(tmp_path / "e.json")])
+    table = comparison_table([Row.from_json(row) for row in evaluation(tmp_path / "e.json")])
     heading, composed, fingers = table.rows
     assert heading[:5] == ["heading", "40", "75.0 % (59.8-85.8)", "96.9 %", "0.0 %"]
     at = table.columns.index("Heading error, rad")
@@ -224,7 +224,7 @@ def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> Non
 def test_rows_of_several_policies_have_different_labels(tmp_path: pathlib.Path) -> None:
     heading, *_ = evaluation(tmp_path / "e.json")
     rows = [Row.from_json(row) for row in (heading, {**heading, "method": "pd", "group": "small"})]
-    assert [line[0] for line in compared(rows).rows] == [
+    assert [line[0] for line in comparison_table(rows).rows] == [
         "heading, human, ours",
         "heading, small, human, pd",
     ]

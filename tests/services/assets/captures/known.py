@@ -13,7 +13,7 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.services.assets.captures.human import TO_HUMAN, joint_positions
-from congrasp.services.assets.captures.references import separated
+from congrasp.services.assets.captures.references import separate_fingers
 
 FRAMES = 90
 GRASP = 60
@@ -30,7 +30,7 @@ def q_closed(rng: np.random.Generator) -> np.ndarray:
         [joint.name.startswith(("thumb", "index")) for joint in HUMAN.joints], 0.35, 0.1
     )
     q = HUMAN.q_open + share * (HUMAN.q_closed - HUMAN.q_open) + rng.uniform(-0.05, 0.05, 20)
-    return separated(HUMAN, np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)[None])[0]
+    return separate_fingers(HUMAN, np.clip(q, HUMAN.lower + 0.01, HUMAN.upper - 0.01)[None])[0]
 
 
 @dataclasses.dataclass

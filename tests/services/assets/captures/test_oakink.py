@@ -139,6 +139,33 @@ def test_one_camera_counts_and_frames_are_sorted(tmp_path):
     np.testing.assert_allclose(sequence.wrist_position, case.wrist_position[::2], atol=1e-6)
 
 
+def test_subjects_of_one_sequence_have_different_names(tmp_path):
+    case = known.make("A01001_0001_0000", "A01001", 10)
+    write(case, tmp_path, cameras=(1,))
+    index = tmp_path / "anno" / "seq_all.json"
+    rows = json.loads(index.read_text())
+    index.write_text(json.dumps([*rows, *([row[0], 1, *row[2:]] for row in rows)]))
+    folder = tmp_path / "anno" / "general_info"
+    for file in list(folder.iterdir()):
+        copy = folder / file.name.replace(f"{STAMP}__0__", f"{STAMP}__1__")
+        copy.write_bytes(file.read_bytes())
+    names = [sequence.name for sequence in read(tmp_path, Meshes(()), None)]
+    assert names == [f"{case.name}/{STAMP}/0", f"{case.name}/{STAMP}/1"]
+
+
+def test_a_name_of_an_object_is_no_pattern(tmp_path):
+    """The parts of another object are not those of one whose name would match any."""
+    case = known.make("A01001_0001_0000", "A01001", 10)
+    write(case, tmp_path)
+    write_parts(case, tmp_path, 0.0)
+    (tmp_path / "OakBase" / "bottle" / "A01001").rename(tmp_path / "OakBase" / "bottle" / "other")
+    (tmp_path / "metaV2").mkdir()
+    names = {"A01001": {"name": "*"}}
+    (tmp_path / "metaV2" / "yodao_object_id.json").write_text(json.dumps(names))
+    (sequence,) = read(tmp_path, Meshes(()), None)
+    assert sequence.object_name == "*" and sequence.parts == ()
+
+
 def test_faulty_annotations_name_their_fault(run_import, tmp_path):
     case = known.make("right", "A01001", 11)
 

@@ -25,10 +25,14 @@ from congrasp.services.assets.captures.constraint_sets import (
     from_below,
     usable_resting_poses,
 )
-from congrasp.services.assets.captures.contact import LATER, before_carried, opposed_frame
+from congrasp.services.assets.captures.contact import (
+    MAX_FRAMES_TO_CLOSE,
+    before_carried,
+    opposed_frame,
+)
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.references import (
-    DEEPEST,
+    MAX_DEPTH_M,
     check_reference,
     depth,
     width,
@@ -106,7 +110,7 @@ def test_the_reference_is_taken_when_thumb_and_finger_have_closed():
 def test_fingers_that_never_close_give_the_nearest_frame_within_reach():
     assert opposed(0.003 + CLOSING, 0.0) == FIRST + 8
     slow = 0.01 - 0.0001 * AT
-    assert opposed(slow, 0.0) == FIRST + LATER
+    assert opposed(slow, 0.0) == FIRST + MAX_FRAMES_TO_CLOSE
     # The object is lifted by 1 cm a frame from the eighth frame on: three centimetres at the
     # eleventh.
     assert opposed(slow, 0.0, 0.01 * np.maximum(AT - 8, 0)) == 10
@@ -214,7 +218,7 @@ def test_depth_is_that_of_the_deepest_skin():
 
     for deep in (-0.02, 0.003, 0.012):
         assert depth(held, block(deep)) == pytest.approx(deep, abs=1e-6)
-    check_reference(HUMAN, held, block(0.9 * DEEPEST), 1.0)
+    check_reference(HUMAN, held, block(0.9 * MAX_DEPTH_M), 1.0)
     with pytest.raises(Dropped, match="12 mm deep in the object"):
         check_reference(HUMAN, held, block(0.012), 1.0)
     # It closes around the object by itself

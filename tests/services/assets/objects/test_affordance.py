@@ -13,9 +13,9 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import affordance
 from congrasp.services.assets.objects.affordance import (
+    find_painted,
     in_half_space,
     on_part_mesh,
-    painted,
     two_parts,
 )
 from congrasp.services.assets.objects.assembly import UNLABELLED
@@ -61,7 +61,7 @@ def test_each_source_finds_the_lower_half(box, folder):
     for plus in (
         in_half_space(box, (0, 0, -2), 0.0),
         on_part_mesh(box, folder / "low.stl"),
-        painted(box, folder / "painted.ply", (0, 255, 0)),
+        find_painted(box, folder / "painted.ply", (0, 255, 0)),
     ):
         assert plus.shape == (512,)
         assert np.array_equal(plus[~near], below[~near])
@@ -138,7 +138,7 @@ def test_halves_that_can_be_held_stay(imported):
     obj = imported(trimesh.creation.cylinder(0.02, 0.2))
     assert obj.part_names == UNLABELLED
     assert 0.45 < obj.graspable[obj.labels].mean() < 0.55
-    assert affordance.covered(obj).all()
+    assert affordance.find_covered_rests(obj).all()
     assert affordance.UNCOVERED not in obj.notes
 
 
@@ -147,19 +147,19 @@ def test_halves_that_cannot_be_held_are_cut_elsewhere(imported):
     thick.
     """
     obj = imported(trimesh.creation.cylinder(0.02, 0.04))
-    assert affordance.covered(obj).any()
+    assert affordance.find_covered_rests(obj).any()
     halved = obj.points[:, 2] > 0
     for half in (halved, ~halved):
         plain = dataclasses.replace(
             obj, labels=np.where(half, 0, 1), graspable=np.array([True, False])
         )
-        assert affordance.covered(plain).sum() < affordance.covered(obj).sum()
+        assert affordance.find_covered_rests(plain).sum() < affordance.find_covered_rests(obj).sum()
     # The pieces follow the labels.
     assert {piece.part for piece in obj.pieces} <= {0, 1}
 
 
 def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
-    free = affordance.covered
+    free = affordance.find_covered_rests
 
     def never(obj, *, use_affordance=True):
         return (
@@ -168,7 +168,7 @@ def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
             else free(obj, use_affordance=False)
         )
 
-    monkeypatch.setattr(affordance, "covered", never)
+    monkeypatch.setattr(affordance, "find_covered_rests", never)
     obj = generate(3, "cylinder")
     cut = affordance.cut_to_hold(obj)
     assert cut.notes == (*obj.notes, affordance.UNCOVERED)
@@ -182,6 +182,6 @@ def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
 def test_a_cut_covers_no_fewer_resting_poses(family, seed):
     obj = generate(seed, family)
     cut = affordance.cut_to_hold(obj)
-    assert affordance.covered(cut).sum() >= affordance.covered(obj).sum()
+    assert affordance.find_covered_rests(cut).sum() >= affordance.find_covered_rests(obj).sum()
     assert 0.1 <= cut.graspable[cut.labels].mean() <= 0.9
     np.testing.assert_array_equal(cut.points, obj.points)

@@ -240,7 +240,7 @@ def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatc
 
 def test_a_cut_beyond_its_limit_is_an_error(monkeypatch):
     """No other shape replaces one that a slow machine does not finish."""
-    monkeypatch.setattr(decompose, "PROCESSOR_LIMIT", 0.01)
+    monkeypatch.setattr(decompose, "MAX_PROCESSOR_S", 0.01)
     with pytest.raises(CongraspError, match=r"coacd took longer than 0\.01 s"):
         decomposed(ell())
 
@@ -284,7 +284,7 @@ def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
 
 def test_a_busy_machine_changes_no_shape(monkeypatch):
     """A child that gets no processor time is no reason for another shape."""
-    monkeypatch.setattr(decompose, "STARVED", 0.001)
+    monkeypatch.setattr(decompose, "MAX_WALL_CLOCK_RATIO", 0.001)
     mesh = ell()
     with pytest.raises(
         CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"

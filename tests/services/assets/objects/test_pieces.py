@@ -115,7 +115,7 @@ def test_pieces_of_a_bent_wall_are_as_thin_as_the_wall(angle):
     volume = np.radians(angle) * 0.040 * 0.002 * 0.03
     merged = merge(blocks, 2, wall, volume)
     assert len(merged) == 2
-    errors = fidelity(wall, merged, closed=True)
+    errors = fidelity(wall, merged, is_closed=True)
     assert abs(errors.volume) < 0.05
     # The bend of a half is r (1 - cos(angle / 4)) deep.
     assert errors.surface < 0.041 * (1 - np.cos(np.radians(angle / 4)))
@@ -139,6 +139,33 @@ def test_a_convex_mesh_and_itself():
     ball = trimesh.creation.icosphere(radius=0.03)
     errors = compared(ball, [ball])
     np.testing.assert_allclose(errors, 0, atol=1e-12)
+
+
+def test_overlaps_of_the_pieces_of_a_needle_count_once():
+    """All rays miss it: it is thinner than they are apart."""
+    needle = block([1e-4, 1.2e-4, 0.2])
+    halves = [block([1e-4, 1.2e-4, 0.14]).apply_translation([0, 0, z]) for z in (-0.03, 0.03)]
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    for mesh in (needle, *halves):
+        mesh.apply_transform(turn)
+    assert abs(compared(needle, halves).volume) < 0.02
+
+
+def test_a_surface_that_no_ball_touches_is_not_faultless(monkeypatch):
+    monkeypatch.setattr(
+        "congrasp.services.assets.objects.fidelity.are_outside",
+        lambda triangles, centers: np.zeros(len(centers), bool),
+    )
+    assert compared(block(SIDES), [block(SIDES + 0.004)]).surface > 0.002
+
+
+def test_walls_of_a_crack_do_not_count():
+    """Two plates 0.35 mm apart, and a piece that fills them: the gap's walls are no error."""
+    plates = [block([0.03, 0.03, 0.004]), block([0.03, 0.03, 0.004])]
+    plates[1].apply_translation([0, 0, 0.00435])
+    filled = block([0.03, 0.03, 0.00835])
+    filled.apply_translation([0, 0, 0.002175])
+    assert compared(trimesh.util.concatenate(plates), [filled]).surface < 5e-4
 
 
 def test_a_piece_that_is_larger_all_around():

@@ -12,7 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from congrasp.services.evaluate.lineup import PolicyKey
-from congrasp.services.evaluate.paper.comparison import SUCCESS, compare, summary, unmatched
+from congrasp.services.evaluate.paper.comparison import (
+    SUCCESS,
+    compare,
+    rows_without_counterpart,
+    summary,
+)
 from congrasp.services.evaluate.paper.evaluation import PartResult
 from congrasp.services.evaluate.paper.figures import TABLES, paper_lines, paper_row
 from congrasp.services.evaluate.paper.page import not_comparable, paper_tables
@@ -131,7 +136,7 @@ def test_groups_by_size_are_compared_and_others_are_our_own():
     (small,) = find(compare(results, {}, HANDS), "objects", "heading", group="small")
     assert small.paper == 0.929
     assert small.ours == 0.9
-    assert [ours.group for _, ours in unmatched(results)] == ["family mug"]
+    assert [ours.group for _, ours in rows_without_counterpart(results)] == ["family mug"]
 
 
 def test_the_summary_counts_rates_and_intervals():
