@@ -3,9 +3,9 @@
 They read strangers' files, or call native code.
 
 Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources.
-`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS` is that process:
-FUNCTION ("module:name") is called with FOLDER and the options from the standard input; what it
-returns goes to FOLDER/answer.json.
+`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS PACKAGE ...` is that
+process. FUNCTION ("module:name") is called with FOLDER and the options from the standard input; its
+result goes to FOLDER/answer.json.
 """
 
 import importlib
@@ -18,20 +18,31 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.environment import child_environment
+from congrasp.services.ops import causes
 
 _ANSWER = "answer.json"
+_STARTED = "started"
+"""File that the child creates once its imports are done."""
 _MODULE = "congrasp.services.assets.confined"
 _PARENT_CHECK_S = 0.5
 """Time between two checks whether the parent is still there."""
+_FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
+"""Signals by which others end a process."""
 
 
 class OutOfResources(ChildProcessError):
-    """The child reached its limit of processor time, or was killed by the system."""
+    """The child reached its limit of processor time or memory, or was killed by the system."""
+
+
+class EnvironmentFailure(ChildProcessError):
+    """The child could not do its work here, whatever the function and its input: it did not start,
+    a package cannot be imported, a file cannot be written, or another process ended it.
+    """
 
 
 def call_confined(
@@ -42,6 +53,7 @@ def call_confined(
     memory: int,
     seconds: float,
     patience: float,
+    packages: Sequence[str] = (),
 ) -> Any:
     """Calls a function of a module in a child process.
 
@@ -54,17 +66,20 @@ def call_confined(
       memory: limit of the address space, bytes.
       seconds: limit of the processor time, s.
       patience: limit of the wall-clock time, s.
+      packages: packages that the function uses, imported before it is called.
 
     Raises:
       CongraspError: of the function.
       TimeoutError: it did not end within `patience`.
-      OutOfResources: it reached its limit of processor time, or the system killed it, as it does
-        without memory.
-      ChildProcessError: it ended without an answer; the message states the reason.
+      OutOfResources: it reached its limit of processor time or memory, or the system killed it.
+      EnvironmentFailure: it did not start, or failed for a reason that is not the function's.
+      ChildProcessError: it ended without an answer; the message, a predicate, states the reason, as
+        it does for the two errors above.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
-    command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
+    limits = [str(memory), str(seconds)]
+    command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), *limits, *packages]
     try:
         child = subprocess.run(
             command,
@@ -77,6 +92,8 @@ def call_confined(
         )
     except subprocess.TimeoutExpired:
         raise TimeoutError from None
+    except OSError as error:
+        raise EnvironmentFailure(f"did not start ({error.strerror})") from None
     if child.returncode == -signal.SIGPROF:
         raise OutOfResources(f"took longer than {seconds:g} s of processor time")
     if child.returncode == -signal.SIGKILL:
@@ -84,29 +101,50 @@ def call_confined(
     try:
         answer = json.loads((folder / _ANSWER).read_text())
     except (OSError, ValueError):
-        reason = f"exit code {child.returncode}"
-        lines = child.stderr.decode(errors="replace").strip().splitlines()
-        if lines:
-            reason = lines[-1]
-        raise ChildProcessError(f"failed ({reason})") from None
+        raise _failure(folder, child.returncode, child.stderr.decode(errors="replace")) from None
     if "error" in answer:
         raise CongraspError(answer["error"])
+    if "environment" in answer:
+        raise EnvironmentFailure(f"failed ({answer['environment']})")
     return answer["result"]
 
 
-def _child(called: str, folder: str, memory: str, seconds: str) -> None:
+def _failure(folder: pathlib.Path, code: int, output: str) -> ChildProcessError:
+    """Returns the error of a child without an answer.
+
+    Args:
+      folder: folder of the call.
+      code: exit code of the child.
+      output: what it wrote to its standard error.
+    """
+    reason = causes.cause_in(output) or causes.last_line(output) or f"exit code {code}"
+    if not (folder / _STARTED).exists():
+        return EnvironmentFailure(f"did not start ({reason})")
+    if -code in _FROM_OUTSIDE:
+        return EnvironmentFailure(f"was ended by {signal.Signals(-code).name}")
+    if causes.is_shortage(output):
+        return OutOfResources(f"failed ({reason})")
+    return ChildProcessError(f"failed ({reason})")
+
+
+def _child(called: str, folder: str, memory: str, seconds: str, *packages: str) -> None:
     """Calls the function; ends at a limit, or when the parent is gone."""
     module, _, name = called.partition(":")
     function = getattr(importlib.import_module(module), name)
+    for package in packages:
+        importlib.import_module(package)
     options = json.load(sys.stdin)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     signal.setitimer(signal.ITIMER_PROF, float(seconds))  # its signal ends the process
     resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    pathlib.Path(folder, _STARTED).touch()
     try:
         answer = {"result": function(pathlib.Path(folder), **options)}
     except CongraspError as error:
         answer = {"error": str(error)}
+    except (ImportError, OSError) as error:
+        answer = {"environment": f"{type(error).__name__}: {error}"}
     pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer))
 
 

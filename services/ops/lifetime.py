@@ -32,7 +32,7 @@ to kill the child.
 """
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-_PARENT = "CONGRASP_PARENT"
+PARENT = "CONGRASPPARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 _POLL = 0.5
 """Time between two looks at a child, s."""
@@ -159,7 +159,7 @@ def follow_parent() -> None:
     """Makes the kernel send SIGTERM when the parent dies, if the parent requested it (Linux
     only).
     """
-    parent = os.environ.pop(_PARENT, None)
+    parent = os.environ.pop(PARENT, None)
     if parent is None or not sys.platform.startswith("linux"):
         return
     pr_set_pdeathsig = 1
@@ -215,7 +215,7 @@ class Child:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
         with its parent.
         """
-        additions = {**self.environment, _PARENT: str(os.getpid())}
+        additions = {**self.environment, PARENT: str(os.getpid())}
         environment = child_environment(**additions)
         # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
         # frames.

@@ -33,6 +33,7 @@ from congrasp.services.ops.audit import FAULTS as KINDS
 from congrasp.services.ops.audit import Report
 from congrasp.services.ops.audit import compare as audit
 from congrasp.services.train.launch import LAUNCH_FILE, read_launch
+from tests.children import following
 
 _RUN = "quickstart"
 _OPTIONS = (
@@ -101,7 +102,7 @@ class Run:
         command += ["--actors", str(self._count), "--evaluation", "0"]
         command += ["--resume"] if (self.run_dir / "config.json").exists() else []
         self.process = psutil.Popen(
-            command, stdout=self._output, stderr=subprocess.STDOUT, text=True
+            command, stdout=self._output, stderr=subprocess.STDOUT, text=True, env=following()
         )
         self._transport = urls.connect(self.until(self._endpoint), "observer", wait=_DEADLINE)
         self.until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
