@@ -120,6 +120,8 @@ def _failure(folder: pathlib.Path, code: int, output: str) -> ChildProcessError:
     reason = causes.cause_in(output) or causes.last_line(output) or f"exit code {code}"
     if not (folder / _STARTED).exists():
         return EnvironmentFailure(f"did not start ({reason})")
+    if code == 0:  # where the ends of children are ignored, their exit codes are lost
+        return EnvironmentFailure("ended without an answer")
     if -code in _FROM_OUTSIDE:
         return EnvironmentFailure(f"was ended by {signal.Signals(-code).name}")
     if causes.is_shortage(output):

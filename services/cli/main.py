@@ -25,6 +25,7 @@ from congrasp.services.cli.process import (
     SIGNALLED,
     end_process,
     prepare_streams,
+    restore_signals,
     undo_interpreter_options,
     write_if_possible,
 )
@@ -90,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     owns_process = arguments is None
     if owns_process:
         prepare_streams()
+        restore_signals()
         undo_interpreter_options()
     words = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()

@@ -55,7 +55,7 @@ def test_what_the_learner_alone_uses_may_change_and_is_kept(run):
 def test_what_actors_use_may_not(run, change):
     folder, config = run
     with pytest.raises(
-        CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"
+        CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start another run\."
     ):
         continue_run(folder, dataclasses.replace(config, **change))
     assert open_run(folder) == config
@@ -116,7 +116,7 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
     (folder / "checkpoints" / "latest").symlink_to("gone")
     with pytest.raises(
         CongraspError,
-        match=r"although latest shows that it had one\. Start again in another --run-dir\.",
+        match=r"latest shows that it had one\. In another --run-dir, start another run\.",
     ):
         has_checkpoints(folder)
     (folder / "checkpoints" / "checkpoint_000000004.safetensors").touch()
@@ -339,10 +339,39 @@ def test_a_changed_config_is_refused_on_resume(tmp_path, stored, kind):
     path.write_bytes(edited_config(text, kind))
     assert (path.read_bytes() == text) == (kind == "none")
     if kind == "bit" and stored != "neither":
-        with pytest.raises(CongraspError, match=r"config\.json.*--initial"):
+        with pytest.raises(CongraspError, match=r"config\.json.*start another run\."):
             continue_run(tmp_path, open_run(tmp_path))
     else:
         continue_run(tmp_path, open_run(tmp_path))
+
+
+def damage_config(folder):
+    path = folder / "config.json"
+    path.write_bytes(edited_config(path.read_bytes(), "bit"))
+    continue_run(folder, open_run(folder))
+
+
+REFUSED = {
+    "damaged configuration": damage_config,
+    "changed size": lambda folder: continue_run(folder, RunConfig(environments=7)),
+    "no checkpoint": lambda folder: has_checkpoints(folder),
+}
+"""Actions on the folder of a run that end in the proposal of another one."""
+
+
+@pytest.mark.parametrize("has_policy", [True, False])
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_proposed_policy_exists(tmp_path, name, has_policy):
+    folder = tmp_path / "a run"
+    create_run(folder, RunConfig())
+    policy = folder / "policy.safetensors"
+    if has_policy:
+        policy.write_bytes(b"a policy")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "latest").symlink_to("gone")
+    with pytest.raises(CongraspError, match=r"tart another run") as caught:
+        REFUSED[name](folder)
+    assert (f"--initial '{policy}'" in str(caught.value)) == has_policy
 
 
 def test_a_setting_that_may_change_changes_on_resume(tmp_path):
