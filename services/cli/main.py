@@ -31,6 +31,7 @@ from congrasp.services.cli.process import (
 )
 from congrasp.services.cli.terminal import ensure_width
 from congrasp.services.cli.variables import check_xla_flags
+from congrasp.services.cli.words import check_typography, expand_homes
 from congrasp.services.ops.interrupts import ending, interrupts_reach
 from congrasp.services.ops.lifetime import follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
@@ -127,11 +128,11 @@ def _exit_code(arguments: list[str], debug: bool) -> int:
 
 
 def run(arguments: list[str]) -> int:
-    """Runs one command; returns its exit code, 130 after Ctrl-C and 143 after SIGTERM."""
+    """Runs one command; returns its exit code, 128 and the number of the signal that stopped it."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         return 0
-    name, *rest = arguments
+    name, *words = arguments
     if name == "--version":
         print(congrasp.__version__)
         return 0
@@ -139,6 +140,8 @@ def run(arguments: list[str]) -> int:
         kind = "option" if name.startswith("-") else "command"
         remedy = suggestions.command_remedy(arguments, list(COMMANDS))
         raise CongraspError(f"There is no {kind} '{name}'.", remedy)
+    rest = expand_homes(words)
+    check_typography(rest)
     check_inputs(rest)
     check_xla_flags()
     _prepare_environment()

@@ -9,10 +9,10 @@ import warnings
 from typing import NoReturn, TextIO
 
 from congrasp.common.runtime.environment import child_environment
-from congrasp.services.ops.lifetime import SIGNALS
+from congrasp.services.ops.lifetime import ENDING, SIGNALS
 
-SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
-"""Exit codes after Ctrl-C and SIGTERM."""
+SIGNALLED = tuple(128 + number for number in ENDING)
+"""Exit codes after a signal."""
 _INSPECT = "PYTHONINSPECT"
 _NEEDED_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGCHLD")
 """Signals that a command or its children need."""

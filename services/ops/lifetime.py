@@ -30,6 +30,10 @@ CHILD_GRACE = 2.0
 """Longest time for a child to drain, s. It is shorter than `GRACE`, which leaves this process time
 to kill the child.
 """
+ENDING = tuple(
+    number for number in signal.Signals if number.name in ("SIGHUP", "SIGINT", "SIGTERM")
+)
+"""Signals that stop a command: the terminal closed, Ctrl-C, and the request to end."""
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
 PARENT = "CONGRASPPARENT"
@@ -42,7 +46,7 @@ _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
 
 class Stop(threading.Event):
-    """Event set by the first SIGINT or SIGTERM; loops poll it or wait on it.
+    """Event set by the first signal of `ENDING`; loops poll it or wait on it.
 
     Attributes:
       signal: number of the received signal, or None.
@@ -88,7 +92,7 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
         if interrupt:
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handle) for number in ENDING if _is_obeyed(number)}
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     watch = threading.Thread(
         target=_watch_signals, args=(reader, stop, grace, interrupt), daemon=True, name=SIGNALS
@@ -101,6 +105,11 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
         for number, handler in previous.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def _is_obeyed(number: signal.Signals) -> bool:
+    """False for the end of a terminal under `nohup`."""
+    return number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
 
 
 def _default_grace(interrupt: bool) -> float:

@@ -140,6 +140,7 @@ def test_help_names_every_command_and_every_command_exists():
             ["grasp", "mug:7", "--attempts", "100000000"],
             "--attempts is 100000000. It must be between 1 and 1024",
         ),
+        (["grasp", "mug:7", "\u2014attempts", "2"], "dash of typeset text. Type --attempts"),
         (["grasp"], "nothing to grasp"),
         (["grasp", ""], "An argument is empty"),
         (["grasp", "mug:7", "--out", ""], "--out is empty"),
@@ -372,6 +373,26 @@ def test_memory_that_does_not_suffice_is_one_line_and_no_bad_input(said, what, m
         f"congrasp: error: The device's memory does not suffice: {what}. Choose fewer "
         f"--environments"
     )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libEGL.so.1: cannot open shared object file: No such file or directory"),
+        ImportError("/lib/libstdc++.so.6: version `GLIBCXX_3.4.32' not found (required by x.so)"),
+        OSError("libgomp.so.1: cannot open shared object file: No such file or directory"),
+    ],
+    ids=str,
+)
+def test_a_library_that_does_not_load_is_named(error, monkeypatch, capsys):
+    def refuse(arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "run", refuse)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["hands"])
+    library = re.escape(str(error).partition(":")[0])
+    is_one_line(end.value.code, capsys.readouterr().err, f"cannot be loaded .*{library}")
 
 
 @pytest.mark.parametrize(
